@@ -1,0 +1,31 @@
+# Two commands for a newcomer: `make demo` and `make test`. Both make their own virtual environment first.
+SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
+PYTHON ?= $(shell for name in python3.12 python3.11 python3; do \
+  $$name -c '$(SUPPORTED)' 2>/dev/null && echo $$name && break; done)
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test lint clean
+
+$(VENV)/installed: pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" && $(PYTHON) -c '$(SUPPORTED)' \
+	  || { echo "potlp-jax needs Python 3.11 or 3.12; name one: make PYTHON=/path/to/python3.11 demo"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+demo: $(VENV)/installed  ## Fire-fighting task 1 on a handful of seeds with every policy: table and pictures in out/demo
+	$(BIN)/potlp compare firefighting --task 1 --policies known-map,baseline,optimistic,oracle --trials 5 --out out/demo
+	$(BIN)/potlp run firefighting --task 1 --policy oracle --seed 0 --out out/demo/oracle
+	@echo "Pictures: out/demo/oracle/trial.png, out/demo/oracle/trial.gif, out/demo/compare.png"
+
+test: $(VENV)/installed  ## The whole suite
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+lint: $(VENV)/installed  ## Style, format and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+clean:
+	rm -rf $(VENV) out

@@ -1,0 +1,1 @@
+from potlp_jax.task.task import Task as Task

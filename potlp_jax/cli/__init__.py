@@ -1,0 +1,210 @@
+"""``potlp ...``: the command line.
+
+Here are the commands' options and help texts; what a command does is in the file of its name. Those files are imported
+when a command runs, so that help is quick.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from potlp_jax.cli.output import clear_errors, package_version
+
+app = typer.Typer(
+    name="potlp",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Write JSON, and nothing else, to stdout.")]
+Environment = Annotated[
+    str,
+    typer.Argument(
+        metavar="ENV", help="[cyan]toy[/cyan], [cyan]firefighting[/cyan], or [cyan]map:FILE.yaml[/cyan] (a ROS map)."
+    ),
+]
+TaskName = Annotated[
+    str, typer.Option("--task", "-t", help="Number of one of the environment's tasks, a formula, or a .hoa file.")
+]
+SplitName = Annotated[
+    str, typer.Option("--split", help="Which worlds to draw from: calibration, training, validation or test.")
+]
+Simulations = Annotated[
+    int | None, typer.Option("--simulations", min=1, help="Simulations per decision of policies that search.")
+]
+
+
+_ABOUT = (
+    "Plan temporal-logic tasks in buildings that the robot has never seen.\n\n"
+    "A task says what to reach and what to avoid: [cyan](!fire U extinguisher) & F fire[/cyan] means no fire until the "
+    "extinguisher is found, and in the end the fire. The robot sees as it goes, weighs the frontiers of what it has "
+    "seen by the chance that the task goes on behind them, and moves until the task is satisfied."
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"potlp {package_version()}")
+        raise typer.Exit
+
+
+@app.callback(
+    help=_ABOUT,
+    epilog="""
+[bold]A first tour[/bold]
+
+[cyan]potlp task "!hazard U goal"[/cyan] - what the formula means, as an automaton
+
+[cyan]potlp run toy --task 2 --out demo[/cyan] - one small world: record, picture and animation in demo/
+
+[cyan]potlp explain demo:0[/cyan] - why the robot decided as it did at first
+
+[cyan]potlp compare toy --task 2 --policies oracle --trials 20[/cyan] - does it save anything?
+
+[dim]Exit codes: 0 done, 1 not satisfied or failed, 2 bad input, 130 interrupted.[/dim]
+""",
+)
+def potlp(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and leave.")
+    ] = False,
+) -> None:
+    """The options of ``potlp`` itself."""
+
+
+@app.command(
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp task "F goal"[/cyan]
+
+[cyan]potlp task "(!fire U extinguisher) & F fire" --propositions fire,extinguisher,exit --svg task.svg[/cyan]
+
+[cyan]potlp task automaton.hoa --json[/cyan]
+"""
+)
+@clear_errors
+def task(
+    formula: Annotated[
+        str,
+        typer.Argument(
+            metavar="FORMULA", help="A co-safe formula in Spot's syntax, the name of a shipped task, or a .hoa file."
+        ),
+    ],
+    propositions: Annotated[
+        str | None, typer.Option("--propositions", "-p", help="All propositions, in the order of a letter's bits: a,b.")
+    ] = None,
+    max_positive_literals: Annotated[
+        int | None, typer.Option(min=0, help="Leave out ways that need more propositions to hold in one place.")
+    ] = None,
+    svg: Annotated[Path | None, typer.Option("--svg", help="Draw the automaton (.svg, .png or .pdf).")] = None,
+    json: Json = False,
+) -> None:
+    """Show a task as an automaton: states, transitions, and the outcomes that have to be estimated."""
+    from potlp_jax.cli.task import show_task
+
+    show_task(formula, propositions, max_positive_literals, svg, json)
+
+
+@app.command(
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp run toy --task 1[/cyan]
+
+[cyan]potlp run firefighting --task 3 --policy oracle --seed 7 --out out/fire[/cyan]
+
+[cyan]potlp run firefighting --task "!fire U exit" --policy baseline --json[/cyan]
+
+[dim]Ends with exit code 1 if the task was not satisfied.[/dim]
+"""
+)
+@clear_errors
+def run(
+    environment: Environment,
+    task: TaskName = "1",
+    policy: Annotated[
+        str, typer.Option("--policy", "-p", help="known-map, baseline, optimistic or oracle.")
+    ] = "oracle",
+    seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="Which world of the split.")] = 0,
+    split: SplitName = "validation",
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for trial.json, trial.png and trial.gif.")
+    ] = None,
+    animation: Annotated[bool, typer.Option(help="Make the animation, the slowest of the three files.")] = True,
+    simulations: Simulations = None,
+    json: Json = False,
+) -> None:
+    """Run one trial: one world, one task, one policy."""
+    from potlp_jax.cli.run import run_one
+
+    run_one(environment, task, policy, seed, split, out, animation, simulations, json)
+
+
+@app.command(
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp compare toy --task 2 --trials 20[/cyan]
+
+[cyan]potlp compare firefighting -t 1 --policies baseline,optimistic,oracle --trials 100 --out out/table[/cyan]
+
+[dim]known-map (the floor) and baseline are always run: savings are measured between them.[/dim]
+"""
+)
+@clear_errors
+def compare(
+    environment: Environment,
+    task: TaskName = "1",
+    policies: Annotated[str, typer.Option("--policies", help="Names, joined by commas.")] = "baseline,oracle",
+    trials: Annotated[int, typer.Option("--trials", "-n", min=1, help="Worlds; every policy runs in each.")] = 20,
+    seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="First world of the split.")] = 0,
+    split: SplitName = "validation",
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for compare.json, trials.csv, scatter.png and table.txt."),
+    ] = None,
+    simulations: Simulations = None,
+    json: Json = False,
+) -> None:
+    """Compare policies in the same worlds, with the share of attainable savings and its uncertainty."""
+    from potlp_jax.cli.compare import compare_policies
+
+    compare_policies(environment, task, policies, trials, seed, split, out, simulations, json)
+
+
+@app.command(
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp explain out/fire:0[/cyan] - the first decision of out/fire/trial.json
+
+[cyan]potlp explain out/fire/trial.json:12 --out tree.png[/cyan]
+
+[cyan]potlp explain out/fire:12 --json[/cyan]
+"""
+)
+@clear_errors
+def explain(
+    decision: Annotated[
+        str, typer.Argument(metavar="DECISION", help="FOLDER:INDEX or FILE:INDEX of a trial that `potlp run` recorded.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Search again and draw the top of the tree (.png, .svg or .pdf)."),
+    ] = None,
+    depth: Annotated[int, typer.Option(min=1, max=6, help="Levels of the tree that are drawn.")] = 3,
+    json: Json = False,
+) -> None:
+    """Explain one decision: the actions that were weighed, their estimates and expected costs."""
+    from potlp_jax.cli.explain import explain_decision
+
+    explain_decision(decision, out, depth, json)
+
+
+def main() -> None:
+    """Entry point of the ``potlp`` script."""
+    app()

@@ -1,0 +1,172 @@
+"""``potlp compare``: policies in the same worlds."""
+
+import csv
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from potlp_jax.cli.inputs import make_world, read_environment_task, read_policy, read_split, trial_config
+from potlp_jax.cli.output import (
+    FAILED,
+    console,
+    error_console,
+    fail,
+    note,
+    output_folder,
+    print_json,
+    progress_bar,
+    to_json,
+)
+from potlp_jax.environments import Generator, make
+from potlp_jax.environments.splits import Split
+from potlp_jax.planning.policies import Policy
+from potlp_jax.records import Outcome, Trial
+from potlp_jax.sweep.statistics import Comparison, TrialResult
+from potlp_jax.task.task import Task
+from potlp_jax.trial import TrialConfig, run_trial
+from potlp_jax.view.comparisons import draw_scatter, loss_lines, outcome_table, savings_table
+from potlp_jax.view.style import save_figure
+from potlp_jax.world.grid import World
+
+IMPOSSIBLE_IN_A_ROW: int = 100
+"""Worlds that are redrawn one after the other before the task is taken to be impossible in all of them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Pair:
+    """One world with the trials of all policies, reduced to what is reported."""
+
+    seed: int
+    trials: Mapping[str, dict[str, Any]]
+    budget: float
+
+
+def compare_policies(
+    environment: str,
+    task_name: str,
+    policy_names: str,
+    trials: int,
+    seed: int,
+    split_name: str,
+    out: Path | None,
+    simulations: int | None,
+    json: bool,
+) -> None:
+    """Run every policy in the same worlds and report the paired figures (docs/model.md, section 8)."""
+    generator, split = make(environment), read_split(split_name)
+    policies = _read_policies(policy_names)
+    task = read_environment_task(generator, task_name)
+    config, folder = trial_config(simulations), output_folder(out)
+    pairs: list[_Pair] = []
+    with progress_bar() as progress:
+        bar = progress.add_task("worlds (the first one compiles the planner)", total=trials)
+        for pair in _pairs(generator, task, policies, split, seed, config, f"{environment}/{split}"):
+            pairs.append(pair)
+            progress.update(bar, completed=len(pairs), description="worlds")
+            if not error_console().is_terminal:
+                note(
+                    f"world {pair.seed}: " + ", ".join(f"{name} {row['cost']:.1f}" for name, row in pair.trials.items())
+                )
+            if len(pairs) == trials:
+                break
+    comparison = Comparison.from_results(
+        {policy.value: [_result(pair, policy) for pair in pairs] for policy in policies}
+    )
+    redrawn = pairs[-1].seed - seed + 1 - trials
+    report = {
+        "environment": environment,
+        "split": str(split),
+        "task": task.text,
+        "first_seed": seed,
+        "seeds": [pair.seed for pair in pairs],
+        "redrawn": redrawn,
+        **comparison.to_dict(),
+    }
+    heading = f"{environment}/{split}, task {task.text}, {trials} worlds from {seed}, {redrawn} redrawn as impossible"
+    if folder is not None:
+        _write(folder, report, heading, comparison, pairs)
+    if json:
+        print_json(report)
+    else:
+        _print(console(), heading, comparison)
+        if folder is not None:
+            console().print(f"wrote compare.json, trials.csv, scatter.png and table.txt in {folder}", markup=False)
+
+
+def _read_policies(names: str) -> list[Policy]:
+    """Known map and baseline first, whether named or not; the others in their order, each once."""
+    named = [read_policy(name) for name in names.split(",") if name.strip()]
+    return list(dict.fromkeys([Policy.KNOWN_MAP, Policy.BASELINE, *named]))
+
+
+def _pairs(
+    generator: Generator,
+    task: Task,
+    policies: Sequence[Policy],
+    split: Split,
+    first: int,
+    config: TrialConfig,
+    environment: str,
+) -> Iterator[_Pair]:
+    """The worlds from ``first`` on in which the task is possible, with a trial of every policy in each."""
+    impossible, seed = 0, first
+    while True:
+        world = make_world(generator, split, seed)
+
+        def trial(policy: Policy, world: World = world, seed: int = seed) -> Trial:
+            return run_trial(world, task, policy, jax.random.key(seed), config, environment=environment, seed=seed)
+
+        floor = trial(Policy.KNOWN_MAP)
+        if floor.outcome is Outcome.SATISFIED:
+            others = {policy.value: trial(policy).summary() for policy in policies if policy is not Policy.KNOWN_MAP}
+            yield _Pair(seed, {Policy.KNOWN_MAP.value: floor.summary(), **others}, _budget(world, config))
+            impossible = 0
+        else:
+            impossible += 1
+            if impossible == IMPOSSIBLE_IN_A_ROW:
+                fail(
+                    f"the task is impossible in {impossible} worlds in a row ({first} to {seed}); is it meant so?",
+                    FAILED,
+                )
+        seed += 1
+
+
+def _budget(world: World, config: TrialConfig) -> float:
+    return config.budget_factor * float(np.sum(np.asarray(world.extent))) * float(world.resolution)
+
+
+def _result(pair: _Pair, policy: Policy) -> TrialResult:
+    trial = pair.trials[policy.value]
+    return TrialResult(cost=trial["cost"], outcome=trial["outcome"], budget=pair.budget, status=trial["status"])
+
+
+def _print(out: Console, heading: str, comparison: Comparison) -> None:
+    out.print(heading, markup=False, style="bold")
+    satisfied, charged = comparison.satisfied, comparison.charged
+    title = f"{satisfied.pairs} worlds in which every policy satisfied the task ({satisfied.dropped} left out)"
+    out.print(savings_table(satisfied, title))
+    out.print(savings_table(charged, f"all {charged.pairs} worlds, unsatisfied trials charged their budget"))
+    out.print(outcome_table(comparison))
+    for line in loss_lines(comparison):
+        out.print(line, markup=False)
+
+
+def _write(
+    folder: Path, report: Mapping[str, Any], heading: str, comparison: Comparison, pairs: Sequence[_Pair]
+) -> None:
+    (folder / "compare.json").write_text(to_json(report) + "\n", "utf-8")
+    with (folder / "table.txt").open("w", encoding="utf-8") as file:
+        _print(Console(file=file, width=150, highlight=False), heading, comparison)
+    with (folder / "trials.csv").open("w", encoding="utf-8", newline="") as file:
+        names = ("policy", "outcome", "cost", "steps", "decisions", "fallbacks", "status")
+        writer = csv.writer(file)
+        writer.writerow(("seed", *names, "budget"))
+        for pair in pairs:
+            writer.writerows((pair.seed, *(row[name] for name in names), pair.budget) for row in pair.trials.values())
+    costs = {name: [pair.trials[name] for pair in pairs] for name in pairs[0].trials}
+    save_figure(draw_scatter(costs, heading), folder / "scatter.png")

@@ -1,0 +1,54 @@
+"""``potlp explain``: one recorded decision."""
+
+import re
+from pathlib import Path
+
+from potlp_jax.cli.output import console, fail, note, print_json
+from potlp_jax.cli.run import RECORD
+from potlp_jax.records import Decision, Trial, load_trial
+from potlp_jax.trial import replay_decision
+from potlp_jax.view.decisions import action_table, decision_to_dict, describe_decision, draw_tree
+from potlp_jax.view.style import save_figure
+
+
+def explain_decision(name: str, out: Path | None, depth: int, json: bool) -> None:
+    """Print the actions of a decision; with ``out``, search again and draw the top of the tree."""
+    trial, decision = _read_decision(name)
+    if out is not None:
+        _draw(trial, decision, out, depth)
+    if json:
+        print_json({"trial": trial.summary(), **decision_to_dict(decision)})
+        return
+    output = console()
+    if decision.actions:
+        output.print(action_table(trial, decision))
+    else:
+        output.print(describe_decision(trial, decision), markup=False)
+        output.print(f"policy {trial.policy} does not search: it weighed no actions", markup=False)
+    if out is not None:
+        output.print(f"wrote {out}", markup=False)
+
+
+def _read_decision(name: str) -> tuple[Trial, Decision]:
+    match = re.fullmatch(r"(.+):(\d+)", name)
+    if match is None:
+        fail(f"{name!r} names no decision; write FOLDER:INDEX or FILE:INDEX, such as out/trial.json:0")
+    path, index = Path(match[1]), int(match[2])
+    trial = load_trial(path / RECORD if path.is_dir() else path)
+    if index >= len(trial.decisions):
+        count = len(trial.decisions)
+        known = f"decisions 0 to {count - 1}" if count else "no decisions"
+        fail(f"{path}: the trial has {known}; there is no decision {index}")
+    return trial, trial.decisions[index]
+
+
+def _draw(trial: Trial, decision: Decision, out: Path, depth: int) -> None:
+    if not decision.actions:
+        fail(f"decision {decision.index} of policy {trial.policy} did not search: there is no tree to draw")
+    from potlp_jax.planning.pouct import tree_top
+
+    problem, plan, tree = replay_decision(trial, decision.index)
+    if int(plan.action) != decision.choice:
+        note("searching again chose another action than recorded: the versions of the software may differ")
+    top = tree_top(problem, tree, depth=depth)
+    save_figure(draw_tree(top, describe_decision(trial, decision), depth=depth), out)

@@ -1,0 +1,72 @@
+"""``potlp task``: what a formula means."""
+
+from pathlib import Path
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.markup import escape
+from rich.table import Table
+
+from potlp_jax.cli.inputs import read_task
+from potlp_jax.cli.output import console, print_json
+from potlp_jax.view.automata import Automaton, draw_automaton
+from potlp_jax.view.style import save_figure
+
+
+def show_task(
+    formula: str, propositions: str | None, max_positive_literals: int | None, svg: Path | None, json: bool
+) -> None:
+    """Print the automaton of a formula, and draw it if asked to."""
+    names = None if propositions is None else [name.strip() for name in propositions.split(",") if name.strip()]
+    task = read_task(formula, names, max_positive_literals)
+    description = task.describe()
+    if svg is not None:
+        save_figure(draw_automaton(Automaton.from_description(description), task.text), svg)
+    if json:
+        print_json(description)
+        return
+    out = console()
+    out.print(task.text, style="bold", markup=False)
+    out.print(f"propositions: {', '.join(task.propositions) or 'none'}", markup=False)
+    out.print(_states(description))
+    if description["classes"]:
+        out.print(_classes(description))
+    if svg is not None:
+        out.print(f"wrote {svg}", markup=False)
+
+
+def _states(description: dict[str, Any]) -> Table:
+    table = Table(title="states and transitions", title_justify="left", box=SIMPLE_HEAD)
+    table.add_column("state", justify="right")
+    table.add_column("role")
+    table.add_column("to", justify="right")
+    table.add_column("when")
+    for state in range(description["states"]):
+        moves = [move for move in description["transitions"] if move["from"] == state]
+        for line, move in enumerate(moves):
+            first = (str(state), _role(state, description)) if line == 0 else ("", "")
+            table.add_row(*first, str(move["to"]), escape(move["guard"]), end_section=line == len(moves) - 1)
+    return table
+
+
+def _role(state: int, description: dict[str, Any]) -> str:
+    roles = ["initial"] if state == description["initial"] else []
+    roles += [role for role in ("accepting", "trap") if state in description[role]]
+    return ", ".join(roles)
+
+
+def _classes(description: dict[str, Any]) -> Table:
+    table = Table(title="outcome classes of a move into the unknown", title_justify="left", box=SIMPLE_HEAD)
+    table.add_column("class", justify="right")
+    table.add_column("all the while")
+    table.add_column("until")
+    table.add_column("transitions")
+    for index, outcome in enumerate(description["classes"]):
+        edges = [
+            f"{edge['from']}→{edge['to']}"
+            for edge in description["edges"]
+            if index in description["conditions"][edge["condition"]]["classes"]
+        ]
+        stay = outcome["stay"] + ("" if outcome["stay_is_exact"] else " (among others)")
+        table.add_row(str(index), escape(stay), escape(outcome["cube"]), ", ".join(edges))
+    return table

@@ -1,0 +1,36 @@
+"""Where worlds come from: one file a family, each a ``Generator``; ``make`` finds them by name."""
+
+from potlp_jax.environments.base import Generator
+from potlp_jax.world.grid import WorldError
+
+FAMILIES: tuple[str, ...] = ("toy", "firefighting", "map:FILE.yaml")
+"""The names that ``make`` understands."""
+
+
+def make(name: str) -> Generator:
+    """The generator of a family of worlds, as named on the command line.
+
+    Args:
+        name: ``toy``, ``firefighting``, or ``map:FILE.yaml`` for worlds on a ROS map.
+
+    Raises:
+        WorldError: there is no such family.
+        MapError: the map cannot be used.
+    """
+    # Only the family asked for is imported: reading maps needs libraries that the others do not.
+    if name == "toy":
+        from potlp_jax.environments.toy import Toy
+
+        return Toy()
+    if name == "firefighting":
+        from potlp_jax.environments.firefighting import Firefighting
+
+        return Firefighting()
+    if name.startswith("map:"):
+        from potlp_jax.environments.ros_map import RosMap
+
+        return RosMap.from_spec(name)
+    raise WorldError(f"unknown environment {name!r}; choose one of: {', '.join(FAMILIES)}")
+
+
+__all__ = ["FAMILIES", "Generator", "make"]

@@ -1,0 +1,229 @@
+"""Where the propositions of a task are true on a map: a small YAML file in map metres.
+
+    propositions:                # in the order of the letters' bits
+      document:                  # a name, with one region or more
+        - {point: [3.5, -2.0], radius: 0.5}
+      package:
+        - {polygon: [[0, 0], [2, 0], [2, 1.5], [0, 1.5]]}
+    start: [1.0, 4.5]            # optional; without it the start is drawn at random
+    tasks:                       # optional: formulas by name
+      "1": F document & F package
+
+A *point* with a radius covers the cells whose centre is at most that far away and that can be reached from the
+point's own cell without leaving the disc (a robot within the radius but behind a wall is not at the point); the point's
+own cell always counts. A *polygon* covers the cells whose centre lies inside, by the even-odd rule. Only free cells
+carry a proposition.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int32
+from scipy import ndimage
+
+from potlp_jax.environments.map_server import GridFrame, MapError, parse_number, parse_numbers, read_yaml
+
+MAX_PROPOSITIONS = 16
+"""As many as a letter has bits."""
+
+Point = tuple[float | int, float | int]
+"""Metres (x, y) in the map's frame."""
+
+
+@dataclass(frozen=True)
+class Disc:
+    """All that is near a point, in metres."""
+
+    centre: Point
+    radius: float | int
+
+    def __str__(self) -> str:
+        return f"point {_text(self.centre)} with radius {self.radius:g}"
+
+    def covers(self, free: Bool[np.ndarray, "H W"], frame: GridFrame) -> Bool[np.ndarray, "H W"]:
+        """Free cells of the disc that are connected within it to its point, or to the free cell nearest to that."""
+        distance = _distances(self.centre, frame)
+        near = distance <= self.radius / frame.resolution
+        own = frame.metres_to_cell(*self.centre)
+        if frame.contains(*own):
+            near[own] = True
+            distance[own] = 0.0
+        near &= free
+        if not near.any():
+            return near
+        labels = component_labels(near)
+        return labels == labels.flat[np.argmin(np.where(near, distance, np.inf))]
+
+
+@dataclass(frozen=True)
+class Polygon:
+    """The inside of a closed line through the vertices, in metres; the last one joins the first."""
+
+    vertices: tuple[Point, ...]
+
+    def __str__(self) -> str:
+        return "polygon " + ", ".join(_text(vertex) for vertex in self.vertices)
+
+    def covers(self, free: Bool[np.ndarray, "H W"], frame: GridFrame) -> Bool[np.ndarray, "H W"]:
+        """Free cells whose centre lies inside."""
+        vertices = frame.to_grid(np.array(self.vertices, dtype=np.float64))
+        up, across = _centres(frame)
+        inside = np.zeros(free.shape, dtype=bool)
+        for (x0, y0), (x1, y1) in zip(vertices, np.roll(vertices, -1, axis=0), strict=True):
+            # A ray to the right of a centre crosses the side; half-open in y, so that a shared vertex counts once.
+            if y0 != y1:
+                crosses = (y0 <= up) != (y1 <= up)
+                inside ^= crosses & (across < x0 + (up - y0) * ((x1 - x0) / (y1 - y0)))
+        return inside & free
+
+
+Region = Disc | Polygon
+
+
+@dataclass(frozen=True)
+class Places:
+    """Regions of each proposition, in the order of the letters' bits, and optionally a start and tasks.
+
+    Attributes:
+        propositions: pairs of a name and its regions.
+        start: metres (x, y), or None to draw the start at random.
+        tasks: pairs of a name and a formula.
+        source: what to call this in messages: the file.
+    """
+
+    propositions: tuple[tuple[str, tuple[Region, ...]], ...]
+    start: Point | None = None
+    tasks: tuple[tuple[str, str], ...] = ()
+    source: str = "places"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The propositions' names."""
+        return tuple(name for name, _ in self.propositions)
+
+
+def load_places(file: Path | str) -> Places:
+    """Read propositions, start and tasks from a YAML file.
+
+    Raises:
+        MapError: the file cannot be read, a key is missing or unknown, or a region is none.
+    """
+    file = Path(file)
+    fields = read_yaml(file)
+    _check_known(file, "", fields, ("propositions", "start", "tasks"))
+    start = None
+    if "start" in fields:
+        start = _point(file, "start", fields["start"])
+    return Places(
+        _propositions(file, fields.get("propositions")), start, _tasks(file, fields.get("tasks", {})), str(file)
+    )
+
+
+def place_letters(places: Places, reachable: Bool[np.ndarray, "H W"], frame: GridFrame) -> Int32[np.ndarray, "H W"]:
+    """Letter of every cell; bit i is proposition i.
+
+    Raises:
+        MapError: a region lies outside of the map, or covers no cell that the robot can reach.
+    """
+    letters = np.zeros(reachable.shape, dtype=np.int32)
+    for bit, (name, regions) in enumerate(places.propositions):
+        for region in regions:
+            covered = region.covers(reachable, frame)
+            if not covered.any():
+                raise MapError(
+                    places.source, f"propositions: {name}", f"{region} {_why_nowhere(region, reachable, frame)}"
+                )
+            letters[covered] |= 1 << bit
+    return letters
+
+
+def component_labels(free: Bool[np.ndarray, "H W"]) -> Int32[np.ndarray, "H W"]:
+    """Number, from 1, of each free cell's component, in row-major order of their first cells; 0 on other cells.
+
+    Components are 4-connected, which is the same as 8-connected without corner cutting.
+    """
+    labels = np.zeros(free.shape, dtype=np.int32)
+    ndimage.label(free, output=labels)
+    return labels
+
+
+def nearest_free(point: Point, free: Bool[np.ndarray, "H W"], frame: GridFrame) -> Point:
+    """Centre of the free cell nearest to a point, in metres."""
+    row, col = np.unravel_index(np.argmin(np.where(free, _distances(point, frame), np.inf)), free.shape)
+    return frame.cell_to_metres(int(row), int(col))
+
+
+def _why_nowhere(region: Region, reachable: Bool[np.ndarray, "H W"], frame: GridFrame) -> str:
+    points = np.array([region.centre] if isinstance(region, Disc) else region.vertices)
+    centre = (float(points[:, 0].mean()), float(points[:, 1].mean()))
+    everywhere = region.covers(np.ones_like(reachable), frame)
+    what = "covers no cell that the robot can reach" if everywhere.any() else "lies outside of the map's reachable part"
+    return f"{what}; the nearest cell it can reach is at {_text(nearest_free(centre, reachable, frame))}"
+
+
+def _distances(point: Point, frame: GridFrame) -> Float64[np.ndarray, "H W"]:
+    """From a point in metres to the centre of every cell, in cells."""
+    up, across = _centres(frame)
+    point_across, point_up = frame.to_grid(np.array([point], dtype=np.float64))[0]
+    return np.hypot(across - point_across, up - point_up)
+
+
+def _centres(frame: GridFrame) -> tuple[Float64[np.ndarray, "H 1"], Float64[np.ndarray, "1 W"]]:
+    """Cell centres from the lower left corner, in cells: up for each row, across for each column."""
+    return frame.height - 0.5 - np.arange(frame.height)[:, None], 0.5 + np.arange(frame.width)[None, :]
+
+
+def _propositions(file: Path, value: Any) -> tuple[tuple[str, tuple[Region, ...]], ...]:
+    if not isinstance(value, dict) or not value:
+        raise MapError(file, "propositions", "is missing or empty; it maps names to lists of regions")
+    if len(value) > MAX_PROPOSITIONS:
+        raise MapError(file, "propositions", f"{len(value)} of them, at most {MAX_PROPOSITIONS} are possible")
+    return tuple((name, _regions(file, f"propositions: {name}", regions)) for name, regions in value.items())
+
+
+def _regions(file: Path, field: str, value: Any) -> tuple[Region, ...]:
+    if not isinstance(value, list) or not value:
+        raise MapError(
+            file, field, "must be a list of regions, each {point: [x, y], radius: r} or {polygon: [[x, y], ...]}"
+        )
+    return tuple(_region(file, field, region) for region in value)
+
+
+def _region(file: Path, field: str, value: Any) -> Region:
+    if isinstance(value, dict) and set(value) == {"point", "radius"}:
+        radius = float(parse_number(file, f"{field}: radius", value["radius"]))
+        if radius < 0:
+            raise MapError(file, f"{field}: radius", f"{radius:g} must not be negative")
+        return Disc(_point(file, f"{field}: point", value["point"]), radius)
+    if isinstance(value, dict) and set(value) == {"polygon"}:
+        corners = value["polygon"]
+        if not isinstance(corners, list) or len(corners) < 3:
+            raise MapError(file, f"{field}: polygon", "needs three vertices [x, y] or more")
+        return Polygon(tuple(_point(file, f"{field}: polygon", corner) for corner in corners))
+    raise MapError(
+        file, field, f"{value!r} is no region; write {{point: [x, y], radius: r}} or {{polygon: [[x, y], ...]}}"
+    )
+
+
+def _point(file: Path, field: str, value: Any) -> Point:
+    x, y = parse_numbers(file, field, value, ("x", "y"))
+    return x, y
+
+
+def _tasks(file: Path, value: Any) -> tuple[tuple[str, str], ...]:
+    if not isinstance(value, dict) or not all(isinstance(text, str) and text.strip() for text in value.values()):
+        raise MapError(file, "tasks", "must map names to formulas")
+    return tuple(value.items())
+
+
+def _check_known(file: Path, field: str, fields: Mapping[str, Any], known: tuple[str, ...]) -> None:
+    unknown = sorted(set(fields) - set(known))
+    if unknown:
+        raise MapError(file, field or unknown[0], f"unknown key {unknown[0]!r}; known are {', '.join(known)}")
+
+
+def _text(point: Point) -> str:
+    return f"[{point[0]:.2f}, {point[1]:.2f}]"

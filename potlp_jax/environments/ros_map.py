@@ -1,0 +1,263 @@
+"""Worlds on real buildings: a ROS map, cleaned until it can serve as the truth, with propositions placed in metres.
+
+``map:FILE.yaml`` takes the propositions from ``FILE.places.yaml`` beside it (`potlp_jax.environments.places`). Options
+follow after commas: ``map:FILE.yaml,places=OTHER.yaml,resolution=0.2,radius=0.1``. Names of files hold no comma.
+
+A raw map does not describe a closed building: pixels are free that no robot reached, and free space touches unknown
+space without a wall between. `clean_map` therefore
+
+1. takes what is unknown, and all beyond the image, for an obstacle;
+2. inflates obstacles by the robot's radius (between centres of pixels);
+3. resamples to the working resolution: a cell is an obstacle if it shares area with any obstacle pixel, so that no wall
+   is lost, however thin; a passage of width w keeps at least ``floor((w - 2 radius) / resolution) - 1`` free cells;
+4. keeps what is connected with the start (8-connected without corner cutting, which is the same as 4-connected), or the
+   largest such component;
+5. crops to it, with a ring of obstacles around.
+
+Costs are in metres, since ``World.resolution`` is the size of a cell in metres.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Int32, PRNGKeyArray
+from scipy import ndimage
+
+from potlp_jax.environments.base import host_generators
+from potlp_jax.environments.map_server import GridFrame, MapError, OccupancyMap, load_map
+from potlp_jax.environments.places import Places, Point, component_labels, load_places, nearest_free, place_letters
+from potlp_jax.world.grid import World, make_world
+
+PREFIX = "map:"
+
+
+@dataclass(frozen=True)
+class RosMapConfig:
+    """Which map, and how it becomes a grid.
+
+    Attributes:
+        file: the map's YAML.
+        places: YAML of the propositions, or the propositions; None: ``FILE.places.yaml`` beside the map.
+        resolution: size of a working cell in metres, not finer than the map's pixels.
+        radius: the robot's radius in metres, by which obstacles grow.
+
+    With the defaults a door of 0.6 m stays open wherever it lies on the grid.
+    """
+
+    file: str | Path
+    places: str | Places | None = None
+    resolution: float = 0.2
+    radius: float = 0.1
+
+    @property
+    def spec(self) -> str:
+        """The text from which `parse_spec` makes this configuration; places given as an object are left out."""
+        options = [f"places={self.places}"] if isinstance(self.places, str) else []
+        for name in ("resolution", "radius"):
+            if getattr(self, name) != getattr(RosMapConfig, name):
+                options.append(f"{name}={getattr(self, name)}")
+        return ",".join([f"{PREFIX}{self.file}", *options])
+
+
+@dataclass(frozen=True, eq=False)
+class CleanMap:
+    """Cells that the robot can reach, all others being obstacles, and where they lie."""
+
+    free: Bool[np.ndarray, "H W"]
+    frame: GridFrame
+
+
+class RosMap:
+    """Worlds on one map; they differ in the start, unless the places fix it.
+
+    Attributes:
+        name: the specification, as `from_spec` reads it.
+        propositions: names, in the order of the letters' bits.
+        tasks: formulas by name, from the places.
+        image_map: the map as its server would publish it; ``image_map.frame`` converts metres to pixels.
+        clean: the grid; ``clean.frame`` converts metres to cells of the worlds.
+    """
+
+    def __init__(self, config: RosMapConfig) -> None:
+        """Reads and cleans the map, and places the propositions.
+
+        Raises:
+            MapError: the map or the places cannot be used; the message names the file, the field, and what to do.
+
+        Warns:
+            MapWarning: see `potlp_jax.environments.map_server.load_map`.
+        """
+        self.config = config
+        self.image_map = load_map(config.file)
+        places = config.places if isinstance(config.places, Places) else _find_places(config, self.image_map)
+        self.places = places
+        self.clean = clean_map(self.image_map, config.resolution, config.radius, places.start, places.source)
+        self.name = config.spec
+        self.propositions: tuple[str, ...] = places.names
+        self.tasks: Mapping[str, str] = dict(places.tasks)
+        self._letters = place_letters(places, self.clean.free, self.clean.frame)
+        self._free_cells: Int32[np.ndarray, "N 2"] = np.argwhere(self.clean.free).astype(np.int32)
+
+    @classmethod
+    def from_spec(cls, spec: str) -> "RosMap":
+        """From ``map:FILE.yaml``, with options ``,places=...``, ``,resolution=...``, ``,radius=...``.
+
+        Raises:
+            MapError: the text is not of that form, or see the class.
+        """
+        return cls(parse_spec(spec))
+
+    def generate(self, key: PRNGKeyArray) -> World:
+        """The world with the start that the places fix, or with one drawn from all cells by key."""
+        if self.places.start is not None:
+            start = self.metres_to_cell(*self.places.start)
+        else:
+            row, col = self._free_cells[host_generators(key, 1)[0].integers(len(self._free_cells))]
+            start = int(row), int(col)
+        return make_world(~self.clean.free, self._letters, start, resolution=self.clean.frame.resolution)
+
+    def metres_to_cell(self, x: float | int, y: float | int) -> tuple[int, int]:
+        """Cell (row, col) of the worlds that holds a point in map metres; outside of the grid where the point is."""
+        return self.clean.frame.metres_to_cell(x, y)
+
+    def cell_to_metres(self, row: int, col: int) -> tuple[float, float]:
+        """Centre of a cell of the worlds, in map metres."""
+        return self.clean.frame.cell_to_metres(row, col)
+
+
+def parse_spec(spec: str) -> RosMapConfig:
+    """``map:FILE.yaml,option=value,...`` as a configuration.
+
+    Raises:
+        MapError: the text is not of that form.
+    """
+    file, *options = spec.removeprefix(PREFIX).split(",")
+    usage = "write map:FILE.yaml[,places=FILE][,resolution=METRES][,radius=METRES]"
+    if not spec.startswith(PREFIX) or not file:
+        raise MapError(spec, "", f"names no map; {usage}")
+    values: dict[str, str] = {}
+    for option in options:
+        match = re.fullmatch(r"(places|resolution|radius)=(.+)", option)
+        if match is None or match[1] in values:
+            raise MapError(spec, option, f"is no option, or given twice; {usage}")
+        values[match[1]] = match[2]
+    try:
+        numbers = {name: float(values[name]) for name in ("resolution", "radius") if name in values}
+    except ValueError as error:
+        raise MapError(spec, "", f"{error}; {usage}") from error
+    return RosMapConfig(file, values.get("places"), **numbers)
+
+
+def clean_map(
+    image_map: OccupancyMap,
+    resolution: float = 0.2,
+    radius: float = 0.1,
+    start: Point | None = None,
+    source: str = "start",
+) -> CleanMap:
+    """The grid on which a robot of this radius can move, as the module describes.
+
+    Args:
+        image_map: the map as published.
+        resolution: size of a working cell in metres.
+        radius: the robot's radius in metres.
+        start: metres (x, y) whose component is kept; None: the largest.
+        source: the file that gives the start, for messages.
+
+    Raises:
+        MapError: the resolution is finer than the map's, nothing is left free, or the start lies outside or is blocked.
+    """
+    file, pixel = image_map.settings.file, image_map.settings.resolution
+    ratio = _exact(file, "resolution", resolution) / pixel
+    if ratio < 1:
+        raise MapError(file, "resolution", f"{resolution} m a cell is finer than the map's {float(pixel)} m a pixel")
+    blocked = _inflate(~image_map.free, _exact(file, "radius", radius) / pixel)
+    free = ~_resample(blocked, ratio)
+    height, width = free.shape
+    frame = GridFrame(height, width, float(ratio * pixel), *image_map.settings.origin)
+    if not free.any():
+        raise MapError(
+            file, "", f"nothing is left free with cells of {resolution} m and a radius of {radius} m; make them smaller"
+        )
+    kept = _largest_component(free) if start is None else _component_of(start, free, frame, source)
+    return _crop(kept, frame)
+
+
+def _exact(file: Path, field: str, number: float) -> Fraction:
+    if not np.isfinite(number) or number < 0:
+        raise MapError(file, field, f"{number} is not a finite number of metres, 0 or more")
+    return Fraction(str(number))
+
+
+def _inflate(blocked: Bool[np.ndarray, "H W"], pixels: Fraction) -> Bool[np.ndarray, "H W"]:
+    """Obstacles and all whose centre is within a radius, in pixels, of an obstacle's centre."""
+    distance = np.asarray(ndimage.distance_transform_edt(~np.pad(blocked, 1, constant_values=True)))[1:-1, 1:-1]
+    # Squared distances between centres are integers, so that the comparison can be exact.
+    return np.rint(distance**2) <= int(pixels * pixels)
+
+
+def _resample(blocked: Bool[np.ndarray, "H W"], ratio: Fraction) -> Bool[np.ndarray, "h w"]:
+    """Cells of ``ratio`` pixels, from the lower left corner; blocked if a pixel that shares area is, or is missing."""
+    upwards = _any_of_each(blocked[::-1], ratio)[::-1]
+    return _any_of_each(upwards.T, ratio).T
+
+
+def _any_of_each(blocked: Bool[np.ndarray, "H W"], ratio: Fraction) -> Bool[np.ndarray, "h W"]:
+    count = -(-len(blocked) // ratio)
+    spans = [(int(cell * ratio), int(-(-(cell + 1) * ratio // 1))) for cell in range(count)]
+    # Beyond the image is an obstacle: it blocks a last cell that reaches over its edge.
+    padded = np.pad(blocked, ((0, spans[-1][1] + 1 - len(blocked)), (0, 0)), constant_values=True)
+    # `reduceat` reduces between consecutive indices; every other result spans one cell.
+    return np.logical_or.reduceat(padded, np.array(spans).ravel(), axis=0)[::2]
+
+
+def _largest_component(free: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    labels = component_labels(free)
+    return labels == 1 + np.argmax(np.bincount(labels.ravel())[1:])
+
+
+def _component_of(
+    start: Point, free: Bool[np.ndarray, "H W"], frame: GridFrame, source: str
+) -> Bool[np.ndarray, "H W"]:
+    cell = frame.metres_to_cell(*start)
+    inside = frame.contains(*cell)
+    if not inside or not free[cell]:
+        x, y = nearest_free(start, free, frame)
+        why = (
+            "is blocked: it lies in or too near an obstacle, or in unknown space" if inside else "is outside of the map"
+        )
+        raise MapError(
+            source, "start", f"[{start[0]:g}, {start[1]:g}] {why}; the nearest free cell is at [{x:.2f}, {y:.2f}]"
+        )
+    labels = component_labels(free)
+    return labels == labels[cell]
+
+
+def _crop(kept: Bool[np.ndarray, "H W"], frame: GridFrame) -> CleanMap:
+    rows, cols = np.flatnonzero(kept.any(axis=1)), np.flatnonzero(kept.any(axis=0))
+    content = kept[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
+    free = np.pad(content, 1)
+    return CleanMap(free, frame.window(int(rows[0]) - 1, int(cols[0]) - 1, *free.shape))
+
+
+def _find_places(config: RosMapConfig, image_map: OccupancyMap) -> Places:
+    file = Path(config.file).with_suffix(".places.yaml") if config.places is None else Path(str(config.places))
+    if config.places is not None or file.is_file():
+        return load_places(file)
+    clean = clean_map(image_map, config.resolution, config.radius)
+    cells = np.argwhere(clean.free)
+    (x0, y0), (x1, y1) = (clean.frame.cell_to_metres(*map(int, cells[i])) for i in (0, -1))
+    raise MapError(
+        Path(config.file),
+        "places",
+        f"{file} does not exist, and a map has no propositions of its own. Write it, in map metres, for instance\n"
+        "propositions:\n"
+        f"  document: [{{point: [{x0:.2f}, {y0:.2f}], radius: 0.5}}]\n"
+        f"  package: [{{point: [{x1:.2f}, {y1:.2f}], radius: 0.5}}]\n"
+        "tasks:\n"
+        '  "1": F document & F package\n',
+    )

@@ -1,0 +1,46 @@
+"""Seeds: which worlds are for calibrating, training, validating and testing, kept apart by construction.
+
+Within a family, the key of a world is ``fold_in`` of the family's key with one 32-bit number whose high bits are the
+split and whose low bits are the index. ``fold_in`` enciphers that number (Threefry) under the family's key, so it is
+one-to-one: no two pairs (split, index) share a key.
+
+Rule of the project: parameters of an environment are chosen on CALIBRATION; training, tuning and mending look at TRAINING
+and VALIDATION; TEST is for the figures that are reported, and every run on it is logged. World ``N`` of the command line
+is index ``N`` of VALIDATION unless another split is named.
+
+The key of a world makes only the world. What a trial draws comes from the trial's own key.
+"""
+
+import enum
+import zlib
+
+import jax
+from jaxtyping import PRNGKeyArray
+
+_INDEX_BITS = 28
+MAX_INDEX: int = 2**_INDEX_BITS - 1
+"""Largest index of a world in a split."""
+
+_ROOT_SEED = 20210531
+
+
+class Split(enum.StrEnum):
+    """What the worlds of a split may be used for; the split's number in the keys is its place in this list."""
+
+    CALIBRATION = "calibration"
+    TRAINING = "training"
+    VALIDATION = "validation"
+    TEST = "test"
+
+
+def world_key(split: Split | str, index: int, family: str) -> PRNGKeyArray:
+    """The typed key of world ``index`` of a split of a family of worlds.
+
+    Raises:
+        ValueError: where the index is negative or above ``MAX_INDEX``, or the split has no such name.
+    """
+    number = list(Split).index(Split(split))
+    if not 0 <= index <= MAX_INDEX:
+        raise ValueError(f"the index of a world must lie in 0..{MAX_INDEX}, found {index}")
+    family_key = jax.random.fold_in(jax.random.key(_ROOT_SEED, impl="threefry2x32"), zlib.crc32(family.encode()))
+    return jax.random.fold_in(family_key, number << _INDEX_BITS | index)

@@ -1,0 +1,125 @@
+"""True P_S, R_S and R_F of every (subgoal, outcome class), from the underlying map (MODEL.md section 6).
+
+A path of subgoal ``s`` starts at ``s``. It passes through phases, which serve as automaton states of a product:
+
+* PORCH: on the subgoal's own frontier or on known cells beside it,
+* HIDDEN: in unobserved cells, entered from the porch,
+* SEEN: back in observed space through another frontier, never through its own.
+
+Every cell entered on the way carries a staying letter; the last one, from HIDDEN or SEEN or entered as the first
+unobserved cell, carries a letter of the class's cube. Staying depends on the automaton's state alone, so that the
+distances are solved once per (subgoal, state), for all classes of the state together.
+"""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float32, Int32
+
+from potlp_jax.planning.estimates import Estimates
+from potlp_jax.planning.product import LANES, arrivals_by_lane, distances_by_lane
+from potlp_jax.task.task import TaskArrays
+from potlp_jax.types import NO_STATE
+from potlp_jax.world.frontiers import Subgoals, frontier_cells
+from potlp_jax.world.grid import BeliefMap, World
+
+PORCH, HIDDEN, SEEN = range(3)
+
+
+@struct.dataclass(kw_only=True)
+class TrueMapEstimator:
+    """The oracle of MODEL.md section 8: estimates are the true labels of ``world``."""
+
+    world: World
+
+    def __call__(self, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays) -> Estimates:
+        return true_labels(self.world, belief, subgoals, task)
+
+
+def true_labels(world: World, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays) -> Estimates:
+    """Labels of every real (subgoal, class); padded pairs have P_S = 0.
+
+    P_S is 0 or 1. R_S is the shortest successful path from the subgoal (the resolution where P_S = 0), R_F the
+    distance of the farthest unobserved cell that can be reached while staying, one way, 0 if there is none.
+    """
+    count, states = subgoals.mask.shape[0], task.transitions.shape[0]
+    lanes = max(min(LANES, count * states), 1)
+    stays = task.transitions == jnp.arange(states, dtype=jnp.int32)[:, None]
+    # One state for each class, of those whose staying letters are the class's.
+    same_stay = jnp.all(task.class_stay[:, None, :] == stays[None, :, :], axis=2)
+    state_of_class = jnp.argmax(same_stay, axis=1)
+    used = jnp.any((state_of_class[:, None] == jnp.arange(states)[None, :]) & task.class_mask[:, None], axis=0)
+
+    # Real pairs first, so that chunks of padding cost next to nothing.
+    real = (subgoals.mask[:, None] & used[None, :]).reshape(-1)
+    order = jnp.argsort(~real, stable=True).astype(jnp.int32)
+    missing = -(count * states) % lanes
+    chunks = (jnp.pad(order, (0, missing)).reshape(-1, lanes), jnp.pad(real[order], (0, missing)).reshape(-1, lanes))
+
+    def label(chunk):
+        pairs, real = chunk
+        return _labels_of_lanes(world, belief, subgoals, task, stays, pairs // states, pairs % states, real)
+
+    success_cost, failure_cost = jax.lax.map(label, chunks)
+    back = jnp.argsort(order)
+    success_cost = success_cost.reshape(-1, task.class_mask.shape[0])[back].reshape(count, states, -1)
+    failure_cost = failure_cost.reshape(-1)[back].reshape(count, states)
+    success_cost = jnp.take_along_axis(success_cost, state_of_class[None, None, :], axis=1)[:, 0]
+    reached = jnp.isfinite(success_cost) & task.class_mask[None, :]
+    return Estimates(
+        success_probability=reached.astype(jnp.float32),
+        success_cost=jnp.where(reached, success_cost, world.resolution),
+        failure_cost=failure_cost[:, state_of_class],
+    )
+
+
+def _labels_of_lanes(
+    world: World,
+    belief: BeliefMap,
+    subgoals: Subgoals,
+    task: TaskArrays,
+    stays: Bool[Array, "Z L"],
+    subgoal: Int32[Array, " lanes"],
+    state: Int32[Array, " lanes"],
+    real: Bool[Array, " lanes"],
+) -> tuple[Float32[Array, "lanes C"], Float32[Array, " lanes"]]:
+    """R_S of every class (``inf`` where it fails) and R_F, for paths of some subgoals that stay in some states."""
+    free = ~world.occupied
+    staying = jnp.moveaxis(stays[:, world.letters][state], 0, -1) & free[:, :, None]
+    hidden = belief.unknown[:, :, None]
+    own = subgoals.component[:, :, None] == subgoal[None, None, :]
+    porch = _with_neighbours(own) & ~hidden
+    # Also a frontier that known space does not reach: a goal may have been seen across a gap, or through a fire.
+    way_back = frontier_cells(belief, jnp.ones_like(free))[:, :, None] & ~own
+
+    def enter(*ways: tuple[Bool[Array, "H W lanes"] | Bool[Array, "H W 1"], int]) -> Int32[Array, "H W lanes"]:
+        phase = jnp.full(staying.shape, NO_STATE, jnp.int32)
+        for allowed, next_phase in ways:
+            phase = jnp.where(allowed & staying, next_phase, phase)
+        return phase
+
+    transitions = jnp.stack(
+        [enter((porch, PORCH), (hidden, HIDDEN)), enter((hidden, HIDDEN), (way_back, SEEN)), enter((~hidden & ~own, SEEN))]
+    )
+    start = jnp.where(real, PORCH, NO_STATE).astype(jnp.int32)
+    cost = distances_by_lane(transitions, free, subgoals.cells[subgoal], start, world.resolution)
+
+    # The last move of a success: where it may lead from each phase, whatever the letter.
+    ends = (hidden, hidden | way_back, ~hidden & ~own)
+    arrival = arrivals_by_lane(cost, free, world.resolution)
+    last = jnp.min(jnp.stack([jnp.where(way, arrival[phase], jnp.inf) for phase, way in enumerate(ends)]), axis=0)
+
+    def cheapest(go: Bool[Array, " L"]) -> Float32[Array, " lanes"]:
+        return jnp.min(jnp.where((go[world.letters] & free)[:, :, None], last, jnp.inf), axis=(0, 1))
+
+    explored = hidden & jnp.isfinite(cost[HIDDEN])
+    failure_cost = jnp.max(jnp.where(explored, cost[HIDDEN], 0.0), axis=(0, 1))
+    return jax.lax.map(cheapest, task.class_go).T, failure_cost
+
+
+def _with_neighbours(cells: Bool[Array, "H W lanes"]) -> Bool[Array, "H W lanes"]:
+    """The cells and their eight neighbours."""
+    height, width = cells.shape[:2]
+    padded = jnp.pad(cells, ((1, 1), (1, 1), (0, 0)))
+    shifted = [padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]
+    return jnp.any(jnp.stack(shifted), axis=0)

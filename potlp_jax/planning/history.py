@@ -1,0 +1,401 @@
+"""What a rollout knows, what follows from it, and what can still be done: the paper's b_h (section III-B).
+
+Knowledge is three-valued - unknown, holds, fails - per subgoal and condition. Attempting an action settles its
+condition at its subgoal; what follows is added at once:
+
+* a condition implies every weaker one, so ``holds`` travels forward along the task's implications and ``fails``
+  backward;
+* a condition made of several cubes holds exactly if one of its cubes does.
+
+The closure is complete: whatever is true in every assignment that agrees with what is known is itself known, so a
+condition that is still unknown can turn out either way and no rollout ever contradicts itself. Every rule has at most
+one negative literal, so unit propagation of failures decides entailment: a condition holds exactly if assuming that
+it fails makes a condition fail that is known to hold. Without conditions of several cubes one round suffices.
+
+Sets are bit masks in ``uint32`` words: a search carries them down the tree, and stores none.
+
+References:
+  Bradley et al., Learning and Planning for Temporally Extended Tasks in Unknown Environments, ICRA 2021, Eq. 3.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float32, Int32, UInt32
+
+from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.types import NO_CLASS, NO_STATE
+
+WORD_BITS: int = 32
+
+
+@struct.dataclass(kw_only=True)
+class History:
+    """Summary of a rollout: all that later costs and choices depend on.
+
+    Attributes:
+      place: node of the problem: the subgoal beyond which the robot is, or S for the robot's own cell.
+      state: automaton state.
+      owed: way back out of the unknown region, R_S or R_F of the last action by its outcome; 0 at the robot.
+      holds: per subgoal, bit mask over conditions known to hold there.
+      fails: per subgoal, bit mask over conditions known to fail there.
+      visited: per node, bit mask over the states in which the rollout has been there since it last learnt something.
+
+    ``M`` conditions take ``W = ceil(M / 32)`` words, ``Z`` states ``V = ceil(Z / 32)`` (at least one each); see
+    ``pack_bits`` and ``unpack_bits``.
+    """
+
+    place: Int32[Array, "*B"]
+    state: Int32[Array, "*B"]
+    owed: Float32[Array, "*B"]
+    holds: UInt32[Array, "*B S W"]
+    fails: UInt32[Array, "*B S W"]
+    visited: UInt32[Array, "*B S1 V"]
+
+
+@struct.dataclass(kw_only=True)
+class ActionTerms:
+    """The terms of Eq. 3 for every action of one history; the last action is finish (P_S = 1, R_S = R_F = 0).
+
+    ``distance`` is D, the way back that is owed included; inf where the action is not real or out of reach.
+    ``certain`` is True where the action's condition is known to hold. Only where ``available`` are the others of use.
+    """
+
+    distance: Float32[Array, "*B A"]
+    success_probability: Float32[Array, "*B A"]
+    success_cost: Float32[Array, "*B A"]
+    failure_cost: Float32[Array, "*B A"]
+    certain: Bool[Array, "*B A"]
+    available: Bool[Array, "*B A"]
+
+
+@struct.dataclass(kw_only=True)
+class ActionRow:
+    """What does not depend on the history, per action (leading axis or axes ``*A``).
+
+    ``subgoal``, ``from_state``, ``to_state`` are (S, NO_STATE, an accepting state) for finish. Cubes are sorted by
+    R_S; ``cube_bits`` marks each cube's class in the masks over conditions and is empty for padding.
+    ``forward`` and ``backward`` are the conditions that the action's condition implies and is implied by.
+    """
+
+    subgoal: Int32[Array, "*A"]
+    from_state: Int32[Array, "*A"]
+    to_state: Int32[Array, "*A"]
+    cube_probability: Float32[Array, "*A K"]
+    cube_cost: Float32[Array, "*A K"]
+    cube_bits: UInt32[Array, "*A K W"]
+    failure_cost: Float32[Array, "*A"]
+    condition_bits: UInt32[Array, "*A W"]
+    forward: UInt32[Array, "*A W"]
+    backward: UInt32[Array, "*A W"]
+    end_bits: UInt32[Array, "*A V"]
+
+
+@struct.dataclass(kw_only=True)
+class ActionTables:
+    """A problem, rearranged by action for search.
+
+    ``actions`` has the leading axis A. ``distance[u, z, a]`` is the travel of action ``a`` from node ``u`` in state
+    ``z`` without what is owed: 0 where ``stays_inside`` (same subgoal, same state), inf where the action is not real.
+    ``backward`` lists for each condition those that imply it; ``cubes`` the classes of each of the Q conditions of
+    several cubes, which are the last Q of the M.
+    """
+
+    actions: ActionRow
+    distance: Float32[Array, "*B S1 Z A"]
+    stays_inside: Bool[Array, "*B S1 Z A"]
+    accepting: Bool[Array, "*B Z"]
+    backward: UInt32[Array, "*B M W"]
+    cubes: UInt32[Array, "*B Q W"]
+    compound_mask: Bool[Array, "*B Q"]
+
+
+def pack_bits(flags: Bool[Array, "*N n"]) -> UInt32[Array, "*N w"]:
+    """Flags along the last axis as 32-bit words, lowest bit first; at least one word."""
+    words = max(1, -(-flags.shape[-1] // WORD_BITS))
+    padding = [(0, 0)] * (flags.ndim - 1) + [(0, words * WORD_BITS - flags.shape[-1])]
+    bits = jnp.pad(flags, padding).reshape(*flags.shape[:-1], words, WORD_BITS).astype(jnp.uint32)
+    weights = jnp.asarray(np.uint32(1) << np.arange(WORD_BITS, dtype=np.uint32))
+    return jnp.sum(bits * weights.reshape((1,) * (bits.ndim - 1) + (-1,)), axis=-1, dtype=jnp.uint32)
+
+
+def unpack_bits(words: UInt32[Array, "*N w"], count: int) -> Bool[Array, "*N n"]:
+    """Inverse of ``pack_bits``: the first ``count`` flags."""
+    shifts = jnp.arange(WORD_BITS, dtype=jnp.uint32).reshape((1,) * words.ndim + (-1,))
+    bits = (words[..., None] >> shifts) & jnp.uint32(1)
+    return (bits != 0).reshape(*words.shape[:-1], -1)[..., :count]
+
+
+def initial_history(problem: PlanningProblem) -> History:
+    """At the robot, nothing known, nothing owed."""
+    subgoals, states = problem.subgoal_count, problem.task.state_mask.shape[-1]
+    words = max(1, -(-problem.task.condition_mask.shape[-1] // WORD_BITS))
+    unknown = jnp.zeros((subgoals, words), jnp.uint32)
+    at_robot = jnp.arange(subgoals + 1)[:, None] == subgoals
+    return History(
+        place=jnp.int32(subgoals),
+        state=problem.dfa_state,
+        owed=jnp.float32(0.0),
+        holds=unknown,
+        fails=unknown,
+        visited=pack_bits(at_robot & (jnp.arange(states) == problem.dfa_state)[None, :]),
+    )
+
+
+def action_terms(problem: PlanningProblem, history: History) -> ActionTerms:
+    """D, P_S, R_S, R_F of every action given the history, and whether it is available.
+
+    An action is available where it is real and can be reached, its P_S is not 0, and it does not merely lead back:
+    one whose condition is known to hold and that ends where the rollout has been since it last learnt something is
+    not. An accepting history has no actions. A condition that holds has P_S = 1, also where the estimates say that
+    none of its cubes can succeed; its R_S is then that of the cheapest cube not known to fail.
+    """
+    return terms_of_all(action_tables(problem), history)
+
+
+def step(problem: PlanningProblem, history: History, action: Int32[Array, ""], success: Bool[Array, ""]) -> History:
+    """The history after ``action`` with the given outcome. The action must be available; finish always succeeds."""
+    tables = action_tables(problem)
+    row = jax.tree.map(lambda leaf: leaf[action], tables.actions)
+    return step_row(tables, row, history, success)
+
+
+def action_tables(problem: PlanningProblem) -> ActionTables:
+    """Rearrange an unbatched problem by action."""
+    task, subgoals, edges = problem.task, problem.subgoal_count, problem.edge_count
+    states, classes = task.state_mask.shape[-1], task.class_mask.shape[-1]
+    condition_bits = pack_bits(jnp.eye(task.condition_mask.shape[-1], dtype=jnp.bool_))
+    cubes = jnp.any(
+        task.condition_classes[:, :, None] == jnp.arange(condition_bits.shape[0], dtype=jnp.int32)[None, None, :],
+        axis=1,
+    )
+    distance = _with_finish(
+        jnp.where(
+            problem.subgoal_mask[None, None, :, None] & task.edge_mask[None, None, None, :],
+            problem.travel[..., task.edges[:, 0]],
+            jnp.inf,
+        ).reshape(subgoals + 1, states, subgoals * edges),
+        problem.finish,
+    )
+    rows = _action_rows(problem, condition_bits)
+    node, state = jnp.arange(subgoals + 1)[:, None, None], jnp.arange(states)[None, :, None]
+    inside = (rows.subgoal[None, None, :] == node) & (rows.from_state[None, None, :] == state)
+    real = _with_finish((problem.subgoal_mask[:, None] & task.edge_mask[None, :]).reshape(-1), jnp.array(False))
+    inside = inside & real[None, None, :]
+    return ActionTables(
+        actions=rows,
+        distance=jnp.where(inside, 0.0, distance),
+        stays_inside=inside,
+        accepting=task.accepting & task.state_mask,
+        backward=pack_bits(task.implies.T),
+        cubes=pack_bits(cubes)[classes:],
+        compound_mask=task.condition_mask[classes:],
+    )
+
+
+def terms_of_all(tables: ActionTables, history: History) -> ActionTerms:
+    """``action_terms`` from the tables of the problem."""
+    rows = tables.actions
+    holds, fails, visited = (
+        _per_action(words, rows.subgoal.shape[0]) for words in (history.holds, history.fails, history.visited[:-1])
+    )
+    probability, success_cost, certain = knowledge_terms(rows, holds, fails)
+    base = tables.distance[history.place, history.state]
+    inside = tables.stays_inside[history.place, history.state]
+    distance = jnp.where(inside, 0.0, base + history.owed)
+    leads_back = certain & _overlaps(visited, rows.end_bits)
+    live = ~tables.accepting[history.state]
+    return ActionTerms(
+        distance=distance,
+        success_probability=probability,
+        success_cost=success_cost,
+        failure_cost=rows.failure_cost,
+        certain=certain,
+        available=jnp.isfinite(distance) & (probability > 0) & ~leads_back & live,
+    )
+
+
+def knowledge_terms(
+    rows: ActionRow, holds: UInt32[Array, "*A W"], fails: UInt32[Array, "*A W"]
+) -> tuple[Float32[Array, "*A"], Float32[Array, "*A"], Bool[Array, "*A"]]:
+    """P_S, R_S and whether the condition is known to hold, from the masks of each action's own subgoal.
+
+    Cubes are tried in order of R_S (MODEL.md section 3): P = 1 - Π(1 - P_i), R_S = Σ R_i P_i Π_{j<i}(1 - P_j) / P,
+    with P_i = 1 or 0 where cube i is known. The first cube that can succeed is taken as it is, so that padding does
+    not change a result by rounding.
+    """
+    certain = _overlaps(holds, rows.condition_bits)
+    impossible = _overlaps(fails, rows.condition_bits)
+    probability = jnp.zeros(certain.shape, jnp.float32)
+    cost = jnp.full(certain.shape, jnp.inf, jnp.float32)
+    for k in range(rows.cube_cost.shape[-1]):
+        bits, cube_cost = rows.cube_bits[..., k, :], rows.cube_cost[..., k]
+        failed = _overlaps(fails, bits)
+        chance = jnp.where(_overlaps(holds, bits), 1.0, jnp.where(failed, 0.0, rows.cube_probability[..., k]))
+        share = (1.0 - probability) * chance
+        total = probability + share
+        mean = (cost * probability + cube_cost * share) / jnp.where(total > 0, total, 1.0)
+        first = (probability == 0) & ((chance > 0) | (jnp.isinf(cost) & ~failed))
+        cost = jnp.where(first, cube_cost, jnp.where(share > 0, mean, cost))
+        probability = jnp.where(first, chance, total)
+    probability = jnp.where(certain, 1.0, jnp.where(impossible, 0.0, probability))
+    return probability, jnp.where(jnp.isinf(cost), 0.0, cost), certain
+
+
+def knowledge_of(subgoal: Int32[Array, ""], history: History) -> tuple[UInt32[Array, "W"], UInt32[Array, "W"]]:
+    """What holds and what fails at one subgoal; nothing is known at the robot's node."""
+    here = jnp.arange(history.holds.shape[0], dtype=jnp.int32)[:, None] == subgoal
+    return _or_rows(jnp.where(here, history.holds, 0)), _or_rows(jnp.where(here, history.fails, 0))
+
+
+def step_row(tables: ActionTables, row: ActionRow, history: History, success: Bool[Array, ""]) -> History:
+    """``step`` from the action's row of the tables."""
+    subgoals = history.holds.shape[0]
+    here = jnp.arange(subgoals, dtype=jnp.int32)[:, None] == row.subgoal
+    holds, fails = knowledge_of(row.subgoal, history)
+    _, success_cost, certain = knowledge_terms(row, holds, fails)
+    holds, fails = settle(tables, row, holds, fails, success)
+    state = jnp.where(success, row.to_state, row.from_state)
+    nodes = jnp.arange(subgoals + 1, dtype=jnp.int32)[:, None]
+    arrived = jnp.where(nodes == row.subgoal, _single_bit(state, history.visited.shape[-1])[None, :], jnp.uint32(0))
+    return History(
+        place=row.subgoal,
+        state=state,
+        owed=jnp.where(success, success_cost, row.failure_cost),
+        holds=jnp.where(here, holds[None, :], history.holds),
+        fails=jnp.where(here, fails[None, :], history.fails),
+        visited=jnp.where(certain, history.visited | arrived, arrived),
+    )
+
+
+def settle(
+    tables: ActionTables,
+    row: ActionRow,
+    holds: UInt32[Array, "W"],
+    fails: UInt32[Array, "W"],
+    success: Bool[Array, ""],
+) -> tuple[UInt32[Array, "W"], UInt32[Array, "W"]]:
+    """Knowledge about one subgoal after the action's condition has held or failed there, closed."""
+    holds = jnp.where(success, holds | row.forward, holds)
+    fails = jnp.where(success, fails, fails | row.backward)
+    if tables.cubes.shape[0] == 0:
+        return holds, fails
+    fails = _propagate_failures(tables, fails)
+    # A condition holds if its failure would refute what is known to hold.
+    refuted = _propagate_failures(tables, fails[None, :] | tables.backward)
+    return pack_bits(_overlaps(refuted, holds[None, :])), fails
+
+
+def _propagate_failures(tables: ActionTables, fails: UInt32[Array, "*N W"]) -> UInt32[Array, "*N W"]:
+    """Close failures: all cubes of a condition fail, so it fails, and so does what implies it.
+
+    Every round but the last fails one more condition of several cubes, so their number bounds the rounds.
+    """
+    count = tables.cubes.shape[0]
+    backward = tables.backward[-count:]
+
+    def close_once(_, fails):
+        for q in range(count):
+            open_cubes = tables.cubes[q].reshape((1,) * (fails.ndim - 1) + (-1,)) & ~fails
+            failed = jnp.all(open_cubes == 0, axis=-1, keepdims=True) & tables.compound_mask[q]
+            implying = backward[q].reshape((1,) * (fails.ndim - 1) + (-1,))
+            fails = fails | jnp.where(failed, implying, jnp.uint32(0))
+        return fails
+
+    return jax.lax.fori_loop(0, count, close_once, fails)
+
+
+def _action_rows(problem: PlanningProblem, condition_bits: UInt32[Array, "M W"]) -> ActionRow:
+    task, subgoals, edges = problem.task, problem.subgoal_count, problem.edge_count
+    states = task.state_mask.shape[-1]
+    classes = _rows(task.condition_classes, task.edge_condition)
+    real = jnp.broadcast_to(classes[None] != NO_CLASS, (subgoals, *classes.shape))
+    probability = jnp.where(real, _columns(problem.success_probability, classes), 0.0)
+    cost = jnp.where(real, _columns(problem.success_cost, classes), jnp.inf)
+    failure_cost = jnp.max(jnp.where(real, _columns(problem.failure_cost, classes), 0.0), axis=-1, initial=0.0)
+    order = jnp.argsort(cost, axis=-1, stable=True)
+    probability, cost = (jnp.take_along_axis(values, order, axis=-1) for values in (probability, cost))
+    sorted_classes = jnp.take_along_axis(jnp.broadcast_to(classes[None], real.shape), order, axis=-1)
+    cube_bits = jnp.where((sorted_classes != NO_CLASS)[..., None], _rows(condition_bits, sorted_classes), 0)
+    backward, forward = pack_bits(task.implies.T), pack_bits(task.implies)
+    states_of_edges = task.edges.T.astype(jnp.int32)
+
+    def by_edge(values: Array, finish: Array) -> Array:
+        """One row per edge becomes one row per action."""
+        repeated = jnp.broadcast_to(values[None], (subgoals, *values.shape))
+        return _with_finish_row(repeated.reshape(subgoals * edges, *values.shape[1:]), finish)
+
+    def by_action(values: Array, finish: Array) -> Array:
+        return _with_finish_row(values.reshape(subgoals * edges, *values.shape[2:]), finish)
+
+    cubes, words = cost.shape[-1], condition_bits.shape[-1]
+    no_bits = jnp.zeros((words,), jnp.uint32)
+    accepting_state = jnp.argmax(task.accepting & task.state_mask).astype(jnp.int32)
+    finish_cubes = jnp.arange(cubes) == 0
+    to_state = by_edge(states_of_edges[1], accepting_state)
+    node = jnp.broadcast_to(jnp.arange(subgoals, dtype=jnp.int32)[:, None], (subgoals, edges))
+    return ActionRow(
+        subgoal=by_action(node, jnp.int32(subgoals)),
+        from_state=by_edge(states_of_edges[0], jnp.int32(NO_STATE)),
+        to_state=to_state,
+        cube_probability=by_action(probability, finish_cubes.astype(jnp.float32)),
+        cube_cost=by_action(cost, jnp.where(finish_cubes, 0.0, jnp.inf)),
+        cube_bits=by_action(cube_bits, jnp.zeros((cubes, words), jnp.uint32)),
+        failure_cost=by_action(failure_cost, jnp.float32(0.0)),
+        condition_bits=by_edge(_rows(condition_bits, task.edge_condition), no_bits),
+        forward=by_edge(_rows(forward, task.edge_condition), no_bits),
+        backward=by_edge(_rows(backward, task.edge_condition), no_bits),
+        end_bits=_single_bit(to_state, max(1, -(-states // WORD_BITS))),
+    )
+
+
+def _rows(values: Array, index: Array) -> Array:
+    """``values[index]``, zeros where there is nothing to index (a task without conditions)."""
+    if values.shape[0] == 0:
+        return jnp.zeros((*index.shape, *values.shape[1:]), values.dtype)
+    return values[jnp.maximum(index, 0)]
+
+
+def _columns(values: Array, index: Array) -> Array:
+    """``values[:, index]``, zeros where there is nothing to index."""
+    if values.shape[1] == 0:
+        return jnp.zeros((values.shape[0], *index.shape), values.dtype)
+    return values[:, jnp.maximum(index, 0)]
+
+
+def _with_finish(values: Array, finish: Array) -> Array:
+    """Append the finish action along the last axis."""
+    return jnp.concatenate([values, finish[..., None]], axis=-1)
+
+
+def _with_finish_row(values: Array, finish: Array) -> Array:
+    """Append the finish action along the first axis."""
+    return jnp.concatenate([values, finish[None].astype(values.dtype)], axis=0)
+
+
+def _per_action(words: UInt32[Array, "S W"], actions: int) -> UInt32[Array, "A W"]:
+    """The masks of each action's own subgoal; empty for finish."""
+    subgoals, width = words.shape
+    edges = (actions - 1) // max(subgoals, 1)
+    repeated = jnp.broadcast_to(words[:, None, :], (subgoals, edges, width)).reshape(actions - 1, width)
+    return _with_finish_row(repeated, jnp.zeros((width,), jnp.uint32))
+
+
+def _overlaps(first: UInt32[Array, "*N W"], second: UInt32[Array, "*N W"]) -> Bool[Array, "*N"]:
+    """Whether two sets have a common element. Unrolled over the few words: a reduction would be slower."""
+    common = first[..., 0] & second[..., 0]
+    for word in range(1, first.shape[-1]):
+        common = common | (first[..., word] & second[..., word])
+    return common != 0
+
+
+def _or_rows(words: UInt32[Array, "S W"]) -> UInt32[Array, "W"]:
+    return jax.lax.reduce(words, np.uint32(0), jax.lax.bitwise_or, (0,))
+
+
+def _single_bit(index: Int32[Array, "*N"], words: int) -> UInt32[Array, "*N w"]:
+    """The set with the one element ``index``; empty for a negative index."""
+    word = jnp.arange(words, dtype=jnp.int32).reshape((1,) * index.ndim + (-1,))
+    bit = jnp.uint32(1) << (index & (WORD_BITS - 1)).astype(jnp.uint32)
+    return jnp.where(word == (index >> 5)[..., None], bit[..., None], jnp.uint32(0))

@@ -1,0 +1,221 @@
+"""What a trial leaves behind: outcome, path, word and every decision, as plain host values and JSON.
+
+A record is self-contained: it holds the world, the task (as HOA, so that it is read without Spot) and, per cell, the
+step at which the cell was first seen, so that the belief at any step - and with it any decision - can be rebuilt.
+"""
+
+import dataclasses
+import json
+import math
+import zlib
+from collections.abc import Mapping
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int32
+
+from potlp_jax.world.grid import (
+    BeliefMap,
+    World,
+    belief_from_numpy,
+    pack_array,
+    unpack_array,
+    world_from_dict,
+    world_to_dict,
+)
+
+FORMAT = "potlp-trial-1"
+NEVER_SEEN: int = -1
+"""Entry of ``first_seen`` for a cell that was never observed."""
+
+
+class RecordError(ValueError):
+    """A file is not a trial record of this version; the message names the file and what is wrong."""
+
+
+class Outcome(StrEnum):
+    """How a trial ended (MODEL.md section 7)."""
+
+    SATISFIED = "satisfied"
+    INFEASIBLE = "infeasible"
+    STUCK = "stuck"
+    BUDGET = "budget"
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionRecord:
+    """One available action of a decision. ``subgoal`` is None for the finish action; costs in units of resolution."""
+
+    index: int
+    subgoal: int | None
+    cell: tuple[int, int] | None
+    from_state: int | None
+    to_state: int | None
+    success_probability: float
+    success_cost: float
+    failure_cost: float
+    distance: float
+    q_value: float
+    visits: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Decision:
+    """One decision: where the robot stood, what it considered, what it chose.
+
+    ``kind`` is ``"action"`` (toward a subgoal), ``"finish"`` (acceptance in known space), ``"frontier"`` (nearest
+    frontier: the baseline's move), ``"fallback"`` (the same as liveness rule of a planner without available action) or
+    ``"none"``. ``choice`` is the index of the chosen action, None unless the policy searches. ``path`` is the part of
+    the known-space path that may be executed before the next decision, starting at ``cell``.
+    """
+
+    index: int
+    step: int
+    cell: tuple[int, int]
+    state: int
+    key: tuple[int, ...]
+    kind: str
+    choice: int | None
+    target: tuple[int, int] | None
+    target_state: int | None
+    value: float
+    fallback: bool
+    status: int
+    subgoals: tuple[tuple[int, int], ...]
+    actions: tuple[ActionRecord, ...]
+    path: tuple[tuple[int, int], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """A finished trial. ``path``, ``states`` and ``word`` have one entry per visited cell, the start included.
+
+    ``word[i]`` is the letter of ``path[i]`` and ``states[i]`` the automaton's state after reading it.
+    ``first_seen[row, column]`` is the index into ``path`` at which the cell was first observed, or ``NEVER_SEEN``.
+    """
+
+    outcome: Outcome
+    cost: float
+    path: tuple[tuple[int, int], ...]
+    word: tuple[int, ...]
+    states: tuple[int, ...]
+    decisions: tuple[Decision, ...]
+    first_seen: Int32[np.ndarray, "H W"]
+    world: World
+    task_text: str
+    task_hoa: str
+    propositions: tuple[str, ...]
+    policy: str
+    environment: str
+    seed: int | None
+    status: int
+    config: Mapping[str, Any]
+    versions: Mapping[str, str]
+
+    def belief_at(self, step: int) -> BeliefMap:
+        """The belief after observing from ``path[step]``."""
+        seen = (self.first_seen != NEVER_SEEN) & (self.first_seen <= step)
+        cells = np.where(
+            seen, np.where(np.asarray(self.world.occupied), BeliefMap.OCCUPIED, BeliefMap.FREE), BeliefMap.UNKNOWN
+        )
+        letters = np.where(seen, np.asarray(self.world.letters), 0)
+        height, width = (int(size) for size in self.world.extent)
+        return belief_from_numpy(cells, letters, float(self.world.resolution), (height, width))
+
+    def summary(self) -> dict[str, Any]:
+        """The figures of the trial without its arrays."""
+        return {
+            "outcome": str(self.outcome),
+            "cost": self.cost,
+            "steps": len(self.path) - 1,
+            "decisions": len(self.decisions),
+            "fallbacks": sum(decision.fallback for decision in self.decisions),
+            "policy": self.policy,
+            "task": self.task_text,
+            "environment": self.environment,
+            "seed": self.seed,
+            "status": self.status,
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able values; infinite costs become the string ``"inf"``."""
+        data = {
+            field.name: getattr(self, field.name)
+            for field in dataclasses.fields(self)
+            if field.name not in ("decisions", "first_seen", "world")
+        }
+        data["outcome"] = str(self.outcome)
+        data["decisions"] = [dataclasses.asdict(decision) for decision in self.decisions]
+        data["first_seen"] = pack_array(self.first_seen)
+        data["world"] = world_to_dict(self.world)
+        return _finite({"format": FORMAT, **data})
+
+    def save(self, path: Path) -> None:
+        """Write the record as JSON."""
+        path.write_text(json.dumps(self.to_dict(), allow_nan=False))
+
+
+def load_trial(path: Path) -> Trial:
+    """Read a record written by ``Trial.save``. Raises RecordError where the file is not one."""
+    try:
+        data = json.loads(path.read_text())
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise RecordError(f"{path}: cannot be read as a trial record: {error}") from error
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        found = data.get("format") if isinstance(data, dict) else type(data).__name__
+        raise RecordError(f"{path}: not a trial record of format {FORMAT!r} (found {found!r}); run `potlp run` again")
+    try:
+        return _trial_from_dict(data)
+    except (KeyError, TypeError, ValueError, zlib.error) as error:
+        raise RecordError(f"{path}: the trial record is damaged: {error!r}") from error
+
+
+def _trial_from_dict(data: Mapping[str, Any]) -> Trial:
+    values = {field.name: data[field.name] for field in dataclasses.fields(Trial)}
+    values["outcome"] = Outcome(data["outcome"])
+    values["cost"] = float(data["cost"])
+    values["path"] = _cells(data["path"])
+    values["word"] = tuple(data["word"])
+    values["states"] = tuple(data["states"])
+    values["propositions"] = tuple(data["propositions"])
+    values["decisions"] = tuple(_decision_from_dict(decision) for decision in data["decisions"])
+    values["first_seen"] = unpack_array(data["first_seen"])
+    values["world"] = world_from_dict(data["world"])
+    return Trial(**values)
+
+
+def _decision_from_dict(data: Mapping[str, Any]) -> Decision:
+    values = dict(data)
+    values["cell"] = tuple(data["cell"])
+    values["target"] = None if data["target"] is None else tuple(data["target"])
+    values["key"] = tuple(data["key"])
+    values["value"] = float(data["value"])
+    values["subgoals"] = _cells(data["subgoals"])
+    values["path"] = _cells(data["path"])
+    values["actions"] = tuple(_action_from_dict(action) for action in data["actions"])
+    return Decision(**values)
+
+
+def _action_from_dict(data: Mapping[str, Any]) -> ActionRecord:
+    values = dict(data)
+    values["cell"] = None if data["cell"] is None else tuple(data["cell"])
+    for name in ("success_probability", "success_cost", "failure_cost", "distance", "q_value"):
+        values[name] = float(data[name])
+    return ActionRecord(**values)
+
+
+def _cells(rows: list[list[int]]) -> tuple[tuple[int, int], ...]:
+    return tuple((int(row), int(column)) for row, column in rows)
+
+
+def _finite(value: Any) -> Any:
+    """JSON knows no infinities; they are written as strings, which ``float`` reads back."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    if isinstance(value, Mapping):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return value

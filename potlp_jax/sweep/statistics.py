@@ -1,0 +1,218 @@
+"""Paired statistics of policies over the same worlds (docs/model.md, section 8).
+
+Costs are in units of resolution. A pair - one world with one trial of every policy - is dropped for all policies or
+for none. The savings tables are host objects: nothing here is traced.
+"""
+
+import dataclasses
+import math
+import warnings
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.stats import DegenerateDataWarning, bootstrap
+
+from potlp_jax.types import Status
+
+BASELINE = "baseline"
+KNOWN_MAP = "known-map"
+SATISFIED = "satisfied"
+
+LOSSES: Status = Status.SUBGOAL_OVERFLOW | Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW | Status.NOT_CONVERGED
+"""Status bits by which a fixed-size array or loop took something away from a trial; they are counted apart."""
+
+CONFIDENCE: float = 0.95
+RESAMPLES: int = 9_999
+
+
+@dataclasses.dataclass(frozen=True)
+class TrialResult:
+    """What the statistics need of one trial. ``budget`` is the cost at which the trial would have been given up."""
+
+    cost: float
+    outcome: str
+    budget: float
+    status: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class PolicyRow:
+    """One policy's figures; what is undefined (nothing to attain, fewer than two pairs, no pair) is NaN.
+
+    ``attainable_share`` is the share of the attainable savings, (Σ baseline − Σ ours) / (Σ baseline − Σ known map),
+    with its bootstrap interval ``attainable_low`` .. ``attainable_high``; ``net_savings`` is 1 − Σ ours / Σ baseline;
+    ``trial_savings`` is the mean of 1 − ours / baseline, with the standard error of that mean.
+    """
+
+    policy: str
+    attainable_share: float
+    attainable_low: float
+    attainable_high: float
+    net_savings: float
+    trial_savings: float
+    trial_savings_error: float
+    mean_cost: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """The rows of all policies over the same ``pairs`` worlds; ``dropped`` worlds were left out for all of them."""
+
+    pairs: int
+    dropped: int
+    rows: tuple[PolicyRow, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """The paired comparison.
+
+    ``satisfied`` has the worlds in which every policy ended satisfied and none lost anything to a bound of its arrays;
+    ``charged`` has all worlds, with a trial that did not end satisfied charged its budget. ``outcomes`` counts the
+    ends of trials per policy, ``losses`` the trials per policy and status bit of ``LOSSES``.
+    """
+
+    worlds: int
+    satisfied: Table
+    charged: Table
+    outcomes: Mapping[str, Mapping[str, int]]
+    losses: Mapping[str, Mapping[str, int]]
+
+    @classmethod
+    def from_results(
+        cls, results: Mapping[str, Sequence[TrialResult]], *, resamples: int = RESAMPLES, seed: int = 0
+    ) -> "Comparison":
+        """Compare the policies that are the keys of ``results``; entry ``i`` of each is its trial in world ``i``.
+
+        Raises ValueError where the baseline or the known map is missing, or the policies have unequally many trials.
+        """
+        _check(results)
+        costs = {policy: np.array([trial.cost for trial in trials], float) for policy, trials in results.items()}
+        budgets = {policy: np.array([trial.budget for trial in trials], float) for policy, trials in results.items()}
+        ended = {
+            policy: np.array([trial.outcome == SATISFIED for trial in trials], bool)
+            for policy, trials in results.items()
+        }
+        lost = [np.array([trial.status & LOSSES != 0 for trial in trials], bool) for trials in results.values()]
+        kept = np.all(list(ended.values()), axis=0) & ~np.any(lost, axis=0)
+        charged = {policy: np.where(ended[policy], costs[policy], budgets[policy]) for policy in results}
+        return cls(
+            worlds=len(kept),
+            satisfied=_table({policy: values[kept] for policy, values in costs.items()}, len(kept), resamples, seed),
+            charged=_table(charged, len(kept), resamples, seed),
+            outcomes={policy: _count([trial.outcome for trial in trials]) for policy, trials in results.items()},
+            losses={policy: _count_losses(trials) for policy, trials in results.items()},
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able values; undefined figures become None."""
+        return _defined(dataclasses.asdict(self))
+
+
+def attainable_share(
+    ours: Float64[np.ndarray, "*B"], baseline: Float64[np.ndarray, "*B"], known_map: Float64[np.ndarray, "*B"]
+) -> float:
+    """Share of the attainable savings over the given trials; NaN where the baseline leaves nothing to attain."""
+    return float(_share(ours, baseline, known_map))
+
+
+def attainable_interval(
+    ours: Float64[np.ndarray, " B"],
+    baseline: Float64[np.ndarray, " B"],
+    known_map: Float64[np.ndarray, " B"],
+    *,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+) -> tuple[float, float]:
+    """95 % paired bootstrap percentile interval of ``attainable_share``; NaNs where it is undefined.
+
+    A resample that holds no attainable savings counts toward both tails: where more than a tail is made of such
+    resamples there is no interval, rather than one that looks narrow because it ignores them.
+    """
+    if len(ours) < 2:
+        return math.nan, math.nan
+    with warnings.catch_warnings():
+        # Resamples without attainable savings are told apart below, so SciPy need not warn of them.
+        warnings.simplefilter("ignore", DegenerateDataWarning)
+        result = bootstrap(
+            (ours, baseline, known_map),
+            _share,
+            paired=True,
+            vectorized=True,
+            n_resamples=resamples,
+            batch=max(1, 2_000_000 // len(ours)),
+            method="percentile",
+            rng=np.random.default_rng(seed),
+        )
+    shares = result.bootstrap_distribution
+    tail = (1 - CONFIDENCE) / 2
+    low = np.quantile(np.where(np.isnan(shares), -np.inf, shares), tail, method="lower")
+    high = np.quantile(np.where(np.isnan(shares), np.inf, shares), 1 - tail, method="higher")
+    if not (np.isfinite(low) and np.isfinite(high)):
+        return math.nan, math.nan
+    return float(low), float(high)
+
+
+def _share(ours: np.ndarray, baseline: np.ndarray, known_map: np.ndarray, axis: int = -1) -> np.ndarray:
+    attainable = baseline.sum(axis) - known_map.sum(axis)
+    # Rounding of float32 costs must not pass for something to attain.
+    some = attainable > 1e-6 * baseline.sum(axis)
+    return np.where(some, (baseline.sum(axis) - ours.sum(axis)) / np.where(some, attainable, 1.0), np.nan)
+
+
+def _table(costs: Mapping[str, np.ndarray], worlds: int, resamples: int, seed: int) -> Table:
+    pairs = len(costs[BASELINE])
+    rows = tuple(
+        _row(policy, ours, costs[BASELINE], costs[KNOWN_MAP], resamples, seed) for policy, ours in costs.items()
+    )
+    return Table(pairs=pairs, dropped=worlds - pairs, rows=rows)
+
+
+def _row(
+    policy: str, ours: np.ndarray, baseline: np.ndarray, known_map: np.ndarray, resamples: int, seed: int
+) -> PolicyRow:
+    pairs = len(ours)
+    low, high = attainable_interval(ours, baseline, known_map, resamples=resamples, seed=seed)
+    # Where the baseline has nothing to walk, the task held at the start and nothing can be saved.
+    savings = 1 - np.divide(ours, baseline, out=np.ones(pairs), where=baseline > 0)
+    return PolicyRow(
+        policy=policy,
+        attainable_share=attainable_share(ours, baseline, known_map),
+        attainable_low=low,
+        attainable_high=high,
+        net_savings=float(1 - ours.sum() / baseline.sum()) if baseline.sum() > 0 else math.nan,
+        trial_savings=float(savings.mean()) if pairs else math.nan,
+        trial_savings_error=float(savings.std(ddof=1) / math.sqrt(pairs)) if pairs > 1 else math.nan,
+        mean_cost=float(ours.mean()) if pairs else math.nan,
+    )
+
+
+def _check(results: Mapping[str, Sequence[TrialResult]]) -> None:
+    missing = [policy for policy in (BASELINE, KNOWN_MAP) if policy not in results]
+    if missing:
+        raise ValueError(f"a paired comparison needs trials of {' and '.join(missing)}; add them to the policies")
+    lengths = {policy: len(trials) for policy, trials in results.items()}
+    if len(set(lengths.values())) > 1:
+        raise ValueError(f"the policies have unequally many trials, so they are not paired: {lengths}")
+
+
+def _count(names: Sequence[str]) -> dict[str, int]:
+    return dict(sorted(Counter(str(name) for name in names).items()))
+
+
+def _count_losses(trials: Sequence[TrialResult]) -> dict[str, int]:
+    bits = [bit for trial in trials for bit in Status(trial.status & LOSSES)]
+    return _count([str(bit.name).lower() for bit in bits])
+
+
+def _defined(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: _defined(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_defined(entry) for entry in value]
+    return value

@@ -1,0 +1,144 @@
+"""Deterministic automata as dense arrays, in one canonical form for every co-safe language."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Int, Int32
+
+from potlp_jax.task.formula import Formula, TaskError, load_spot
+
+
+@dataclass(frozen=True, eq=False)
+class Dfa:
+    """Minimal complete DFA of a co-safe language: a word is accepted when every continuation satisfies the task.
+
+    States are numbered breadth-first from the initial state, letters in increasing order, so that equal languages
+    have equal arrays. There is at most one accepting state, which is absorbing, and at most one trap state.
+
+    Attributes:
+        transitions: ``[z, letter]`` is the next state.
+        accepting: the task is satisfied, whatever follows.
+        trap: acceptance is out of reach.
+        initial: the state before the first letter is read; always 0.
+    """
+
+    transitions: Int32[np.ndarray, "Z L"]
+    accepting: Bool[np.ndarray, " Z"]
+    trap: Bool[np.ndarray, " Z"]
+    initial: int
+
+    @property
+    def num_states(self) -> int:
+        return self.transitions.shape[0]
+
+
+def translate(formula: Formula) -> str:
+    """Spot's deterministic complete Büchi automaton of the formula, in HOA format.
+
+    Raises:
+        TaskError: Spot is missing.
+    """
+    automaton = load_spot().translate(formula.parsed, "BA", "deterministic", "complete")
+    return automaton.to_str("hoa")
+
+
+def canonical_dfa(transitions: Int[np.ndarray, "Z L"], accepting: Bool[np.ndarray, " Z"], initial: int) -> Dfa:
+    """The minimal DFA of a complete deterministic Büchi automaton with state-based acceptance.
+
+    Args:
+        transitions: ``[z, letter]`` is the next state.
+        accepting: states that an accepted run visits infinitely often.
+        initial: where runs begin.
+
+    Raises:
+        TaskError: the language is not co-safe; names a state that shows it.
+    """
+    _, letter_class, representative = _letter_classes(transitions)
+    reduced = transitions[:, representative]
+    satisfied = _satisfied_states(reduced, accepting)
+    _check_co_safe(reduced, accepting, satisfied, initial)
+    block = _refine(reduced, satisfied)
+    order, number = _breadth_first(reduced, block, initial)
+    minimal = number[block[reduced[order]]][:, letter_class]
+    accepted = satisfied[order]
+    return Dfa(
+        transitions=np.ascontiguousarray(minimal, dtype=np.int32),
+        accepting=accepted,
+        trap=~_reaches(_adjacency(minimal), accepted),
+        initial=0,
+    )
+
+
+def _letter_classes(transitions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Letters that act alike: distinct columns, each letter's column, each column's first letter, in letter order."""
+    columns, first, inverse = np.unique(transitions, axis=1, return_index=True, return_inverse=True)
+    rank = np.argsort(first)
+    position = np.empty_like(rank)
+    position[rank] = np.arange(rank.size)
+    return columns[:, rank], position[inverse.ravel()], first[rank]
+
+
+def _adjacency(transitions: np.ndarray) -> np.ndarray:
+    """``[z, z'']``: some letter leads from z to z''."""
+    adjacency = np.zeros((transitions.shape[0],) * 2, dtype=bool)
+    adjacency[np.arange(transitions.shape[0])[:, None], transitions] = True
+    return adjacency
+
+
+def _reaches(adjacency: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """States from which a state of ``target`` can be reached in zero or more steps."""
+    reached = target
+    while True:
+        grown = reached | (adjacency & reached).any(axis=1)
+        if (grown == reached).all():
+            return reached
+        reached = grown
+
+
+def _satisfied_states(transitions: np.ndarray, accepting: np.ndarray) -> np.ndarray:
+    """States from which every infinite word is accepted: no run ends up avoiding ``accepting`` for ever."""
+    adjacency = _adjacency(transitions)
+    avoiding = ~accepting
+    while True:
+        shrunk = avoiding & (adjacency & avoiding).any(axis=1)
+        if (shrunk == avoiding).all():
+            return ~_reaches(adjacency, avoiding)
+        avoiding = shrunk
+
+
+def _check_co_safe(transitions: np.ndarray, accepting: np.ndarray, satisfied: np.ndarray, initial: int) -> None:
+    """Raises if an accepted run need never reach a satisfied state: then no finite word settles the task."""
+    adjacency = _adjacency(transitions)
+    reachable = _reaches(adjacency.T, np.arange(accepting.size) == initial)
+    for state in np.flatnonzero(reachable & accepting & ~satisfied):
+        if _reaches(adjacency, np.arange(accepting.size) == state)[transitions[state]].any():
+            raise TaskError(
+                f"the automaton is not co-safe: an accepted run can visit accepting state {state} for ever, yet not "
+                "every continuation from there is accepted"
+            )
+
+
+def _refine(transitions: np.ndarray, satisfied: np.ndarray) -> np.ndarray:
+    """Coarsest partition whose blocks agree on ``satisfied`` and move to equal blocks (Moore's algorithm)."""
+    block = satisfied.astype(np.int64)
+    count = 0
+    while True:
+        signature = np.concatenate([block[:, None], block[transitions]], axis=1)
+        distinct, block = np.unique(signature, axis=0, return_inverse=True)
+        block = block.ravel()
+        if distinct.shape[0] == count:
+            return block
+        count = distinct.shape[0]
+
+
+def _breadth_first(transitions: np.ndarray, block: np.ndarray, initial: int) -> tuple[np.ndarray, np.ndarray]:
+    """Representatives of the reachable blocks in breadth-first order, and each block's number (-1 unreachable)."""
+    number = np.full(block.max() + 1, -1)
+    number[block[initial]] = 0
+    order = [initial]
+    for state in order:
+        for successor in transitions[state]:
+            if number[block[successor]] < 0:
+                number[block[successor]] = len(order)
+                order.append(int(successor))
+    return np.array(order), number

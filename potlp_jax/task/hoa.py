@@ -1,0 +1,418 @@
+"""Automata as text: the part of the Hanoi Omega-Automata format (HOA v1) that a DFA needs.
+
+Read: one deterministic complete automaton with state-based Büchi acceptance (or ``t`` / ``f``), explicit labels on
+edges or states, implicit labels, aliases. Everything else is refused, with the line.
+
+References:
+    Babiak et al. 2015, "The Hanoi Omega-Automata Format"; http://adl.github.io/hoaf/
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from potlp_jax.task.automaton import Dfa
+from potlp_jax.task.cubes import Phi, minimal_cover
+from potlp_jax.task.formula import MAX_PROPOSITIONS, TaskError
+
+_TOKEN = re.compile(
+    r"""(?P<skip>\s+|/\*.*?\*/)
+      | (?P<string>"(?:[^"\\]|\\.)*")
+      | (?P<section>--(?:BODY|END|ABORT)--)
+      | (?P<header>[A-Za-z_][A-Za-z0-9_-]*:)
+      | (?P<alias>@[A-Za-z0-9_-]+)
+      | (?P<name>[A-Za-z_][A-Za-z0-9_-]*)
+      | (?P<number>\d+)
+      | (?P<symbol>[\[\](){}!&|])""",
+    re.VERBOSE | re.DOTALL,
+)
+_UNKNOWN = -1
+
+
+@dataclass(frozen=True, eq=False)
+class HoaAutomaton:
+    """What a HOA file says, over its own propositions and with its own state numbers.
+
+    Attributes:
+        name: the ``name:`` header, empty where there is none.
+        propositions: the ``AP:`` header; bit ``i`` of a letter is ``propositions[i]``.
+        transitions: ``[z, letter]`` is the next state.
+        accepting: states of the Büchi acceptance set.
+        initial: where runs begin.
+    """
+
+    name: str
+    propositions: tuple[str, ...]
+    transitions: Int[np.ndarray, "Z L"]
+    accepting: Bool[np.ndarray, " Z"]
+    initial: int
+
+
+@dataclass(frozen=True)
+class _Token:
+    kind: str
+    text: str
+    line: int
+
+
+@dataclass
+class _State:
+    """One state of the body; ``table`` holds the successor of each letter."""
+
+    line: int
+    accepting: bool
+    label: np.ndarray | None
+    table: np.ndarray
+    explicit_labels: bool = False
+    implicit_edges: int = 0
+
+
+@dataclass
+class _Header:
+    """The headers that matter."""
+
+    name: str = ""
+    num_states: int | None = None
+    initial: int = _UNKNOWN
+    propositions: tuple[str, ...] | None = None
+    acceptance: str | None = None
+    aliases: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+def read_hoa(text: str) -> HoaAutomaton:
+    """Parses the text of one automaton.
+
+    Raises:
+        TaskError: syntax, or anything that is not a complete deterministic automaton with state-based Büchi
+            acceptance; names the line.
+    """
+    return _Reader(_tokens(text)).read()
+
+
+def write_hoa(dfa: Dfa, propositions: Sequence[str], name: str) -> str:
+    """The DFA as a deterministic complete Büchi automaton; edge labels are canonical covers."""
+    quoted = "".join(f" {_quote(proposition)}" for proposition in propositions)
+    lines = [
+        "HOA: v1",
+        f"name: {_quote(name)}",
+        f"States: {dfa.num_states}",
+        f"Start: {dfa.initial}",
+        f"AP: {len(propositions)}{quoted}",
+        "acc-name: Buchi",
+        "Acceptance: 1 Inf(0)",
+        "properties: trans-labels explicit-labels state-acc deterministic complete terminal",
+        "--BODY--",
+    ]
+    for state, row in enumerate(dfa.transitions):
+        lines.append(f"State: {state}" + (" {0}" if dfa.accepting[state] else ""))
+        lines += [f"[{_label(minimal_cover(row == target))}] {target}" for target in np.unique(row)]
+    return "\n".join([*lines, "--END--", ""])
+
+
+def _quote(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _unquote(text: str) -> str:
+    return re.sub(r"\\(.)", r"\1", text[1:-1], flags=re.DOTALL)
+
+
+def _label(cubes: Sequence[Phi]) -> str:
+    """Cubes as a HOA label over proposition numbers, such as ``!0&1 | 2``."""
+    terms = ["&".join(f"{'' if sign > 0 else '!'}{i}" for i, sign in enumerate(phi) if sign) or "t" for phi in cubes]
+    return " | ".join(terms)
+
+
+def _tokens(text: str) -> list[_Token]:
+    """Splits the text; the last token marks the end."""
+    tokens: list[_Token] = []
+    position, line = 0, 1
+    while position < len(text):
+        match = _TOKEN.match(text, position)
+        if match is None:
+            raise _error(line, f"cannot read {text[position : position + 20].splitlines()[0]!r}")
+        if match.lastgroup != "skip":
+            tokens.append(_Token(str(match.lastgroup), match.group(), line))
+        line += match.group().count("\n")
+        position = match.end()
+    return [*tokens, _Token("end", "the end of the text", line)]
+
+
+def _error(line: int, message: str) -> TaskError:
+    return TaskError(f"HOA line {line}: {message}")
+
+
+class _Reader:
+    """Recursive descent over the tokens of one automaton."""
+
+    def __init__(self, tokens: list[_Token]):
+        self._tokens = tokens
+        self._position = 0
+        self._header = _Header()
+        self._letters = np.zeros(1, dtype=np.int64)
+        self._where: list[np.ndarray] = []  # per proposition the letters that hold it
+
+    def read(self) -> HoaAutomaton:
+        self._read_header()
+        header = self._header
+        states = self._read_body()
+        transitions, accepting = self._assemble(states)
+        return HoaAutomaton(header.name, header.propositions or (), transitions, accepting, header.initial)
+
+    # Tokens
+
+    @property
+    def _next(self) -> _Token:
+        return self._tokens[self._position]
+
+    def _take(self) -> _Token:
+        token = self._next
+        self._position += token.kind != "end"
+        return token
+
+    def _accept(self, text: str) -> bool:
+        found = self._next.text == text and self._next.kind != "string"
+        self._position += found
+        return found
+
+    def _expect(self, kind: str, what: str) -> _Token:
+        if self._next.kind != kind:
+            raise self._error(f"expected {what}, found {self._next.text}")
+        return self._take()
+
+    def _expect_symbol(self, symbol: str) -> None:
+        if not self._accept(symbol):
+            raise self._error(f"expected '{symbol}', found {self._next.text}")
+
+    def _number(self, what: str) -> int:
+        return int(self._expect("number", what).text)
+
+    def _error(self, message: str) -> TaskError:
+        return _error(self._next.line, message)
+
+    # Header
+
+    def _read_header(self) -> None:
+        if not self._accept("HOA:"):
+            raise self._error("the text does not begin with 'HOA: v1'")
+        version = self._expect("name", "the version")
+        if version.text != "v1":
+            raise _error(version.line, f"version {version.text} is not known; v1 is")
+        while self._next.text != "--BODY--":
+            self._read_header_item(self._expect("header", "a header or --BODY--"))
+        if self._header.initial == _UNKNOWN:
+            raise self._error("there is no 'Start:' header: the automaton needs one initial state")
+        if self._header.acceptance is None:
+            raise self._error("there is no 'Acceptance:' header")
+        self._take()
+
+    def _read_header_item(self, token: _Token) -> None:
+        header = self._header
+        match token.text:
+            case "States:":
+                header.num_states = self._number("the number of states")
+            case "Start:":
+                self._read_start(token)
+            case "AP:":
+                self._read_propositions(token)
+            case "Alias:":
+                name = self._expect("alias", "an alias such as @a").text
+                header.aliases[name] = self._disjunction()
+            case "Acceptance:":
+                self._read_acceptance(token)
+            case "name:":
+                header.name = _unquote(self._expect("string", "a name in quotes").text)
+            case other if other[0].islower():  # by the format, such headers carry no meaning that may not be ignored
+                self._skip_header_item()
+            case other:
+                raise _error(token.line, f"header '{other}' is not supported")
+
+    def _skip_header_item(self) -> None:
+        while self._next.kind not in ("header", "section", "end"):
+            self._take()
+
+    def _read_start(self, token: _Token) -> None:
+        if self._header.initial != _UNKNOWN:
+            raise _error(token.line, "several initial states: the automaton is not deterministic")
+        self._header.initial = self._number("the initial state")
+        if self._next.text == "&":
+            raise self._error("a conjunction of initial states: alternating automata are not supported")
+
+    def _read_propositions(self, token: _Token) -> None:
+        if self._header.propositions is not None:
+            raise _error(token.line, "a second 'AP:' header")
+        count = self._number("the number of propositions")
+        names: list[str] = []
+        while self._next.kind == "string":
+            names.append(_unquote(self._take().text))
+        if len(names) != count or len(set(names)) != count:
+            raise _error(token.line, f"'AP:' announces {count} distinct propositions, and lists {len(names)}")
+        if count > MAX_PROPOSITIONS:
+            raise _error(token.line, f"{count} propositions are too many: a task has at most {MAX_PROPOSITIONS}")
+        self._header.propositions = tuple(names)
+        self._letters = np.arange(2**count)
+        self._where = [(self._letters >> i & 1).astype(bool) for i in range(count)]
+
+    def _read_acceptance(self, token: _Token) -> None:
+        parts: list[str] = []
+        while self._next.kind not in ("header", "section", "end"):
+            parts.append(self._take().text)
+        condition = "".join(parts)
+        if condition not in ("0t", "0f", "1Inf(0)"):
+            raise _error(token.line, f"acceptance '{' '.join(parts)}' is not supported: it must be Büchi, '1 Inf(0)'")
+        self._header.acceptance = condition
+
+    # Labels: sets of letters
+
+    def _disjunction(self) -> np.ndarray:
+        letters = self._conjunction()
+        while self._accept("|"):
+            letters = letters | self._conjunction()
+        return letters
+
+    def _conjunction(self) -> np.ndarray:
+        letters = self._literal()
+        while self._accept("&"):
+            letters = letters & self._literal()
+        return letters
+
+    def _literal(self) -> np.ndarray:
+        if self._accept("!"):
+            return ~self._literal()
+        if self._accept("("):
+            letters = self._disjunction()
+            self._expect_symbol(")")
+            return letters
+        token = self._take()
+        if token.kind == "number":
+            return self._proposition(token)
+        if token.kind == "alias" and token.text in self._header.aliases:
+            return self._header.aliases[token.text]
+        if token.text in ("t", "f"):
+            return np.full(self._letters.size, token.text == "t")
+        raise _error(token.line, f"{token.text} is not a label: expected a proposition's number, an alias, t or f")
+
+    def _proposition(self, token: _Token) -> np.ndarray:
+        index = int(token.text)
+        if index >= len(self._where):
+            raise _error(token.line, f"proposition {index} does not exist: 'AP:' lists {len(self._where)}")
+        return self._where[index]
+
+    def _optional_label(self) -> np.ndarray | None:
+        if not self._accept("["):
+            return None
+        letters = self._disjunction()
+        self._expect_symbol("]")
+        return np.broadcast_to(letters, self._letters.shape)
+
+    # Body
+
+    def _read_body(self) -> dict[int, _State]:
+        states: dict[int, _State] = {}
+        while not self._accept("--END--"):
+            if not self._accept("State:"):
+                raise self._error(f"expected 'State:' or --END--, found {self._next.text}")
+            self._read_state(states)
+        if self._next.kind != "end":
+            raise self._error("there is text after --END--: one automaton is read, not several")
+        return states
+
+    def _read_state(self, states: dict[int, _State]) -> None:
+        label = self._optional_label()
+        line = self._next.line
+        index = self._number("a state's number")
+        if index in states:
+            raise _error(line, f"state {index} is described twice")
+        if self._next.kind == "string":
+            self._take()
+        table = np.full(self._letters.size, _UNKNOWN)
+        states[index] = state = _State(line, self._acceptance_sets(), label, table)
+        while self._next.text == "[" or self._next.kind == "number":
+            self._read_edge(index, state)
+
+    def _acceptance_sets(self) -> bool:
+        """Whether the set ``{0}`` follows."""
+        if not self._accept("{"):
+            return False
+        member = False
+        while not self._accept("}"):
+            if self._number("an acceptance set's number") != 0 or self._header.acceptance != "1Inf(0)":
+                raise self._error("an acceptance set that 'Acceptance:' does not have")
+            member = True
+        return member
+
+    def _read_edge(self, index: int, state: _State) -> None:
+        line = self._next.line
+        letters = self._edge_letters(state)
+        target = self._number("an edge's target state")
+        if self._next.text == "&":
+            raise self._error("universal branching: alternating automata are not supported")
+        if self._next.text == "{":
+            raise self._error("acceptance on an edge: only state-based acceptance is supported")
+        clash = np.flatnonzero(letters & (state.table >= 0) & (state.table != target))
+        if clash.size:
+            raise _error(
+                line,
+                f"state {index} is not deterministic: letter {self._letter_text(int(clash[0]))} leads to both "
+                f"{state.table[clash[0]]} and {target}",
+            )
+        state.table[letters] = target
+
+    def _edge_letters(self, state: _State) -> np.ndarray:
+        """The letters of the edge that begins here: its label, its state's, or the next letter in order."""
+        label = self._optional_label()
+        if label is not None:
+            if state.label is not None or state.implicit_edges:
+                raise self._error("an edge label beside a state label or implicit labels")
+            state.explicit_labels = True
+            return label
+        if state.explicit_labels:
+            raise self._error("an edge without label beside edges with labels")
+        if state.label is not None:
+            return state.label
+        state.implicit_edges += 1
+        if state.implicit_edges > self._letters.size:
+            raise self._error(f"more than {self._letters.size} edges with implicit labels")
+        return self._letters == state.implicit_edges - 1
+
+    # Result
+
+    def _assemble(self, states: dict[int, _State]) -> tuple[np.ndarray, np.ndarray]:
+        """Dense tables; refuses what is not complete."""
+        count = self._num_states(states)
+        for index, state in states.items():
+            outside = state.table[state.table >= count]
+            if outside.size:
+                raise _error(state.line, f"state {index} leads to state {outside[0]}, which is not described")
+            missing = np.flatnonzero(state.table == _UNKNOWN)
+            if missing.size:
+                raise _error(
+                    state.line,
+                    f"state {index} is not complete: letter {self._letter_text(int(missing[0]))} leads nowhere "
+                    "(Spot completes automata with the option 'complete')",
+                )
+        transitions = np.stack([states[index].table for index in range(count)])
+        members = np.array([states[index].accepting for index in range(count)])
+        return transitions, members | (self._header.acceptance == "0t")
+
+    def _num_states(self, states: dict[int, _State]) -> int:
+        """The number of states, after checking that the body describes each of them."""
+        header = self._header
+        count = len(states) if header.num_states is None else header.num_states
+        for index in range(count):
+            if index not in states:
+                raise self._error(f"state {index} of {count} is not described")
+        for index, state in states.items():
+            if index >= count:
+                raise _error(state.line, f"state {index} exceeds the {count} states of the header")
+        if header.initial >= count:
+            raise self._error(f"the initial state {header.initial} is not described")
+        return count
+
+    def _letter_text(self, letter: int) -> str:
+        """A letter as the conjunction of its literals."""
+        names = self._header.propositions or ()
+        return "&".join(("" if letter >> i & 1 else "!") + name for i, name in enumerate(names)) or "t"

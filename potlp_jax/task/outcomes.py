@@ -1,0 +1,197 @@
+"""What an attempt beyond a subgoal can need: edges, conditions, outcome classes and what implies what.
+
+Definitions (MODEL: sections 3 and 4; Bradley et al. 2021, sections III-B and IV-A):
+
+* An **edge** z' -> z'' can be attempted: z'' differs from z', z'' is no trap, z' is not accepting and has at least one
+  letter that stays.
+* Its **condition** is (stay, go): the letters that keep z' and those that lead to z''.
+* ``go`` is a union of cubes; an **outcome class** is a distinct (stay, cube). The estimator is asked per class.
+* Condition a **implies** condition b if whatever makes a hold beyond a subgoal makes b hold there as well.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Int32
+
+from potlp_jax.task.automaton import Dfa
+from potlp_jax.task.cubes import Phi, cube_letters, hull, minimal_cover
+from potlp_jax.task.formula import TaskError
+
+MAX_CLASSES: int = 4096
+"""Outcome classes of a task, at most: each is asked of an estimator, and stored with its letters."""
+
+
+class OutcomeClass(NamedTuple):
+    """The two vectors of an outcome class, {-1, 0, 1}^n each."""
+
+    phi_stay: Phi
+    """Literals that all letters share which keep the state: the paper's phi(z', z')."""
+    phi_cube: Phi
+    """The cube of letters that makes the transition: the paper's phi(z', z'')."""
+
+
+@dataclass(frozen=True, eq=False)
+class Condition:
+    """What must be found beyond a subgoal for an attempt to succeed.
+
+    Attributes:
+        stay: letters that may be read on the way.
+        go: letters that end it.
+        classes: indices of the outcome classes whose cubes make up ``go``, increasing.
+    """
+
+    stay: Bool[np.ndarray, " L"]
+    go: Bool[np.ndarray, " L"]
+    classes: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcomes:
+    """Edges of a DFA with their conditions.
+
+    Attributes:
+        classes: outcome classes, sorted by (phi_stay, phi_cube, stay letters).
+        conditions: first one condition per class, then ("compound") those with several cubes, by first edge.
+        edges: ``(z', z'')`` in lexicographic order.
+        edge_condition: index of each edge's condition.
+    """
+
+    classes: tuple[OutcomeClass, ...]
+    conditions: tuple[Condition, ...]
+    edges: Int32[np.ndarray, "E 2"]
+    edge_condition: Int32[np.ndarray, " E"]
+
+    @cached_property
+    def stay_is_exact(self) -> Bool[np.ndarray, " C"]:
+        """False where ``phi_stay`` admits letters that do not stay; true labels use the exact letters."""
+        exact = [
+            bool((cube_letters(phi_stay) == condition.stay).all())
+            for (phi_stay, _), condition in zip(self.classes, self.conditions, strict=False)
+        ]
+        return np.array(exact, dtype=bool)
+
+    @cached_property
+    def implies(self) -> Bool[np.ndarray, "M M"]:
+        """``[a, b]``: (stay, go) of a implies that of b, iff go_a in go_b and stay_a in stay_b or go_b.
+
+        On a way that makes a hold, the first letter outside stay_b is then in go_b, or the last one is.
+        """
+        stay = _packed([condition.stay for condition in self.conditions])
+        go = _packed([condition.go for condition in self.conditions])
+        implies = np.zeros((len(go), len(go)), dtype=bool)
+        for a in range(len(go)):
+            go_within = ~(go[a] & ~go).any(axis=1)
+            implies[a] = go_within & ~(stay[a] & ~(stay | go)).any(axis=1)
+        return implies
+
+
+@dataclass(frozen=True, eq=False)
+class _Edge:
+    """An edge before classes are numbered; ``cubes`` make up ``go``."""
+
+    source: int
+    target: int
+    stay: np.ndarray
+    phi_stay: Phi
+    cubes: tuple[Phi, ...]
+
+    @property
+    def class_keys(self) -> list[tuple[Phi, Phi, bytes]]:
+        """Sort keys of the edge's classes. Bytes of a mask compare as the mask does, entry by entry."""
+        return [(self.phi_stay, cube, self.stay.tobytes()) for cube in self.cubes]
+
+
+def find_outcomes(dfa: Dfa, max_positive_literals: int | None = None) -> Outcomes:
+    """Edges, conditions and classes of a DFA.
+
+    Args:
+        dfa: the task's automaton.
+        max_positive_literals: cubes that need more propositions to hold at one cell are dropped (None: none are).
+            An edge's ``go`` is the union of the cubes that are left; edges that lose all cubes do not exist.
+
+    Raises:
+        TaskError: acceptance becomes unreachable because of ``max_positive_literals``, or there are more than
+            ``MAX_CLASSES`` outcome classes.
+    """
+    if max_positive_literals is not None:
+        _check_reachable(dfa, max_positive_literals)
+    edges = _find_edges(dfa, max_positive_literals)
+    stays = {key: edge.stay for edge in edges for key in edge.class_keys}
+    keys = sorted(stays)
+    if len(keys) > MAX_CLASSES:
+        raise TaskError(f"the task has {len(keys)} outcome classes, more than {MAX_CLASSES}: use a simpler formula")
+    conditions = [Condition(stays[key], cube_letters(key[1]), (c,)) for c, key in enumerate(keys)]
+    number = {key: c for c, key in enumerate(keys)}
+    known = {_letter_sets(condition): c for c, condition in enumerate(conditions)}
+    edge_condition = []
+    for edge in edges:
+        classes = tuple(number[key] for key in edge.class_keys)
+        condition = Condition(edge.stay, np.any([conditions[c].go for c in classes], axis=0), classes)
+        index = known.setdefault(_letter_sets(condition), len(conditions))
+        if index == len(conditions):
+            conditions.append(condition)
+        edge_condition.append(index)
+    return Outcomes(
+        classes=tuple(OutcomeClass(phi_stay, cube) for phi_stay, cube, _ in keys),
+        conditions=tuple(conditions),
+        edges=np.array([(edge.source, edge.target) for edge in edges], dtype=np.int32).reshape(-1, 2),
+        edge_condition=np.array(edge_condition, dtype=np.int32),
+    )
+
+
+def _find_edges(dfa: Dfa, max_positive_literals: int | None) -> list[_Edge]:
+    """Edges in lexicographic order, with the cubes that are kept."""
+    covers: dict[bytes, tuple[Phi, ...]] = {}
+    edges = []
+    for source, row in enumerate(dfa.transitions):
+        stay = row == source
+        if dfa.accepting[source] or dfa.trap[source] or not stay.any():
+            continue
+        for target in np.unique(row):
+            if target == source or dfa.trap[target]:
+                continue
+            go = row == target
+            if go.tobytes() not in covers:
+                covers[go.tobytes()] = minimal_cover(go)
+            cubes = tuple(cube for cube in covers[go.tobytes()] if _allowed(cube, max_positive_literals))
+            if cubes:
+                edges.append(_Edge(source, int(target), stay, hull(stay), cubes))
+    return edges
+
+
+def _packed(guards: list[np.ndarray]) -> np.ndarray:
+    """Sets of letters as rows of bits; no rows where there are no guards."""
+    return np.packbits(np.reshape(guards, (len(guards), -1)) if guards else np.zeros((0, 1), bool), axis=1)
+
+
+def _letter_sets(condition: Condition) -> tuple[bytes, bytes]:
+    """What makes conditions equal."""
+    return condition.stay.tobytes(), condition.go.tobytes()
+
+
+def _allowed(cube: Phi, max_positive_literals: int | None) -> bool:
+    return max_positive_literals is None or cube.count(1) <= max_positive_literals
+
+
+def _check_reachable(dfa: Dfa, max_positive_literals: int) -> None:
+    """Raises if letters with at most so many propositions never lead to acceptance, where others would.
+
+    A guard keeps a cube exactly if it holds such a letter, so this also covers states that no edge leaves
+    because no letter stays there.
+    """
+    if max_positive_literals < 0:
+        raise TaskError(f"max_positive_literals is {max_positive_literals}: it must be None or at least 0")
+    letters = [letter for letter in range(dfa.transitions.shape[1]) if letter.bit_count() <= max_positive_literals]
+    reached, frontier = {dfa.initial}, [dfa.initial]
+    for state in frontier:
+        successors = {int(target) for target in dfa.transitions[state, letters]} - reached
+        reached |= successors
+        frontier += sorted(successors)
+    if not dfa.trap[dfa.initial] and not dfa.accepting[list(reached)].any():
+        raise TaskError(
+            f"acceptance is unreachable with max_positive_literals={max_positive_literals}: the task needs more "
+            "propositions to hold at one cell"
+        )

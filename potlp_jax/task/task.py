@@ -1,0 +1,398 @@
+"""A task: a formula, its automaton and its outcome classes in one frozen object, and its arrays for the device."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass
+from functools import cache, cached_property
+from importlib import resources
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int8, Int32
+
+from potlp_jax.task.automaton import Dfa, canonical_dfa, translate
+from potlp_jax.task.cubes import Phi, minimal_cover
+from potlp_jax.task.formula import MAX_PROPOSITIONS, TaskError, check_propositions, parse_formula
+from potlp_jax.task.hoa import HoaAutomaton, read_hoa, write_hoa
+from potlp_jax.task.outcomes import Condition, OutcomeClass, Outcomes, find_outcomes
+from potlp_jax.types import NO_CLASS
+
+UNNAMED: str = "(unnamed automaton)"
+"""Text of a task that was read from HOA without a ``name:`` header."""
+
+
+@flax.struct.dataclass(kw_only=True)
+class TaskArrays:
+    """A task on the device; padded where masks are False.
+
+    Padded propositions (the highest bits of a letter) are ignored by every table. Padded states loop on every letter
+    and are traps. The conditions are the C classes first, then those with several cubes. Stacked tasks have a leading
+    batch axis; functions take the arrays of one task.
+
+    Attributes:
+        transitions: ``[z, letter]`` is the next state.
+        accepting: the task is satisfied.
+        trap: acceptance is out of reach; True on padding.
+        state_mask: True on real states.
+        initial: the state before the first letter.
+        edges: ``(z', z'')`` in lexicographic order; (0, 0) on padding.
+        edge_mask: True on real edges.
+        edge_condition: index of the edge's condition; 0 on padding.
+        class_phi: phi_stay and phi_cube; 0 on padding.
+        class_stay: letters that keep z' (exact); False on padding.
+        class_go: letters of the cube; False on padding.
+        class_mask: True on real classes.
+        condition_classes: the classes that make up a condition, increasing, then ``NO_CLASS``.
+        condition_mask: True on real conditions.
+        implies: ``[a, b]``: if a holds beyond a subgoal, so does b. Reflexive on real conditions, False on padding.
+    """
+
+    transitions: Int32[Array, "*batch Z L"]
+    accepting: Bool[Array, "*batch Z"]
+    trap: Bool[Array, "*batch Z"]
+    state_mask: Bool[Array, "*batch Z"]
+    initial: Int32[Array, "*batch"]
+    edges: Int32[Array, "*batch E 2"]
+    edge_mask: Bool[Array, "*batch E"]
+    edge_condition: Int32[Array, "*batch E"]
+    class_phi: Int8[Array, "*batch C 2 P"]
+    class_stay: Bool[Array, "*batch C L"]
+    class_go: Bool[Array, "*batch C L"]
+    class_mask: Bool[Array, "*batch C"]
+    condition_classes: Int32[Array, "*batch M K"]
+    condition_mask: Bool[Array, "*batch M"]
+    implies: Bool[Array, "*batch M M"]
+
+
+@dataclass(frozen=True)
+class TaskSizes:
+    """Array sizes of a task, real or padded.
+
+    Attributes:
+        states: Z.
+        propositions: P; letters are ``2 ** P``.
+        edges: E.
+        classes: C.
+        compound: conditions with several cubes, M - C.
+        cubes: K, cubes of a condition at most.
+    """
+
+    states: int
+    propositions: int
+    edges: int
+    classes: int
+    compound: int
+    cubes: int
+
+    def union(self, other: "TaskSizes") -> "TaskSizes":
+        """The larger of each size."""
+        return TaskSizes(*map(max, astuple(self), astuple(other)))
+
+    def covers(self, other: "TaskSizes") -> bool:
+        """Whether arrays of the other sizes fit."""
+        return self.union(other) == self
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A temporal-logic task, checked and compiled. Host only; ``arrays`` is its form for the device.
+
+    Attributes:
+        text: the formula, or the name of the automaton that was read.
+        propositions: Sigma; bit ``i`` of a letter is ``propositions[i]``.
+        dfa: the minimal automaton.
+        outcomes: edges, conditions and outcome classes.
+        max_positive_literals: cubes that need more propositions at one cell were dropped (None: none were).
+    """
+
+    text: str
+    propositions: tuple[str, ...]
+    dfa: Dfa
+    outcomes: Outcomes
+    max_positive_literals: int | None = None
+
+    @classmethod
+    def from_formula(
+        cls, text: str, propositions: Sequence[str] | None = None, max_positive_literals: int | None = None
+    ) -> "Task":
+        """Compiles a co-safe formula in Spot's syntax; needs Spot.
+
+        Args:
+            text: the formula. Names that begin with F, G or X, or hold spaces, stand in double quotes.
+            propositions: Sigma, a superset of the formula's names; default: these names, sorted.
+            max_positive_literals: drops cubes that need more propositions to hold at one cell.
+
+        Raises:
+            TaskError: anything wrong with the formula, with column and caret; Spot missing; acceptance unreachable
+                because of ``max_positive_literals``. A formula that no word satisfies is a task whose initial state
+                is a trap.
+        """
+        formula = parse_formula(text, propositions)
+        automaton = read_hoa(translate(formula))
+        return cls._compile(text, formula.propositions, automaton, max_positive_literals)
+
+    @classmethod
+    def from_hoa(
+        cls, text: str, propositions: Sequence[str] | None = None, max_positive_literals: int | None = None
+    ) -> "Task":
+        """Compiles an automaton in HOA format; needs no Spot.
+
+        Args:
+            text: a deterministic complete automaton with state-based Büchi acceptance and a co-safe language.
+            propositions: Sigma, a superset of the automaton's; default: the automaton's, in its order.
+            max_positive_literals: drops cubes that need more propositions to hold at one cell.
+
+        Raises:
+            TaskError: what is wrong with the automaton, with the line where it has one.
+        """
+        automaton = read_hoa(text)
+        sigma = automaton.propositions if propositions is None else propositions
+        return cls._compile(automaton.name or UNNAMED, check_propositions(sigma), automaton, max_positive_literals)
+
+    @classmethod
+    def shipped(cls, name: str) -> "Task":
+        """A task that comes with the package; needs no Spot. ``shipped_tasks()`` lists them.
+
+        Raises:
+            TaskError: there is no such task; names those that there are.
+        """
+        texts = _shipped_hoa()
+        if name not in texts:
+            raise TaskError(f"there is no shipped task {name!r}; there are: {', '.join(texts)}")
+        return cls.from_hoa(texts[name])
+
+    @classmethod
+    def _compile(
+        cls, text: str, propositions: tuple[str, ...], automaton: HoaAutomaton, max_positive_literals: int | None
+    ) -> "Task":
+        """The task of a parsed automaton, over Sigma."""
+        unknown = [name for name in automaton.propositions if name not in propositions]
+        if unknown:
+            raise TaskError(f"unknown proposition '{unknown[0]}'; known: {', '.join(propositions) or 'none'}")
+        bits = [propositions.index(name) for name in automaton.propositions]
+        letters = np.arange(2 ** len(propositions))
+        own_letters = sum(((letters >> bit & 1) << i for i, bit in enumerate(bits)), np.zeros_like(letters))
+        dfa = canonical_dfa(automaton.transitions[:, own_letters], automaton.accepting, automaton.initial)
+        return cls(
+            text=text,
+            propositions=propositions,
+            dfa=dfa,
+            outcomes=find_outcomes(dfa, max_positive_literals),
+            max_positive_literals=max_positive_literals,
+        )
+
+    @property
+    def edges(self) -> Int32[np.ndarray, "E 2"]:
+        """``(z', z'')`` in lexicographic order."""
+        return self.outcomes.edges
+
+    @property
+    def classes(self) -> tuple[OutcomeClass, ...]:
+        """Outcome classes: pairs (phi_stay, phi_cube)."""
+        return self.outcomes.classes
+
+    @property
+    def conditions(self) -> tuple[Condition, ...]:
+        """One condition per class, then those with several cubes."""
+        return self.outcomes.conditions
+
+    @property
+    def sizes(self) -> TaskSizes:
+        """Sizes without padding."""
+        outcomes = self.outcomes
+        return TaskSizes(
+            states=self.dfa.num_states,
+            propositions=len(self.propositions),
+            edges=len(outcomes.edges),
+            classes=len(outcomes.classes),
+            compound=len(outcomes.conditions) - len(outcomes.classes),
+            cubes=max((len(condition.classes) for condition in outcomes.conditions), default=1),
+        )
+
+    @cached_property
+    def arrays(self) -> TaskArrays:
+        """The device form, without padding."""
+        return self.padded(self.sizes)
+
+    def padded(self, sizes: TaskSizes) -> TaskArrays:
+        """The device form in larger arrays. Padding changes no result.
+
+        Raises:
+            TaskError: the task does not fit, or there are too many propositions.
+        """
+        return _on_device(_padded_fields(self, sizes))
+
+    def to_hoa(self) -> str:
+        """The automaton in HOA format, with the formula as its name. ``max_positive_literals`` is not part of it."""
+        return write_hoa(self.dfa, self.propositions, self.text)
+
+    def guard_text(self, cubes: Sequence[Phi]) -> str:
+        """Cubes in words, such as ``!fire & alarm | exit``; ``true`` and ``false`` where there is nothing to say."""
+        return " | ".join(_cube_text(cube, self.propositions) for cube in cubes) or "false"
+
+    def describe(self) -> dict[str, Any]:
+        """The task for people and programs; JSON-able. Guards are canonical covers in words."""
+        dfa = self.dfa
+        return {
+            "formula": self.text,
+            "propositions": list(self.propositions),
+            "max_positive_literals": self.max_positive_literals,
+            "states": dfa.num_states,
+            "initial": dfa.initial,
+            "accepting": np.flatnonzero(dfa.accepting).tolist(),
+            "trap": np.flatnonzero(dfa.trap).tolist(),
+            "transitions": [
+                {"from": source, "to": int(target), "guard": self.guard_text(minimal_cover(row == target))}
+                for source, row in enumerate(dfa.transitions)
+                for target in np.unique(row)
+            ],
+            "edges": [
+                {"from": int(source), "to": int(target), "condition": int(condition)}
+                for (source, target), condition in zip(self.edges, self.outcomes.edge_condition, strict=True)
+            ],
+            "classes": [self._describe_class(c) for c in range(len(self.classes))],
+            "conditions": [self._describe_condition(condition) for condition in self.conditions],
+        }
+
+    def _describe_class(self, c: int) -> dict[str, Any]:
+        phi_stay, phi_cube = self.classes[c]
+        return {
+            "phi_stay": list(phi_stay),
+            "phi_cube": list(phi_cube),
+            "stay": self.guard_text([phi_stay]),
+            "cube": self.guard_text([phi_cube]),
+            "stay_is_exact": bool(self.outcomes.stay_is_exact[c]),
+        }
+
+    def _describe_condition(self, condition: Condition) -> dict[str, Any]:
+        return {
+            "stay": self.guard_text(minimal_cover(condition.stay)),
+            "go": self.guard_text([self.classes[c].phi_cube for c in condition.classes]),
+            "classes": list(condition.classes),
+        }
+
+
+def stack_tasks(tasks: Sequence[Task], sizes: TaskSizes | None = None) -> TaskArrays:
+    """Several tasks over the same propositions, padded and stacked along a new leading axis.
+
+    Args:
+        tasks: at least one task.
+        sizes: padded sizes; default: the largest of each.
+
+    Raises:
+        TaskError: no task, different propositions, or a task that does not fit.
+    """
+    if not tasks:
+        raise TaskError("there is no task to stack")
+    for task in tasks:
+        if task.propositions != tasks[0].propositions:
+            raise TaskError(
+                f"stacked tasks must have the same propositions in the same order: {tasks[0].propositions} and "
+                f"{task.propositions}"
+            )
+    if sizes is None:
+        sizes = tasks[0].sizes
+        for task in tasks:
+            sizes = sizes.union(task.sizes)
+    padded = [_padded_fields(task, sizes) for task in tasks]
+    return _on_device({name: np.stack([fields[name] for fields in padded]) for name in padded[0]})
+
+
+def shipped_tasks() -> Mapping[str, str]:
+    """Names of the tasks that come with the package, and their formulas."""
+    return {name: read_hoa(text).name for name, text in _shipped_hoa().items()}
+
+
+@cache
+def _shipped_hoa() -> dict[str, str]:
+    files = resources.files("potlp_jax.task").joinpath("data").iterdir()
+    texts = {file.name.removesuffix(".hoa"): file.read_text("utf-8") for file in files if file.name.endswith(".hoa")}
+    return dict(sorted(texts.items()))
+
+
+def _cube_text(cube: Phi, propositions: Sequence[str]) -> str:
+    """A cube in words; names that Spot would not read as they stand are quoted."""
+    names = [name if name.isidentifier() and name[0] not in "FGX" else f'"{name}"' for name in propositions]
+    return " & ".join(("" if sign > 0 else "!") + names[i] for i, sign in enumerate(cube) if sign) or "true"
+
+
+def _on_device(fields: dict[str, np.ndarray]) -> TaskArrays:
+    """Concrete arrays, also where a trace is under way: a task keeps its arrays, and may not keep tracers."""
+    with jax.ensure_compile_time_eval():
+        return TaskArrays(**{name: jnp.asarray(value) for name, value in fields.items()})
+
+
+def _padded_fields(task: Task, sizes: TaskSizes) -> dict[str, np.ndarray]:
+    """The fields of ``TaskArrays`` on the host."""
+    if not sizes.covers(task.sizes):
+        raise TaskError(f"the task '{task.text}' does not fit: it has {task.sizes}, the arrays {sizes}")
+    if sizes.propositions > MAX_PROPOSITIONS:
+        raise TaskError(f"{sizes.propositions} propositions are too many: a task has at most {MAX_PROPOSITIONS}")
+    return _state_fields(task, sizes) | _edge_fields(task, sizes) | _condition_fields(task, sizes)
+
+
+def _state_fields(task: Task, sizes: TaskSizes) -> dict[str, np.ndarray]:
+    dfa = task.dfa
+    transitions = np.repeat(np.arange(sizes.states, dtype=np.int32)[:, None], 2**sizes.propositions, axis=1)
+    transitions[: dfa.num_states] = _ignore_padded_propositions(dfa.transitions, sizes)
+    return {
+        "transitions": transitions,
+        "accepting": _grow(dfa.accepting, sizes.states, False),
+        "trap": _grow(dfa.trap, sizes.states, True),
+        "state_mask": np.arange(sizes.states) < dfa.num_states,
+        "initial": np.array(dfa.initial, dtype=np.int32),
+    }
+
+
+def _edge_fields(task: Task, sizes: TaskSizes) -> dict[str, np.ndarray]:
+    outcomes, count = task.outcomes, task.sizes
+    compound = outcomes.edge_condition >= count.classes
+    condition = outcomes.edge_condition + np.int32(sizes.classes - count.classes) * compound
+    return {
+        "edges": _grow(outcomes.edges, sizes.edges, 0),
+        "edge_mask": np.arange(sizes.edges) < count.edges,
+        "edge_condition": _grow(condition.astype(np.int32), sizes.edges, 0),
+    }
+
+
+def _condition_fields(task: Task, sizes: TaskSizes) -> dict[str, np.ndarray]:
+    """Classes keep their indices; the conditions with several cubes follow the padded classes."""
+    outcomes, count = task.outcomes, task.sizes
+    phi = np.zeros((sizes.classes, 2, sizes.propositions), dtype=np.int8)
+    phi[: count.classes, :, : count.propositions] = np.reshape(outcomes.classes, (count.classes, 2, count.propositions))
+    place = np.arange(len(outcomes.conditions))
+    place[count.classes :] += sizes.classes - count.classes
+    total = sizes.classes + sizes.compound
+    classes = np.full((total, sizes.cubes), NO_CLASS, dtype=np.int32)
+    for row, condition in zip(place, outcomes.conditions, strict=True):
+        classes[row, : len(condition.classes)] = condition.classes
+    mask, implies = np.zeros(total, dtype=bool), np.zeros((total, total), dtype=bool)
+    mask[place] = True
+    implies[np.ix_(place, place)] = outcomes.implies
+    own = outcomes.conditions[: count.classes]
+    return {
+        "class_phi": phi,
+        "class_stay": _class_letters([condition.stay for condition in own], count, sizes),
+        "class_go": _class_letters([condition.go for condition in own], count, sizes),
+        "class_mask": np.arange(sizes.classes) < count.classes,
+        "condition_classes": classes,
+        "condition_mask": mask,
+        "implies": implies,
+    }
+
+
+def _class_letters(guards: Sequence[np.ndarray], count: TaskSizes, sizes: TaskSizes) -> np.ndarray:
+    letters = np.reshape(guards, (count.classes, 2**count.propositions)).astype(bool)
+    return _grow(_ignore_padded_propositions(letters, sizes), sizes.classes, False)
+
+
+def _ignore_padded_propositions(table: np.ndarray, sizes: TaskSizes) -> np.ndarray:
+    """Repeats the letters (last axis): the bits above the task's own do not matter."""
+    return np.tile(table, (1, 2**sizes.propositions // table.shape[1]))
+
+
+def _grow(values: np.ndarray, size: int, fill: int | bool) -> np.ndarray:
+    """Pads the first axis to ``size`` entries."""
+    return np.pad(values, [(0, size - len(values))] + [(0, 0)] * (values.ndim - 1), constant_values=fill)

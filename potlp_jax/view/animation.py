@@ -1,0 +1,274 @@
+"""Animation of a trial: one frame a decision, with the map as believed then and the actions that were weighed."""
+
+import io
+import textwrap
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+from PIL import Image
+
+from potlp_jax.records import NEVER_SEEN, ActionRecord, Decision, Trial
+from potlp_jax.task.task import Task
+from potlp_jax.view.decisions import action_name, rank_actions
+from potlp_jax.view.maps import (
+    FREE_UNSEEN,
+    MAX_INCHES_PER_CELL,
+    WALL_SEEN,
+    WALL_UNSEEN,
+    area_handles,
+    describe_outcome,
+    draw_ends,
+    draw_labels,
+    draw_path,
+    draw_subgoals,
+    map_extent,
+    place_labels,
+    show_cells,
+    state_handles,
+)
+from potlp_jax.view.style import AREA_COLOURS, CHOSEN, CHOSEN_ROW, FAINT, INK, ROBOT, STATE_COLOURS, new_figure, rgb
+
+MAX_FRAMES: int = 36
+MAX_BYTES: int = 3_000_000
+FRAME_MILLISECONDS: int = 700
+LAST_FRAME_MILLISECONDS: int = 3_000
+SHOWN_ACTIONS: int = 7
+LABEL_SIZE: float = 8.0
+IMAGE_PIXELS: int = 400
+MIXED_COLOURS: int = 64
+THEME: tuple[str, ...] = ("#FFFFFF", INK, FAINT, CHOSEN, ROBOT, CHOSEN_ROW, WALL_SEEN, FREE_UNSEEN, WALL_UNSEEN)
+
+Progress = Callable[[int, int], None]
+"""Called after each frame with the number of frames done and in all."""
+
+
+def save_animation(
+    trial: Trial,
+    path: Path,
+    *,
+    max_frames: int = MAX_FRAMES,
+    max_bytes: int = MAX_BYTES,
+    progress: Progress | None = None,
+) -> int:
+    """Write the trial as a GIF and return its number of frames.
+
+    Decisions are thinned out evenly to ``max_frames``; the first one and the end are always shown. If the file would be
+    larger than ``max_bytes``, every other frame is left out until it fits.
+    """
+    steps = frame_steps(trial, max_frames)
+    stage = _Stage(trial)
+    frames = []
+    for count, decision in enumerate(steps):
+        frames.append(stage.frame(decision))
+        if progress is not None:
+            progress(count + 1, len(steps))
+    data = _encode(frames)
+    while len(data) > max_bytes and len(frames) > 2:
+        frames = [*frames[:-1:2], frames[-1]]
+        data = _encode(frames)
+    path.write_bytes(data)
+    return len(frames)
+
+
+def frame_steps(trial: Trial, max_frames: int) -> list[Decision | None]:
+    """The decisions that get a frame, evenly spread; None is the end of the trial."""
+    count = len(trial.decisions)
+    kept = np.unique(np.linspace(0, count - 1, min(count, max(1, max_frames - 1))).round().astype(int)) if count else []
+    return [*(trial.decisions[index] for index in kept), None]
+
+
+class _Stage:
+    """The figure of an animation; title, legend and frame are drawn once, the rest anew for each frame."""
+
+    def __init__(self, trial: Trial) -> None:
+        self._trial = trial
+        self._task = Task.from_hoa(trial.task_hoa, trial.propositions)
+        self._figure, self._axes, self._panel, self._scale = _layout(*map_extent(trial.world))
+        self._labels = place_labels(
+            trial.world, trial.propositions, trial.path, inches_per_cell=self._scale, size=LABEL_SIZE
+        )
+        self._axes.set(xticks=[], yticks=[])
+        self._panel.axis("off")
+        _legend(self._axes, trial, self._task)
+        formula = trial.task_text if len(trial.task_text) <= 90 else trial.task_text[:87] + "..."
+        self._axes.set_title(f"{formula}\n{describe_outcome(trial)}", size=9, color=INK)
+        canvas = self._figure.canvas
+        assert isinstance(canvas, FigureCanvasAgg)
+        self._canvas = canvas
+        canvas.draw()
+        self._background = canvas.copy_from_bbox(self._figure.bbox)
+
+    def frame(self, decision: Decision | None) -> Image.Image:
+        """The belief, path and actions at a decision, or the end of the trial if ``decision`` is None."""
+        still = {axes: set(axes.get_children()) for axes in (self._axes, self._panel)}
+        self._draw_map(decision)
+        _draw_panel(self._panel, self._trial, decision, self._task)
+        self._canvas.restore_region(self._background)
+        for axes, before in still.items():
+            fresh = [artist for artist in axes.get_children() if artist not in before]
+            fresh.sort(key=lambda artist: artist.get_zorder())
+            for artist in fresh:
+                axes.draw_artist(artist)
+            for artist in fresh:
+                artist.remove()
+        return Image.fromarray(np.asarray(self._canvas.buffer_rgba())[..., :3].copy())
+
+    def _draw_map(self, decision: Decision | None) -> None:
+        trial, axes = self._trial, self._axes
+        step = len(trial.path) - 1 if decision is None else decision.step
+        seen = (trial.first_seen != NEVER_SEEN) & (trial.first_seen <= step)
+        path, states = trial.path[: step + 1], trial.states[: step + 1]
+        show_cells(axes, trial.world, seen, trial.propositions, hatch=False, pixels=IMAGE_PIXELS)
+        draw_labels(axes, self._labels, size=LABEL_SIZE)
+        draw_path(axes, path, states, inches_per_cell=self._scale)
+        if decision is None:
+            draw_ends(axes, path)
+        else:
+            _draw_intention(axes, decision)
+
+
+def _layout(rows: int, columns: int) -> tuple[Figure, Axes, Axes, float]:
+    """The map beside its panel, or above it if the map is wide; the last value is inches per cell."""
+    if columns >= 1.6 * rows:
+        width, panel_height = 9.0, 2.35
+        scale = min((width - 0.3) / columns, 4.4 / rows, MAX_INCHES_PER_CELL)
+        height = rows * scale + panel_height + 0.95
+        figure = new_figure(width, height)
+        left = (width - columns * scale) / 2
+        place = (left / width, (panel_height + 0.45) / height, columns * scale / width, rows * scale / height)
+        return figure, figure.add_axes(place), figure.add_axes((0.02, 0.0, 0.96, panel_height / height)), scale
+    height, panel_width = 6.2, 5.6
+    scale = min(5.2 / rows, 5.6 / columns, MAX_INCHES_PER_CELL)
+    width = columns * scale + panel_width + 0.4
+    figure = new_figure(width, height)
+    place = (0.2 / width, 0.5 / height, columns * scale / width, rows * scale / height)
+    panel = ((columns * scale + 0.4) / width, 0.1, (panel_width - 0.1) / width, 0.8)
+    return figure, figure.add_axes(place), figure.add_axes(panel), scale
+
+
+def _draw_intention(axes: Axes, decision: Decision) -> None:
+    """Subgoals, the one chosen, the path toward it and the robot on top."""
+    if len(decision.path) > 1:
+        rows, columns = zip(*decision.path, strict=True)
+        axes.plot(columns, rows, color=CHOSEN, linewidth=1.8, linestyle=(0, (2, 1.2)), zorder=5)
+    draw_subgoals(axes, decision)
+    row, column = decision.cell
+    axes.plot(column, row, "o", ms=9, mfc=ROBOT, mec=INK, mew=1.3, zorder=8)
+
+
+def _legend(axes: Axes, trial: Trial, task: Task) -> None:
+    handles = [
+        Patch(facecolor=FREE_UNSEEN, edgecolor=FAINT, label="not seen yet"),
+        *state_handles(trial, task),
+        *area_handles(trial),
+        Line2D([], [], marker="o", ls="", ms=7, mfc=ROBOT, mec=INK, label="robot"),
+        Line2D([], [], marker="^", ls="", ms=6, mfc="white", mec=CHOSEN, mew=1.4, label="subgoal"),
+        Line2D([], [], marker="^", ls=(0, (2, 1.2)), color=CHOSEN, ms=6, label="chosen"),
+    ]
+    axes.legend(
+        handles=handles,
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.005),
+        ncols=min(6, len(handles)) if len(handles) <= 6 else (len(handles) + 1) // 2,
+        fontsize=7.0,
+        frameon=False,
+        handlelength=1.4,
+        columnspacing=1.0,
+        labelspacing=0.2,
+    )
+
+
+def _draw_panel(panel: Axes, trial: Trial, decision: Decision | None, task: Task) -> None:
+    panel.set(xlim=(0, 1), ylim=(SHOWN_ACTIONS + 2.4, -0.2))
+    if decision is None:
+        accepting = bool(task.dfa.accepting[trial.states[-1]])
+        lines = [
+            f"End: {trial.outcome.value} after {len(trial.path) - 1} steps, cost {trial.cost:.1f}",
+            f"automaton state {trial.states[-1]}{' (accepting)' if accepting else ''}, "
+            f"{len(trial.decisions)} decisions",
+        ]
+        _panel_text(panel, lines)
+        return
+    head = (
+        f"decision {decision.index + 1} of {len(trial.decisions)}   step {decision.step}   state {decision.state}   "
+        f"expected cost {decision.value:.1f}"
+    )
+    if not decision.actions:
+        _panel_text(panel, [head, *textwrap.wrap(_KINDS.get(decision.kind, decision.kind), 80)])
+        return
+    panel.text(0.0, 0.1, head, size=9.5, weight="bold", va="center", color=INK)
+    _action_rows(panel, rank_actions(decision), decision)
+
+
+_KINDS = {
+    "finish": "the task can be finished in known space: go there",
+    "frontier": "go to the nearest frontier that violates nothing",
+    "fallback": "no action is available: go to the nearest frontier that violates nothing",
+    "optimistic": "go where the task could be finished if unseen cells were as one wishes",
+    "none": "nothing can be done",
+}
+
+
+def _panel_text(panel: Axes, lines: Sequence[str]) -> None:
+    for line, text in enumerate(lines):
+        panel.text(0.0, 0.1 + 1.1 * line, text, size=9.5, weight="normal" if line else "bold", va="center", color=INK)
+
+
+_COLUMNS = (("P_S", 0.52), ("R_S", 0.62), ("R_F", 0.71), ("D", 0.80), ("Q", 0.90), ("visits", 1.0))
+
+
+def _action_rows(panel: Axes, actions: Sequence[ActionRecord], decision: Decision) -> None:
+    panel.text(0.0, 1.2, "best actions", size=8, color="#6E6E6E", va="center")
+    for name, place in _COLUMNS:
+        panel.text(place, 1.2, name, size=8, color="#6E6E6E", ha="right", va="center")
+    for row, action in enumerate(actions[:SHOWN_ACTIONS], start=2):
+        chosen = action.index == decision.choice
+        if chosen:
+            panel.add_patch(Rectangle((-0.01, row - 0.34), 1.02, 0.9, facecolor=CHOSEN_ROW, edgecolor="none"))
+        colour, weight = (CHOSEN, "bold") if chosen else (INK, "normal")
+        panel.text(0.0, row + 0.1, action_name(action), size=8.5, color=colour, weight=weight, va="center")
+        panel.add_patch(Rectangle((0.27, row - 0.15), 0.17, 0.5, facecolor="#EEEEEE", edgecolor="none"))
+        panel.add_patch(
+            Rectangle((0.27, row - 0.15), 0.17 * action.success_probability, 0.5, facecolor=colour, edgecolor="none")
+        )
+        values = (
+            f"{action.success_probability:.2f}",
+            *(f"{value:.1f}" for value in (action.success_cost, action.failure_cost, action.distance, action.q_value)),
+            str(action.visits),
+        )
+        for value, (_, place) in zip(values, _COLUMNS, strict=True):
+            panel.text(place, row + 0.1, value, size=8.5, color=colour, weight=weight, ha="right", va="center")
+    if len(actions) > SHOWN_ACTIONS:
+        rest = f"and {len(actions) - SHOWN_ACTIONS} more"
+        panel.text(0.0, SHOWN_ACTIONS + 2.05, rest, size=8, color="#6E6E6E", va="center")
+
+
+def _encode(frames: Sequence[Image.Image]) -> bytes:
+    """A GIF with one palette for all frames, so that only what changes between frames takes space."""
+    palette = _palette(frames)
+    indexed = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    durations = [FRAME_MILLISECONDS] * (len(frames) - 1) + [LAST_FRAME_MILLISECONDS]
+    buffer = io.BytesIO()
+    indexed[0].save(buffer, "GIF", save_all=True, append_images=indexed[1:], duration=durations, loop=0, optimize=False)
+    return buffer.getvalue()
+
+
+def _palette(frames: Sequence[Image.Image]) -> Image.Image:
+    """The colours of the pictures' parts exactly, the rest (rims of letters and lines) as the frames need them."""
+    fixed = np.array([rgb(colour) for colour in (*THEME, *STATE_COLOURS, *AREA_COLOURS)], np.uint8)
+    thumbnails = [np.asarray(frame)[::3, ::3] for frame in (frames[0], frames[len(frames) // 2], frames[-1])]
+    sample = Image.fromarray(np.concatenate(thumbnails)).quantize(MIXED_COLOURS, method=Image.Quantize.MEDIANCUT)
+    mixed = np.array(sample.getpalette(), np.uint8).reshape(-1, 3)[:MIXED_COLOURS]
+    apart = np.abs(mixed[:, None].astype(int) - fixed[None]).max(axis=-1).min(axis=1) > 10
+    colours = np.concatenate([fixed, mixed[apart]])
+    palette = Image.new("P", (1, 1))
+    # Unused entries repeat the first colour, lest black creep in.
+    filled = np.concatenate([colours, np.repeat(fixed[:1], 256 - len(colours), axis=0)])
+    palette.putpalette(filled.flatten().tolist())
+    return palette

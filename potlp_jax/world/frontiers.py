@@ -1,0 +1,241 @@
+"""Frontiers: where known space ends, as connected components, one subgoal each (MODEL.md section 6).
+
+Components of any shape and number are found exactly: the cells of the frontier are listed, and every pass over them
+runs in blocks of the list, so that the cost follows the length of the frontier and not the size of the grid.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float32, Int32, UInt32
+
+from potlp_jax.types import NO_SUBGOAL, UNREACHABLE, Status, status_if
+from potlp_jax.world.grid import BeliefMap
+
+_BLOCK = 512
+_NEVER = np.iinfo(np.int32).max
+_NEIGHBOURS = tuple((row, column) for row in (-1, 0, 1) for column in (-1, 0, 1) if (row, column) != (0, 0))
+
+Carry = TypeVar("Carry")
+
+
+@struct.dataclass(kw_only=True)
+class Subgoals:
+    """The components of the frontier that are kept, nearest first.
+
+    Attributes:
+        cells: the subgoal of each component, a cell of the frontier; (0, 0) where masked.
+        mask: True on real subgoals; they come first.
+        size: cells of the component; 0 where masked.
+        distance: the distance that was given for the subgoal's cell; inf where masked.
+        component: index of the subgoal whose component the cell belongs to, else ``NO_SUBGOAL``.
+        frontier: all cells of the frontier, also those of components that were not kept.
+        status: ``SUBGOAL_OVERFLOW`` where there were more components than the array holds.
+    """
+
+    cells: Int32[Array, "*batch S 2"]
+    mask: Bool[Array, "*batch S"]
+    size: Int32[Array, "*batch S"]
+    distance: Float32[Array, "*batch S"]
+    component: Int32[Array, "*batch H W"]
+    frontier: Bool[Array, "*batch H W"]
+    status: UInt32[Array, "*batch"]
+
+
+@dataclasses.dataclass(frozen=True)
+class FrontierConfig:
+    """Attributes:
+    max_subgoals: length of the array of subgoals.
+    min_size: components of fewer cells are dropped while larger ones remain. Keep it below the narrowest passage:
+        a passage whose whole frontier is smaller would be forgotten while anything else is left.
+    """
+
+    max_subgoals: int = 12
+    min_size: int = 2
+
+    def __post_init__(self) -> None:
+        if self.max_subgoals < 1 or self.min_size < 1:
+            raise ValueError(f"max_subgoals and min_size must be at least 1, found {self}")
+
+
+@struct.dataclass(kw_only=True)
+class _Grid:
+    """The frontier on a grid with one more ring, cells counted row by row; the last entry of an array is a dummy.
+
+    ``listed`` holds the frontier's cells in increasing order, then dummies, as many as fill a block.
+    """
+
+    listed: Int32[Array, "*batch room"]
+    count: Int32[Array, "*batch"]
+    parent: Int32[Array, "*batch cells"]
+
+
+def frontier_cells(belief: BeliefMap, reachable: Bool[Array, "H W"]) -> Bool[Array, "H W"]:
+    """Free cells that can be reached and touch, with a side, a cell that is not observed.
+
+    What lies outside of the array counts as not observed.
+    """
+    height, width = reachable.shape
+    unknown = jnp.pad(belief.unknown, 1, constant_values=True)
+    beside = unknown[:height, 1:-1] | unknown[2:, 1:-1] | unknown[1:-1, :width] | unknown[1:-1, 2:]
+    return belief.free & reachable & beside
+
+
+def find_subgoals(
+    belief: BeliefMap,
+    reachable: Bool[Array, "H W"],
+    distance: Float32[Array, "H W"],
+    config: FrontierConfig,
+) -> Subgoals:
+    """The frontier's components (8-connected), each with its subgoal: its cell nearest its centroid.
+
+    Of equally near cells the first in row-major order is the subgoal. Subgoals are ordered by ``distance`` at their
+    cell (the robot's product distance, inf where there is none), then in row-major order. ``config`` is static.
+    """
+    height, width = reachable.shape
+    frontier = frontier_cells(belief, reachable)
+    grid = _label(_listed(frontier), width)
+    size, subgoal = _summarise(grid, width)
+    is_root = grid.parent[:-1] == jnp.arange(grid.parent.shape[0] - 1, dtype=jnp.int32)
+    some_large = jnp.max(size) >= config.min_size
+    kept = is_root & ((size[:-1] >= config.min_size) | ~some_large)
+    padded_distance = jnp.pad(distance, 1, constant_values=UNREACHABLE).ravel()
+    cost, cell, root = _nearest(grid, kept, subgoal, padded_distance, config.max_subgoals)
+    mask = cell < _NEVER
+    slots = jnp.full(grid.parent.shape, NO_SUBGOAL, jnp.int32)
+    slots = slots.at[root].set(jnp.where(mask, jnp.arange(config.max_subgoals, dtype=jnp.int32), NO_SUBGOAL))
+    component = slots[grid.parent[:-1]].reshape(height + 2, width + 2)[1:-1, 1:-1]
+    row, column = cell // (width + 2) - 1, cell % (width + 2) - 1
+    return Subgoals(
+        cells=jnp.where(mask[:, None], jnp.stack([row, column], axis=1), 0),
+        mask=mask,
+        size=jnp.where(mask, size[root], 0),
+        distance=cost,
+        component=component,
+        frontier=frontier,
+        status=status_if(jnp.sum(kept, dtype=jnp.int32) > config.max_subgoals, Status.SUBGOAL_OVERFLOW),
+    )
+
+
+def _listed(frontier: Bool[Array, "H W"]) -> _Grid:
+    flat = jnp.pad(frontier, 1).ravel()
+    cells = flat.shape[0]
+    rank = jnp.cumsum(flat, dtype=jnp.int32)
+    count = rank[-1]
+    room = -(-cells // _BLOCK) * _BLOCK
+
+    def fill(block: Array, listed: Array) -> Array:
+        wanted = block * _BLOCK + jnp.arange(1, _BLOCK + 1, dtype=jnp.int32)
+        found = jnp.searchsorted(rank, wanted).astype(jnp.int32)
+        return jax.lax.dynamic_update_slice(listed, found, (block * _BLOCK,))
+
+    # A rank that is not reached is found at the end, which is the dummy.
+    listed = jax.lax.fori_loop(0, _blocks(count), fill, jnp.full(room, cells, jnp.int32))
+    parent = jnp.where(flat, jnp.arange(cells, dtype=jnp.int32), jnp.int32(cells))
+    return _Grid(listed=listed, count=count, parent=jnp.append(parent, jnp.int32(cells)))
+
+
+def _blocks(count: Int32[Array, ""]) -> Int32[Array, ""]:
+    return (count + (_BLOCK - 1)) // _BLOCK
+
+
+def _over_frontier(grid: _Grid, body: Callable[[Int32[Array, "block"], Carry], Carry], carry: Carry) -> Carry:
+    """Fold ``body`` over the blocks of the list; dummies may be among the cells of the last."""
+
+    def step(block: Array, carry: Carry) -> Carry:
+        return body(jax.lax.dynamic_slice(grid.listed, (block * _BLOCK,), (_BLOCK,)), carry)
+
+    return jax.lax.fori_loop(0, _blocks(grid.count), step, carry)
+
+
+def _label(grid: _Grid, width: int) -> _Grid:
+    """Connected components: ``parent`` becomes the first cell of each component, the dummy off the frontier.
+
+    Each round hooks every tree, at its root, below the least tree that touches it, and halves the paths to the roots:
+    logarithmically many rounds, where passing labels from cell to cell alone would take as many as a component is long.
+    """
+    offsets = jnp.asarray([row * (width + 2) + column for row, column in _NEIGHBOURS], dtype=jnp.int32)
+    dummy = grid.parent.shape[0] - 1
+
+    def hook(cells: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        parent, changed = carry
+        around = jnp.minimum(cells[:, None] + offsets[None, :], dummy)
+        least = jnp.min(parent[around], axis=1)
+        root = parent[cells]
+        least = jnp.where(cells == dummy, dummy, jnp.minimum(least, root))
+        return parent.at[root].min(least).at[cells].min(least), changed | jnp.any(least < root)
+
+    def shorten(cells: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        parent, changed = carry
+        old = parent[cells]
+        new = parent[parent[old]]
+        return parent.at[cells].set(new), changed | jnp.any(new < old)
+
+    def one_round(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        parent, _ = carry
+        return _over_frontier(grid, shorten, _over_frontier(grid, hook, (parent, jnp.bool_(False))))
+
+    parent, _ = jax.lax.while_loop(lambda carry: carry[1], one_round, (grid.parent, grid.count > 0))
+    return grid.replace(parent=parent)
+
+
+def _summarise(grid: _Grid, width: int) -> tuple[Int32[Array, "cells"], Int32[Array, "cells"]]:
+    """Size and subgoal of each component, at the component's root.
+
+    With ``n`` cells that sum to ``S``, the cell ``p`` nearest the centroid minimises ``n p^2 - 2 p S``. Taken relative
+    to the cell that holds the centroid these integers are small: the choice is exact, and equal under jit and vmap.
+    """
+    nothing = jnp.zeros(grid.parent.shape, jnp.int32)
+
+    def add(cells: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        root = grid.parent[cells]
+        row, column = cells // (width + 2), cells % (width + 2)
+        return carry[0].at[root].add(1), carry[1].at[root].add(row), carry[2].at[root].add(column)
+
+    size, rows, columns = _over_frontier(grid, add, (nothing, nothing, nothing))
+
+    def off_centre(cells: Array) -> Array:
+        root = grid.parent[cells]
+        count = jnp.maximum(size[root], 1)
+        row, column = cells // (width + 2) - rows[root] // count, cells % (width + 2) - columns[root] // count
+        square = jnp.minimum(row * row + column * column, jnp.int32(2**30) // count)
+        return count * square - 2 * (row * (rows[root] % count) + column * (columns[root] % count))
+
+    never = jnp.full(grid.parent.shape, _NEVER, jnp.int32)
+    least = _over_frontier(grid, lambda cells, best: best.at[grid.parent[cells]].min(off_centre(cells)), never)
+
+    def first(cells: Array, best: Array) -> Array:
+        root = grid.parent[cells]
+        return best.at[root].min(jnp.where(off_centre(cells) == least[root], cells, _NEVER))
+
+    dummy = grid.parent.shape[0] - 1
+    return size.at[dummy].set(0), _over_frontier(grid, first, never)
+
+
+def _nearest(
+    grid: _Grid,
+    kept: Bool[Array, "real"],
+    subgoal: Int32[Array, "cells"],
+    distance: Float32[Array, "real"],
+    most: int,
+) -> tuple[Float32[Array, "S"], Int32[Array, "S"], Int32[Array, "S"]]:
+    """Distance, subgoal and root of the nearest components, by (distance, subgoal); ``_NEVER`` where there is none."""
+    dummy = grid.parent.shape[0] - 1
+    kept = jnp.append(kept, jnp.bool_(False))
+    distance = jnp.append(distance, jnp.float32(UNREACHABLE))
+
+    def merge(cells: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        chosen = jnp.where(kept[cells], subgoal[cells], _NEVER)
+        cost = jnp.where(kept[cells], distance[jnp.minimum(chosen, dummy)], UNREACHABLE)
+        root = jnp.where(kept[cells], cells, dummy)
+        together = tuple(jnp.concatenate(pair) for pair in zip(carry, (cost, chosen, root), strict=True))
+        cost, chosen, root = (entry[:most] for entry in jax.lax.sort(together, num_keys=2))
+        return cost, chosen, root
+
+    none = (jnp.full(most, UNREACHABLE, jnp.float32), jnp.full(most, _NEVER), jnp.full(most, dummy, jnp.int32))
+    return _over_frontier(grid, merge, none)

@@ -1,0 +1,309 @@
+"""The grid: what is there (``World``) and what has been seen of it (``BeliefMap``).
+
+Cells are ``(row, column)`` with row 0 at the top. A letter is an integer whose bit ``i`` says that proposition ``i``
+of the environment family is true in the cell; labelled cells are free cells (a fire can be seen through and driven
+into, it merely has a letter).
+
+Fields are annotated with ``*batch`` in front of their dimensions: a stack of worlds, or what vmap returns, has the same
+class. Functions take one world unless they say otherwise.
+"""
+
+import base64
+import zlib
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float32, Int, Int8, Int32, Num, Shaped, UInt8
+
+MAX_LETTER: int = 2**16 - 1
+"""Largest letter: sixteen propositions."""
+
+_FLOOR_COLOUR = (150, 150, 150)
+_WALL_COLOUR = (205, 200, 190)
+
+
+class WorldError(ValueError):
+    """A world, or the configuration of a world, is not valid; the message says what and where."""
+
+
+@struct.dataclass(kw_only=True)
+class Appearance:
+    """What a camera sees of the cells; the mapping sensor and the planner never read it.
+
+    Attributes:
+        floor_colour: RGB of the floor of each cell; meaningful on free cells.
+        wall_colour: RGB of the sides of each cell; meaningful on obstacles.
+        smoke: density of white smoke per cell travelled through, 0 (clear) to 1.
+        light: brightness, 0 (dark) to 1 (lit).
+    """
+
+    floor_colour: UInt8[Array, "*batch H W 3"]
+    wall_colour: UInt8[Array, "*batch H W 3"]
+    smoke: Float32[Array, "*batch H W"]
+    light: Float32[Array, "*batch H W"]
+
+    @classmethod
+    def plain(cls, height: int, width: int) -> "Appearance":
+        """Grey floor, light walls, no smoke, lights on."""
+        shape = (height, width)
+        return cls(
+            floor_colour=jnp.asarray(np.full((*shape, 3), _FLOOR_COLOUR, np.uint8)),
+            wall_colour=jnp.asarray(np.full((*shape, 3), _WALL_COLOUR, np.uint8)),
+            smoke=jnp.asarray(np.zeros(shape, np.float32)),
+            light=jnp.asarray(np.ones(shape, np.float32)),
+        )
+
+    def padded(self, top: int, bottom: int, left: int, right: int) -> "Appearance":
+        """The same with rows and columns added that repeat the outermost colours, without smoke and lit."""
+        rows_columns = ((top, bottom), (left, right))
+        return Appearance(
+            floor_colour=jnp.asarray(np.pad(np.asarray(self.floor_colour), (*rows_columns, (0, 0)), mode="edge")),
+            wall_colour=jnp.asarray(np.pad(np.asarray(self.wall_colour), (*rows_columns, (0, 0)), mode="edge")),
+            smoke=jnp.asarray(np.pad(np.asarray(self.smoke), rows_columns)),
+            light=jnp.asarray(np.pad(np.asarray(self.light), rows_columns, constant_values=1.0)),
+        )
+
+
+@struct.dataclass(kw_only=True)
+class World:
+    """The truth: a grid with a closed border. Made by ``make_world``, which checks it.
+
+    Attributes:
+        occupied: True on obstacles.
+        letters: the letter of each cell, 0 on obstacles.
+        start: the robot's first cell, free.
+        resolution: the length of a cell's side in the unit of cost (1: costs are in cells).
+        extent: rows and columns of the map without padding; budgets and dead-end costs refer to it.
+        appearance: what a camera sees.
+    """
+
+    occupied: Bool[Array, "*batch H W"]
+    letters: Int32[Array, "*batch H W"]
+    start: Int32[Array, "*batch 2"]
+    resolution: Float32[Array, "*batch"]
+    extent: Int32[Array, "*batch 2"]
+    appearance: Appearance
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.occupied.shape
+
+
+@struct.dataclass(kw_only=True)
+class BeliefMap:
+    """What has been observed. Observation is perfect: what is not ``UNKNOWN`` agrees with the world.
+
+    Attributes:
+        cells: ``UNKNOWN``, ``FREE`` or ``OCCUPIED``.
+        letters: the letter of each cell, 0 where it is not observed.
+        resolution: the length of a cell's side in the unit of cost.
+        extent: rows and columns of the map without padding.
+    """
+
+    UNKNOWN: ClassVar[int] = -1
+    FREE: ClassVar[int] = 0
+    OCCUPIED: ClassVar[int] = 1
+
+    cells: Int8[Array, "*batch H W"]
+    letters: Int32[Array, "*batch H W"]
+    resolution: Float32[Array, "*batch"]
+    extent: Int32[Array, "*batch 2"]
+
+    @property
+    def free(self) -> Bool[Array, "*batch H W"]:
+        """Observed free."""
+        return self.cells == BeliefMap.FREE
+
+    @property
+    def occupied(self) -> Bool[Array, "*batch H W"]:
+        """Observed occupied."""
+        return self.cells == BeliefMap.OCCUPIED
+
+    @property
+    def unknown(self) -> Bool[Array, "*batch H W"]:
+        """Not observed."""
+        return self.cells == BeliefMap.UNKNOWN
+
+    @classmethod
+    def unobserved(cls, world: World) -> "BeliefMap":
+        """Nothing seen yet."""
+        return cls(
+            cells=jnp.full(world.occupied.shape, BeliefMap.UNKNOWN, jnp.int8),
+            letters=jnp.zeros(world.letters.shape, jnp.int32),
+            resolution=world.resolution,
+            extent=world.extent,
+        )
+
+    @classmethod
+    def revealed(cls, world: World) -> "BeliefMap":
+        """Everything seen."""
+        cells = jnp.where(world.occupied, jnp.int8(BeliefMap.OCCUPIED), jnp.int8(BeliefMap.FREE))
+        return cls(cells=cells, letters=world.letters, resolution=world.resolution, extent=world.extent)
+
+
+def make_world(
+    occupied: Bool[np.ndarray, "H W"],
+    letters: Int[np.ndarray, "_ _"],
+    start: tuple[int, int],
+    resolution: float = 1.0,
+    appearance: Appearance | None = None,
+) -> World:
+    """Check the arrays and close the border.
+
+    If any cell of the border is free, a ring of obstacles is added around the arrays; ``start`` refers to the arrays as
+    given and is moved with them. Letters on obstacles are dropped. Without ``appearance`` the world looks plain.
+
+    Raises:
+        WorldError: where the shapes disagree, a letter is out of range, the start is outside or on an obstacle, or the
+            resolution is not a positive number.
+    """
+    _check(occupied, letters, start, resolution, appearance)
+    row, column = (int(entry) for entry in start)
+    height, width = occupied.shape
+    appearance = Appearance.plain(height, width) if appearance is None else appearance
+    interior = np.zeros(occupied.shape, bool)
+    interior[1:-1, 1:-1] = True
+    if not np.all(occupied[~interior]):
+        occupied = np.pad(occupied, 1, constant_values=True)
+        letters = np.pad(letters, 1)
+        appearance = appearance.padded(1, 1, 1, 1)
+        row, column = row + 1, column + 1
+    return World(
+        occupied=jnp.asarray(occupied),
+        letters=jnp.asarray(np.where(occupied, 0, letters).astype(np.int32)),
+        start=jnp.asarray(np.array([row, column], np.int32)),
+        resolution=jnp.asarray(np.float32(resolution)),
+        extent=jnp.asarray(np.array(occupied.shape, np.int32)),
+        appearance=appearance,
+    )
+
+
+def pad_world(world: World, height: int, width: int) -> World:
+    """The world with obstacles added below and to the right until it has ``height`` rows and ``width`` columns.
+
+    Nothing that can be seen, reached or planned changes. Raises WorldError where the world is larger than that.
+    """
+    rows, columns = world.shape
+    if height < rows or width < columns:
+        raise WorldError(f"a world of {rows}x{columns} cells cannot be padded to {height}x{width}: give a larger size")
+    missing = ((0, height - rows), (0, width - columns))
+    return world.replace(
+        occupied=jnp.asarray(np.pad(np.asarray(world.occupied), missing, constant_values=True)),
+        letters=jnp.asarray(np.pad(np.asarray(world.letters), missing)),
+        appearance=world.appearance.padded(0, height - rows, 0, width - columns),
+    )
+
+
+def belief_from_numpy(
+    cells: Num[np.ndarray, "H W"],
+    letters: Int[np.ndarray, "H W"],
+    resolution: float = 1.0,
+    extent: tuple[int, int] | None = None,
+) -> BeliefMap:
+    """A belief from host arrays, whatever their integer type; entries of ``cells`` as in ``BeliefMap``.
+
+    ``extent`` is the map's size without padding, by default that of the arrays.
+
+    Raises:
+        WorldError: where an entry of ``cells`` is none of the three, or an unobserved cell has a letter.
+    """
+    if not np.isin(cells, (BeliefMap.UNKNOWN, BeliefMap.FREE, BeliefMap.OCCUPIED)).all():
+        raise WorldError(f"a belief's cells must be -1, 0 or 1, found {np.unique(cells).tolist()[:8]}")
+    if np.any((cells == BeliefMap.UNKNOWN) & (letters != 0)):
+        raise WorldError("a belief has letters in cells that were not observed; set them to 0")
+    return BeliefMap(
+        cells=jnp.asarray(cells.astype(np.int8)),
+        letters=jnp.asarray(letters.astype(np.int32)),
+        resolution=jnp.asarray(np.float32(resolution)),
+        extent=jnp.asarray(np.array(cells.shape if extent is None else extent, np.int32)),
+    )
+
+
+def world_to_dict(world: World) -> dict[str, Any]:
+    """JSON-able values of one world; arrays are compressed. Read back bit for bit by ``world_from_dict``."""
+    look = world.appearance
+    return {
+        "occupied": pack_array(np.asarray(world.occupied)),
+        "letters": pack_array(np.asarray(world.letters)),
+        "start": np.asarray(world.start).tolist(),
+        "resolution": float(world.resolution),
+        "extent": np.asarray(world.extent).tolist(),
+        "appearance": {name: pack_array(np.asarray(getattr(look, name))) for name in look.__dataclass_fields__},
+    }
+
+
+def world_from_dict(data: Mapping[str, Any]) -> World:
+    """The world that ``world_to_dict`` wrote. Raises WorldError where the values are damaged."""
+    try:
+        look = {name: jnp.asarray(unpack_array(values)) for name, values in data["appearance"].items()}
+        row, column = (int(entry) for entry in data["start"])
+        rows, columns = (int(size) for size in data["extent"])
+        world = make_world(
+            unpack_array(data["occupied"]),
+            unpack_array(data["letters"]),
+            (row, column),
+            float(data["resolution"]),
+            Appearance(**look),
+        )
+    except WorldError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, zlib.error) as error:
+        raise WorldError(f"not the values of a world: {error!r}") from error
+    if not (0 < rows <= world.shape[0] and 0 < columns <= world.shape[1]):
+        raise WorldError(f"the extent {rows}x{columns} does not fit the {world.shape[0]}x{world.shape[1]} grid")
+    return world.replace(extent=jnp.asarray(np.array([rows, columns], np.int32)))
+
+
+def pack_array(array: Shaped[np.ndarray, "..."]) -> dict[str, Any]:
+    """Shape, type and zlib-compressed bytes (base64) of an array, as JSON-able values."""
+    contiguous = np.ascontiguousarray(array)
+    data = base64.b64encode(zlib.compress(contiguous.tobytes())).decode()
+    return {"shape": list(array.shape), "dtype": contiguous.dtype.str, "zlib": data}
+
+
+def unpack_array(data: Mapping[str, Any]) -> Shaped[np.ndarray, "..."]:
+    """The array that ``pack_array`` wrote."""
+    raw = zlib.decompress(base64.b64decode(data["zlib"]))
+    return np.frombuffer(raw, dtype=np.dtype(data["dtype"])).reshape(data["shape"]).copy()
+
+
+def _check(
+    occupied: np.ndarray,
+    letters: np.ndarray,
+    start: tuple[int, int],
+    resolution: float,
+    appearance: Appearance | None,
+) -> None:
+    if occupied.dtype != np.bool_ or not np.issubdtype(letters.dtype, np.integer):
+        raise WorldError(f"occupied must be boolean, letters integers; found {occupied.dtype} and {letters.dtype}")
+    if letters.shape != occupied.shape or occupied.ndim != 2 or occupied.size == 0:
+        raise WorldError(f"occupied {occupied.shape} and letters {letters.shape} must have one shape [H, W], not empty")
+    if letters.min() < 0 or letters.max() > MAX_LETTER:
+        raise WorldError(f"letters must lie in 0..{MAX_LETTER}, found {letters.min()}..{letters.max()}")
+    row, column = start
+    height, width = occupied.shape
+    if not (0 <= row < height and 0 <= column < width):
+        raise WorldError(f"the start ({row}, {column}) lies outside of the {height}x{width} grid")
+    if occupied[row, column]:
+        raise WorldError(f"the start ({row}, {column}) is an obstacle; choose a free cell")
+    if not (np.isfinite(resolution) and resolution > 0):
+        raise WorldError(f"the resolution must be a positive number, found {resolution}")
+    if appearance is not None:
+        _check_appearance(appearance, occupied.shape)
+
+
+def _check_appearance(appearance: Appearance, shape: tuple[int, ...]) -> None:
+    wanted = {
+        "floor_colour": ((*shape, 3), jnp.uint8),
+        "wall_colour": ((*shape, 3), jnp.uint8),
+        "smoke": (shape, jnp.float32),
+        "light": (shape, jnp.float32),
+    }
+    for name, (size, dtype) in wanted.items():
+        found = getattr(appearance, name)
+        if found.shape != size or found.dtype != dtype:
+            raise WorldError(f"{name} must be {np.dtype(dtype)}{size} on this grid, found {found.dtype}{found.shape}")

@@ -1,0 +1,200 @@
+"""Line of sight: what the mapping sensor adds to the belief.
+
+Definition. Straight lines (Bresenham, ties away from the axis) run from the robot to every cell on the perimeter of the
+square of half-width ``ceil(R)``. A line is followed while its cells are free and within ``R`` (Euclidean, in cells); it
+does not pass between two obstacles that touch at their corners. The free cells of all lines are seen, the robot's cell
+and its eight neighbours always. An obstacle is seen where it touches, also at a corner, a free cell that is seen: lines
+alone would leave slivers in walls that are grazed. Letters do not block sight.
+
+The lines of a side of the square do not cross, so those through a given cell are a contiguous range of them, and the
+cell is seen where any line of the range gets far enough: a range maximum, two look-ups, instead of a scatter.
+"""
+
+import dataclasses
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int, Int32, UInt8
+
+from potlp_jax.world.grid import BeliefMap, World
+
+_OCCUPIED_BIT = 1
+_DIAGONALS = ((-1, -1), (-1, 1), (1, -1), (1, 1))
+
+
+@dataclasses.dataclass(frozen=True)
+class SensorConfig:
+    """The mapping sensor.
+
+    Attributes:
+        range_cells: how far it sees, Euclidean, in cells. Its cost grows with the range times the grid's longer side.
+    """
+
+    range_cells: float = 110.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.range_cells) and self.range_cells >= 0):
+            raise ValueError(f"range_cells must be a finite number of cells, 0 or more, found {self.range_cells}")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Lines:
+    """Static tables of the lines that leave the robot's cell, for one range and one shape of grid.
+
+    Lines are counted through the four sides (up, down, left, right), ``2N + 1`` a side; step ``k`` is at distance ``k``
+    along the side's axis. ``margin`` is how far the window of cells reaches from the robot, in rows and columns.
+    Tables over offsets have entry ``(dr + H - 1, dc + W - 1)``.
+    """
+
+    margin: tuple[int, int]
+    cells: Int[np.ndarray, "steps lines"]
+    """Flat index into the window; one past its end where the line is outside of it."""
+    blocking: UInt8[np.ndarray, "steps lines"]
+    """Bits of a cell's code that stop the line there."""
+    first: Int[np.ndarray, "two_h two_w"]
+    """Flat index ``level * lines + line`` of the range's first block of ``2 ** level`` lines."""
+    last: Int[np.ndarray, "two_h two_w"]
+    """The same for the last block of the range; both together cover it."""
+    needed: Int[np.ndarray, "two_h two_w"]
+    """Step that a line must reach for the cell to be seen; more than any reaches where the cell is out of range."""
+    levels: int
+
+
+def observe(belief: BeliefMap, world: World, cell: Int32[Array, "2"], config: SensorConfig) -> BeliefMap:
+    """The belief with all that is in line of sight from ``cell`` added. ``config`` is static."""
+    seen = visible(world.occupied, cell, config)
+    truth = jnp.where(world.occupied, jnp.int8(BeliefMap.OCCUPIED), jnp.int8(BeliefMap.FREE))
+    return belief.replace(
+        cells=jnp.where(seen, truth, belief.cells), letters=jnp.where(seen, world.letters, belief.letters)
+    )
+
+
+def visible(occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], config: SensorConfig) -> Bool[Array, "H W"]:
+    """The cells, free or not, that are seen from ``cell`` (see the definition at the top of the module).
+
+    Outside of the array nothing is seen. ``cell`` must lie inside of it. ``config`` is static.
+    """
+    height, width = occupied.shape
+    lines = _lines(config.range_cells, height, width)
+    corner = (jnp.int32(height - 1) - cell[0], jnp.int32(width - 1) - cell[1])
+    reach = _range_maxima(_reach(occupied, cell, lines), lines.levels)
+    farthest = jnp.maximum(
+        reach[_at_offsets(lines.first, corner, height, width)], reach[_at_offsets(lines.last, corner, height, width)]
+    )
+    seen = farthest >= _at_offsets(lines.needed, corner, height, width)
+    near = (jnp.abs(jnp.arange(height) - cell[0]) <= 1)[:, None] & (jnp.abs(jnp.arange(width) - cell[1]) <= 1)[None, :]
+    free_seen = (seen | near) & ~occupied
+    return near | free_seen | (occupied & _dilate(free_seen))
+
+
+def _reach(occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], lines: _Lines) -> Int32[Array, "lines"]:
+    """The last step of every line before it is stopped."""
+    rows, columns = lines.margin
+    padded = jnp.pad(_cell_codes(occupied), ((rows, rows), (columns, columns)), constant_values=_OCCUPIED_BIT)
+    window = jax.lax.dynamic_slice(padded, (cell[0], cell[1]), (2 * rows + 1, 2 * columns + 1)).ravel()
+    code = jnp.append(window, jnp.uint8(_OCCUPIED_BIT))[lines.cells]
+    steps = lines.cells.shape[0]
+    step = jnp.arange(steps, dtype=jnp.int32)[:, None]
+    return jnp.min(jnp.where((code & lines.blocking) != 0, step, jnp.int32(steps)), axis=0, initial=steps)
+
+
+def _cell_codes(occupied: Bool[Array, "H W"]) -> UInt8[Array, "H W"]:
+    """Bit 0: an obstacle. Bit ``1 + d``: entering along diagonal ``d`` squeezes between two obstacles."""
+    height, width = occupied.shape
+    around = jnp.pad(occupied, 1, constant_values=True)
+    code = occupied.astype(jnp.uint8)
+    for bit, (row_step, column_step) in enumerate(_DIAGONALS, start=1):
+        beside = around[1 : 1 + height, 1 - column_step : 1 - column_step + width]
+        above = around[1 - row_step : 1 - row_step + height, 1 : 1 + width]
+        code = code | ((beside & above).astype(jnp.uint8) << jnp.uint8(bit))
+    return code
+
+
+def _range_maxima(values: Int32[Array, "lines"], levels: int) -> Int32[Array, "entries"]:
+    """Row ``l`` of the (flattened) table holds the maximum of every block of ``2 ** l`` values from an index on."""
+    rows = [values]
+    for level in range(levels - 1):
+        shift = min(2**level, values.shape[0])
+        ahead = jnp.concatenate([rows[-1][shift:], rows[-1][values.shape[0] - shift :]])
+        rows.append(jnp.maximum(rows[-1], ahead))
+    return jnp.concatenate(rows)
+
+
+def _at_offsets(
+    table: Int[np.ndarray, "two_h two_w"], corner: tuple[Array, Array], height: int, width: int
+) -> Int32[Array, "H W"]:
+    """Entries of a table over offsets for all cells of the grid, seen from the robot's cell."""
+    return jax.lax.dynamic_slice(jnp.asarray(table), corner, (height, width))
+
+
+def _dilate(mask: Bool[Array, "H W"]) -> Bool[Array, "H W"]:
+    """The mask and its eight neighbours."""
+    height, width = mask.shape
+    tall = jnp.pad(mask, ((1, 1), (0, 0)))
+    tall = tall[:height] | tall[1 : height + 1] | tall[2:]
+    wide = jnp.pad(tall, ((0, 0), (1, 1)))
+    return wide[:, :width] | wide[:, 1 : width + 1] | wide[:, 2:]
+
+
+@functools.lru_cache(maxsize=32)
+def _lines(range_cells: float, height: int, width: int) -> _Lines:
+    """The tables. The lines depend on the range alone, so that a padded grid shows the same; the grid bounds steps."""
+    half = max(1, math.ceil(range_cells))
+    margin = (min(half, height - 1), min(half, width - 1))
+    steps = max(margin)
+    k = np.arange(steps + 1)[:, None]
+    aim = np.arange(-half, half + 1)[None, :]
+    minor = np.sign(aim) * ((2 * k * np.abs(aim) + half) // (2 * half))
+    offsets = [(-k, minor), (k, minor), (minor, -k), (minor, k)]
+    row = np.concatenate([np.broadcast_to(r, minor.shape) for r, _ in offsets], axis=1)
+    column = np.concatenate([np.broadcast_to(c, minor.shape) for _, c in offsets], axis=1)
+    cells = (row + margin[0]) * (2 * margin[1] + 1) + column + margin[1]
+    outside = (np.abs(row) > margin[0]) | (np.abs(column) > margin[1])
+    window_size = (2 * margin[0] + 1) * (2 * margin[1] + 1)
+    first, last, needed, levels = _covering_ranges(minor, range_cells, height, width)
+    return _Lines(
+        margin=margin,
+        cells=np.where(outside, window_size, cells)[1:].astype(np.int32),
+        blocking=_blocking_bits(row, column)[1:],
+        first=first,
+        last=last,
+        needed=needed,
+        levels=levels,
+    )
+
+
+def _blocking_bits(row: np.ndarray, column: np.ndarray) -> UInt8[np.ndarray, "steps lines"]:
+    bits = np.full(row.shape, _OCCUPIED_BIT, np.uint8)
+    row_step = np.diff(row, axis=0, prepend=0)
+    column_step = np.diff(column, axis=0, prepend=0)
+    for bit, diagonal in enumerate(_DIAGONALS, start=1):
+        bits[(row_step == diagonal[0]) & (column_step == diagonal[1])] |= np.uint8(1 << bit)
+    return bits
+
+
+def _covering_ranges(
+    minor: Int[np.ndarray, "steps side"], range_cells: float, height: int, width: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """For every offset: the two blocks that cover the lines through it, and the step at which they do."""
+    side = minor.shape[1]
+    row = np.arange(1 - height, height)[:, None]
+    column = np.arange(1 - width, width)[None, :]
+    step = np.maximum(np.abs(row), np.abs(column))
+    in_range = (row**2 + column**2 <= range_cells**2) & (step < minor.shape[0])
+    vertical = np.abs(row) >= np.abs(column)
+    sides = np.where(vertical, np.where(row < 0, 0, 1), np.where(column < 0, 2, 3))
+    across = np.where(vertical, column, row)
+    low, high = np.zeros(step.shape, np.int64), np.zeros(step.shape, np.int64)
+    for k in range(minor.shape[0]):
+        here = (step == k) & in_range
+        low[here] = np.searchsorted(minor[k], across[here], side="left")
+        high[here] = np.searchsorted(minor[k], across[here], side="right")
+    level = np.where(in_range, np.floor(np.log2(np.maximum(high - low, 1))), 0).astype(np.int64)
+    first = level * 4 * side + sides * side + low
+    last = level * 4 * side + sides * side + np.maximum(high - 2**level, 0)
+    # The reach of a line is the number of cells it passes; the cell at step k is its k-th.
+    needed = np.where(in_range, step, np.iinfo(np.int32).max)
+    return first.astype(np.int32), last.astype(np.int32), needed.astype(np.int32), int(level.max()) + 1

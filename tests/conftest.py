@@ -1,0 +1,19 @@
+"""Strict modes for every test: no silent rank promotion, no silent dtype promotion."""
+
+import os
+from pathlib import Path
+
+import jax
+import pytest
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+@pytest.fixture(scope="session")
+def external_data() -> Path:
+    """Folder with maps and reference data made by others; tests that need it are skipped without it."""
+    folder = os.environ.get("POTLP_EXTERNAL_DATA")
+    if not folder:
+        pytest.skip("POTLP_EXTERNAL_DATA is not set: data made by others is not part of the repository")
+    return Path(folder)

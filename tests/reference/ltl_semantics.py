@@ -1,0 +1,321 @@
+"""Semantics of linear temporal logic, written from its definition: no Spot, no automata, nothing of the library.
+
+* ``satisfies_lasso`` evaluates any LTL formula on an infinite word ``prefix . loop . loop . ...``, exactly.
+* ``word_satisfies`` and ``word_violates`` tell whether a finite word has settled a co-safe formula, whatever follows.
+
+Syntax: ``! & | -> <-> xor ^ X F G U R V W M true false 1 0 [] <>``, also ``&& || => <=>``, names, "quoted names" and
+parentheses. ``U R V W M`` and ``->`` associate to the right and bind as in Spot: from weak to strong
+``-> <->``, ``xor``, ``|``, ``&``, ``U R W M``, ``X F G !``.
+
+A letter is an integer whose bit i is set where ``propositions[i]`` is true.
+"""
+
+import re
+from collections.abc import Sequence
+from functools import cache
+
+Formula = tuple
+"""Nested tuples: ("true",), ("false",), ("name", p), ("not", f), ("X", f), ("and", f, g), ("U", f, g), ..."""
+
+_TOKEN = re.compile(r'\s*("(?:[^"\\]|\\.)*"|<->|<=>|->|=>|\[\]|<>|&&|\|\||[!&|^()01]|[A-Za-z_][A-Za-z0-9_.]*)')
+_ALIASES = {"&&": "&", "||": "|", "=>": "->", "<=>": "<->", "[]": "G", "<>": "F", "^": "xor", "V": "R"}
+_CONSTANTS = {"1": ("true",), "true": ("true",), "0": ("false",), "false": ("false",)}
+
+
+def satisfies_lasso(formula: str, propositions: Sequence[str], prefix: Sequence[int], loop: Sequence[int]) -> bool:
+    """Whether the infinite word ``prefix . loop^omega`` satisfies the formula (LTL with any operators)."""
+    if not loop:
+        raise ValueError("the loop of a lasso needs a letter")
+    letters = [*prefix, *loop]
+    successor = [*range(1, len(letters)), len(prefix)]
+    bit = {name: i for i, name in enumerate(propositions)}
+    return _truth(_normal_form(formula), bit, letters, successor)[0]
+
+
+def word_satisfies(formula: str, propositions: Sequence[str], word: Sequence[int]) -> bool:
+    """Whether every infinite continuation of the finite word satisfies the co-safe formula (a good prefix).
+
+    Exact: what is left to do after the word, as a positive combination of obligations, has finitely many successors;
+    the word is good if no infinite sequence of them avoids "nothing left to do".
+    """
+    return _always_reaches_done(_after(formula, tuple(propositions), word), _own_letters(formula, tuple(propositions)))
+
+
+def word_violates(formula: str, propositions: Sequence[str], word: Sequence[int]) -> bool:
+    """Whether no continuation of the finite word satisfies the co-safe formula (a bad prefix). Exact."""
+    return not _can_reach_done(_after(formula, tuple(propositions), word), _own_letters(formula, tuple(propositions)))
+
+
+# Parser
+
+
+class _Parser:
+    def __init__(self, text: str):
+        self.tokens = []
+        position = 0
+        while text[position:].strip():
+            match = _TOKEN.match(text, position)
+            assert match, f"cannot read {text[position:]!r}"
+            self.tokens += _split_operators(match.group(1))
+            position = match.end()
+        self.tokens = [_ALIASES.get(token, token) for token in self.tokens] + [""]
+
+    def take(self, *texts: str) -> str | None:
+        return self.tokens.pop(0) if self.tokens[0] in texts else None
+
+    def formula(self) -> Formula:
+        left = self.exclusive()
+        if operator := self.take("->", "<->"):
+            return (operator, left, self.formula())
+        return left
+
+    def exclusive(self) -> Formula:
+        left = self.disjunction()
+        while self.take("xor"):
+            left = ("xor", left, self.disjunction())
+        return left
+
+    def disjunction(self) -> Formula:
+        left = self.conjunction()
+        while self.take("|"):
+            left = ("or", left, self.conjunction())
+        return left
+
+    def conjunction(self) -> Formula:
+        left = self.until()
+        while self.take("&"):
+            left = ("and", left, self.until())
+        return left
+
+    def until(self) -> Formula:
+        left = self.unary()
+        if operator := self.take("U", "R", "W", "M"):
+            return (operator, left, self.until())
+        return left
+
+    def unary(self) -> Formula:
+        if self.take("!"):
+            return ("not", self.unary())
+        if operator := self.take("X", "F", "G"):
+            return (operator, self.unary())
+        if self.take("("):
+            inner = self.formula()
+            assert self.take(")"), "missing ')'"
+            return inner
+        token = self.tokens.pop(0)
+        assert token not in ("", ")", "&", "|"), f"expected a formula, found {token!r}"
+        if token in _CONSTANTS:
+            return _CONSTANTS[token]
+        return ("name", re.sub(r"\\(.)", r"\1", token[1:-1]) if token.startswith('"') else token)
+
+
+def _split_operators(token: str) -> list[str]:
+    """``XFa`` is X F a, as in Spot; names such as F1 or X2 are names."""
+    if re.fullmatch(r"[FGX][A-Za-z_].*|[FGX]", token):
+        return [token[0], *(_split_operators(token[1:]) if len(token) > 1 else [])]
+    return [token]
+
+
+def _normal_form(text: str) -> Formula:
+    """Parsed, and rewritten to true, false, literals, and, or, X, U, R."""
+    parser = _Parser(text)
+    parsed = parser.formula()
+    assert parser.tokens == [""], f"trailing {parser.tokens}"
+    return _push_negation(parsed, True)
+
+
+def _push_negation(f: Formula, positive: bool) -> Formula:
+    def same(g: Formula) -> Formula:
+        return _push_negation(g, positive)
+
+    true, false = (("true",), ("false",)) if positive else (("false",), ("true",))
+    conjunction, disjunction = ("and", "or") if positive else ("or", "and")
+    until, release = ("U", "R") if positive else ("R", "U")
+    match f:
+        case ("true",):
+            return true
+        case ("false",):
+            return false
+        case ("name", _):
+            return f if positive else ("not", f)
+        case ("not", g):
+            return _push_negation(g, not positive)
+        case ("and", g, h):
+            return (conjunction, same(g), same(h))
+        case ("or", g, h):
+            return (disjunction, same(g), same(h))
+        case ("->", g, h):
+            return (disjunction, _push_negation(g, not positive), same(h))
+        case ("xor", g, h):
+            return _push_negation(("<->", g, h), not positive)
+        case ("<->", g, h):
+            both = ("and", ("->", g, h), ("->", h, g))
+            return same(both)
+        case ("X", g):
+            return ("X", same(g))
+        case ("F", g):
+            return (until, true, same(g))
+        case ("G", g):
+            return (release, false, same(g))
+        case ("U", g, h):
+            return (until, same(g), same(h))
+        case ("R", g, h):
+            return (release, same(g), same(h))
+        case ("W", g, h):  # g W h = h R (g | h)
+            return (release, same(h), (disjunction, same(g), same(h)))
+        case ("M", g, h):  # g M h = h U (g & h)
+            return (until, same(h), (conjunction, same(g), same(h)))
+    raise AssertionError(f)
+
+
+# Infinite words
+
+
+def _truth(f: Formula, bit: dict[str, int], letters: list[int], successor: list[int]) -> list[bool]:
+    """Truth at each position of a lasso."""
+    positions = range(len(letters))
+    match f:
+        case ("true",) | ("false",):
+            return [f[0] == "true"] * len(letters)
+        case ("name", name):
+            return [bool(letter >> bit[name] & 1) for letter in letters]
+        case ("not", g):
+            return [not value for value in _truth(g, bit, letters, successor)]
+        case ("X", g):
+            inner = _truth(g, bit, letters, successor)
+            return [inner[successor[i]] for i in positions]
+    left, right = (_truth(g, bit, letters, successor) for g in f[1:])
+    match f[0]:
+        case "and":
+            return [a and b for a, b in zip(left, right, strict=True)]
+        case "or":
+            return [a or b for a, b in zip(left, right, strict=True)]
+        case "U":  # least solution of u = right | (left & next u)
+            truth = [False] * len(letters)
+            for _ in positions:
+                truth = [right[i] or (left[i] and truth[successor[i]]) for i in positions]
+            return truth
+        case "R":  # greatest solution of r = right & (left | next r)
+            truth = [True] * len(letters)
+            for _ in positions:
+                truth = [right[i] and (left[i] or truth[successor[i]]) for i in positions]
+            return truth
+    raise AssertionError(f)
+
+
+# Finite words. What is left to do is a disjunction of sets of obligations (formulas that the rest of the word must
+# satisfy), kept free of sets that contain another one: {} is false, {{}} is "nothing left to do".
+
+Rest = frozenset
+_DONE: Rest = frozenset({frozenset()})
+_HOPELESS: Rest = frozenset()
+
+
+def _minimal(sets: set[frozenset]) -> Rest:
+    return frozenset(s for s in sets if not any(other < s for other in sets))
+
+
+def _any_of(a: Rest, b: Rest) -> Rest:
+    return _minimal(set(a | b))
+
+
+def _both(a: Rest, b: Rest) -> Rest:
+    return _minimal({s | t for s in a for t in b})
+
+
+@cache
+def _read(f: Formula, letter: frozenset[str]) -> Rest:
+    """What is left of a formula after a letter (the set of propositions that hold)."""
+    match f:
+        case ("true",):
+            return _DONE
+        case ("false",):
+            return _HOPELESS
+        case ("name", name):
+            return _DONE if name in letter else _HOPELESS
+        case ("not", ("name", name)):
+            return _HOPELESS if name in letter else _DONE
+        case ("X", g):
+            return frozenset({frozenset({g})})
+        case ("and", g, h):
+            return _both(_read(g, letter), _read(h, letter))
+        case ("or", g, h):
+            return _any_of(_read(g, letter), _read(h, letter))
+        case ("U", g, h):
+            return _any_of(_read(h, letter), _both(_read(g, letter), frozenset({frozenset({f})})))
+    raise ValueError(f"{f} is not co-safe")
+
+
+@cache
+def _step(rest: Rest, letter: frozenset[str]) -> Rest:
+    result = _HOPELESS
+    for obligations in rest:
+        alternative = _DONE
+        for obligation in obligations:
+            alternative = _both(alternative, _read(obligation, letter))
+        result = _any_of(result, alternative)
+    return result
+
+
+@cache
+def _parsed(formula: str) -> Formula:
+    return _normal_form(formula)
+
+
+def _after(formula: str, propositions: tuple[str, ...], word: Sequence[int]) -> Rest:
+    rest: Rest = frozenset({frozenset({_parsed(formula)})})
+    for letter in word:
+        rest = _step(rest, frozenset(name for i, name in enumerate(propositions) if letter >> i & 1))
+    return rest
+
+
+@cache
+def _own_letters(formula: str, propositions: tuple[str, ...]) -> tuple[frozenset[str], ...]:
+    """All letters over the formula's own propositions: the others change nothing."""
+    names: list[str] = []
+
+    def collect(f: Formula) -> None:
+        if f[0] == "name":
+            names.append(f[1])
+        else:
+            for g in f[1:]:
+                collect(g)
+
+    collect(_parsed(formula))
+    own = sorted(set(names))
+    assert set(own) <= set(propositions), f"{set(own) - set(propositions)} is not among the propositions"
+    return tuple(frozenset(name for i, name in enumerate(own) if letter >> i & 1) for letter in range(2 ** len(own)))
+
+
+@cache
+def _successors(rest: Rest, letters: tuple[frozenset[str], ...]) -> frozenset[Rest]:
+    return frozenset(_step(rest, letter) for letter in letters)
+
+
+@cache
+def _can_reach_done(rest: Rest, letters: tuple[frozenset[str], ...]) -> bool:
+    reached, waiting = {rest}, [rest]
+    while waiting:
+        current = waiting.pop()
+        if current == _DONE:
+            return True
+        new = _successors(current, letters) - reached
+        reached |= new
+        waiting += new
+    return False
+
+
+@cache
+def _always_reaches_done(rest: Rest, letters: tuple[frozenset[str], ...]) -> bool:
+    """No infinite path avoids ``_DONE``: peel off, from ``_DONE`` backwards, what has only peeled successors."""
+    reached, waiting = {rest}, [rest]
+    while waiting:
+        new = _successors(waiting.pop(), letters) - reached
+        reached |= new
+        waiting += new
+    inevitable = {_DONE}
+    while True:
+        more = {r for r in reached if r in inevitable or _successors(r, letters) <= inevitable}
+        if more <= inevitable:
+            return rest in inevitable
+        inevitable |= more

@@ -1,0 +1,210 @@
+"""Slow and obvious planning: Eq. 3 as a literal recursion over histories, and PO-UCT with dictionaries.
+
+Everything here is derived from the text of the model (sections 3 to 5) with lists, sets and dictionaries; nothing of
+the library is used but the arrays that describe a problem. A history is a list of ``(action, outcome)``; whatever is
+known is worked out anew from the whole list, by going through every assignment of truth values to the conditions.
+"""
+
+import itertools
+import math
+import random
+
+import numpy as np
+
+FINISH = "finish"
+
+
+class ReferenceProblem:
+    """The arrays of a planning problem as plain values. An action is ``(s, e)`` or ``FINISH``."""
+
+    def __init__(self, problem):
+        task = problem.task
+        self.accepting = {z for z in range(len(task.accepting)) if task.accepting[z] and task.state_mask[z]}
+        self.edges = {
+            e: (int(task.edges[e, 0]), int(task.edges[e, 1]), int(task.edge_condition[e]))
+            for e in range(len(task.edge_mask))
+            if task.edge_mask[e]
+        }
+        self.subgoals = [s for s in range(len(problem.subgoal_mask)) if problem.subgoal_mask[s]]
+        self.robot = len(problem.subgoal_mask)
+        self.edge_count = len(task.edge_mask)
+        self.cubes = {
+            m: [int(c) for c in task.condition_classes[m] if c >= 0]
+            for m in range(len(task.condition_mask))
+            if task.condition_mask[m]
+        }
+        implies = np.asarray(task.implies)
+        self.implies = [(a, b) for a in self.cubes for b in self.cubes if implies[a, b] and a != b]
+        self.travel = np.asarray(problem.travel, dtype=float)
+        self.finish = np.asarray(problem.finish, dtype=float)
+        self.p = np.asarray(problem.success_probability, dtype=float)
+        self.r_s = np.asarray(problem.success_cost, dtype=float)
+        self.r_f = np.asarray(problem.failure_cost, dtype=float)
+        self.start = int(problem.dfa_state)
+        self.dead_end_cost = float(problem.dead_end_cost)
+        self.assignments = list(self._assignments())
+        self._entailed = {}
+
+    def _assignments(self):
+        """All assignments in which implications hold and a condition holds exactly if one of its cubes does."""
+        names = sorted(self.cubes)
+        for values in itertools.product([False, True], repeat=len(names)):
+            world = dict(zip(names, values, strict=True))
+            if all(world[m] == any(world[c] for c in cubes) for m, cubes in self.cubes.items()) and all(
+                world[b] or not world[a] for a, b in self.implies
+            ):
+                yield world
+
+    def index(self, action):
+        """The library's index of an action."""
+        return self.robot * self.edge_count if action == FINISH else action[0] * self.edge_count + action[1]
+
+    def knowledge(self, history, s):
+        """What the outcomes beyond subgoal s entail: a dictionary condition -> True or False; unknown is absent."""
+        facts = frozenset((self.edges[a[1]][2], outcome) for a, outcome in history if a != FINISH and a[0] == s)
+        if facts not in self._entailed:
+            worlds = [w for w in self.assignments if all(w[m] == outcome for m, outcome in facts)]
+            assert worlds, f"contradiction: {facts}"
+            entailed = {}
+            for m in self.cubes:
+                truths = {w[m] for w in worlds}
+                if len(truths) == 1:
+                    entailed[m] = truths.pop()
+            self._entailed[facts] = entailed
+        return self._entailed[facts]
+
+    def estimate(self, history, action):
+        """P_S, R_S, R_F of an action, given the history."""
+        if action == FINISH:
+            return 1.0, 0.0, 0.0
+        s, e = action
+        condition = self.edges[e][2]
+        known = self.knowledge(history, s)
+        cubes = sorted(self.cubes[condition], key=lambda c: (self.r_s[s, c], c))
+        chance = {c: float(known[c]) if c in known else self.p[s, c] for c in cubes}
+        p_success = 1 - math.prod(1 - chance[c] for c in cubes)
+        if p_success > 0:
+            r_s = 0.0
+            for i, c in enumerate(cubes):
+                r_s += self.r_s[s, c] * chance[c] * math.prod(1 - chance[other] for other in cubes[:i])
+            r_s /= p_success
+        else:
+            r_s = min((self.r_s[s, c] for c in cubes if known.get(c) is not False), default=0.0)
+        if condition in known:
+            p_success = 1.0 if known[condition] else 0.0
+        return p_success, r_s, max(self.r_f[s, c] for c in cubes)
+
+    def end(self, action, outcome):
+        """Place and state after an action."""
+        s, e = action
+        return s, (self.edges[e][1] if outcome else self.edges[e][0])
+
+    def situation(self, history):
+        """Place, state and what is owed after the history."""
+        if not history:
+            return self.robot, self.start, 0.0
+        action, outcome = history[-1]
+        _, r_s, r_f = self.estimate(history[:-1], action)
+        return *self.end(action, outcome), (r_s if outcome else r_f)
+
+    def visited(self, history):
+        """(Place, state) pairs since the history last learnt something."""
+        pairs = [(self.robot, self.start)]
+        for i, (action, outcome) in enumerate(history):
+            if self.edges[action[1]][2] not in self.knowledge(history[:i], action[0]):
+                pairs = []
+            pairs.append(self.end(action, outcome))
+        return pairs
+
+    def distance(self, history, action):
+        """D: what is owed and the way; nothing for going on beyond the same subgoal in the same state."""
+        place, state, owed = self.situation(history)
+        if action == FINISH:
+            return owed + self.finish[place, state]
+        s, e = action
+        source = self.edges[e][0]
+        if (place, state) == (s, source):
+            return 0.0
+        return owed + self.travel[place, state, s, source]
+
+    def actions(self, history):
+        """A(b_h), in the order of their indices."""
+        _, state, _ = self.situation(history)
+        if state in self.accepting:
+            return []
+        visited = self.visited(history)
+        found = []
+        for s in self.subgoals:
+            known = self.knowledge(history, s)
+            for e in self.edges:
+                action = (s, e)
+                returns = known.get(self.edges[e][2]) is True and self.end(action, True) in visited
+                if (
+                    math.isfinite(self.distance(history, action))
+                    and self.estimate(history, action)[0] > 0
+                    and not returns
+                ):
+                    found.append(action)
+        if math.isfinite(self.distance(history, FINISH)):
+            found.append(FINISH)
+        return found
+
+
+def literal_q(problem, history, action):
+    """Q(b_h, a), Eq. 3 as it is written."""
+    p, r_s, r_f = problem.estimate(history, action)
+    cost = problem.distance(history, action)
+    if action == FINISH:
+        return cost
+    cost += p * (r_s + literal_value(problem, [*history, (action, True)]))
+    if p < 1:
+        cost += (1 - p) * (r_f + literal_value(problem, [*history, (action, False)]))
+    return cost
+
+
+def literal_value(problem, history=()):
+    """Least Q after a history; 0 where the task is satisfied, the dead-end cost where nothing is left to do."""
+    history = list(history)
+    if problem.situation(history)[1] in problem.accepting:
+        return 0.0
+    return min((literal_q(problem, history, a) for a in problem.actions(history)), default=problem.dead_end_cost)
+
+
+def dictionary_pouct(problem, simulations, exploration, seed=0):
+    """PO-UCT as published, but for expected backups: {action: Q} and {action: visits} at the root.
+
+    Nodes are dictionaries keyed by the history; a new action is valued by a rollout's cost, each action first of all
+    tried once.
+    """
+    rng = random.Random(seed)
+    q_values, visits, values = {}, {}, {}
+
+    def simulate(history):
+        key = tuple(history)
+        if problem.situation(history)[1] in problem.accepting:
+            return 0.0
+        actions = problem.actions(history)
+        if not actions:
+            return problem.dead_end_cost
+        q, n = q_values.setdefault(key, {}), visits.setdefault(key, dict.fromkeys(actions, 0))
+        total = sum(n.values()) + 1
+
+        def bound(action):
+            return q[action] - exploration * math.sqrt(math.log(total) / n[action]) if n[action] else -math.inf
+
+        action = min(actions, key=bound)
+        if action == FINISH:
+            q[action] = problem.distance(history, action)
+        else:
+            p, r_s, r_f = problem.estimate(history, action)
+            outcome = rng.random() < p
+            values[(*key, (action, outcome))] = simulate([*history, (action, outcome)])
+            won, lost = values.get((*key, (action, True))), values.get((*key, (action, False)))
+            won, lost = (lost if won is None else won), (won if lost is None else lost)
+            q[action] = problem.distance(history, action) + p * (r_s + won) + (1 - p) * (r_f + lost)
+        n[action] += 1
+        return min(q.values())
+
+    for _ in range(simulations):
+        simulate([])
+    return q_values[()], visits[()]

@@ -1,0 +1,134 @@
+"""True labels against a slow reference, and the pathologies that they were defined for."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from potlp_jax.learning.labels import true_labels
+from potlp_jax.planning.product import grid_distances
+from potlp_jax.task.task import Task, TaskSizes
+from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
+from potlp_jax.world.grid import BeliefMap, belief_from_numpy, make_world
+from tests.reference.labels import true_label
+
+FORMULAS = ("F a", "!b U a", "F a & F b", "F(a | b)", "F(a & X b)", "!b U (a & F b)")
+SIZES = TaskSizes(states=6, propositions=2, edges=12, classes=12, compound=2, cubes=3)
+SHAPE = (10, 13)
+FRONTIERS = FrontierConfig(max_subgoals=5, min_size=1)
+
+tasks = {text: Task.from_formula(text, propositions=("a", "b")) for text in FORMULAS}
+
+
+@jax.jit
+def _labels(world, belief, arrays):
+    reachable = jnp.isfinite(grid_distances(belief.free, world.start, belief.resolution))
+    distance = grid_distances(belief.free, world.start, belief.resolution)
+    subgoals = find_subgoals(belief, reachable, distance, FRONTIERS)
+    return subgoals, true_labels(world, belief, subgoals, arrays)
+
+
+def _case(seed, density, known):
+    """A random world and a belief that knows a blob of cells around the start."""
+    rng = np.random.default_rng(seed)
+    occupied = rng.random(SHAPE) < density
+    occupied[[0, -1]] = True
+    occupied[:, [0, -1]] = True
+    start = (int(rng.integers(1, SHAPE[0] - 1)), int(rng.integers(1, SHAPE[1] - 1)))
+    occupied[start] = False
+    letters = np.where(rng.random(SHAPE) < 0.15, rng.integers(1, 4, SHAPE), 0)
+    world = make_world(occupied, letters, start)
+    rows, columns = np.indices(SHAPE)
+    seen = np.hypot(rows - start[0], columns - start[1]) < known
+    seen |= rng.random(SHAPE) < 0.05
+    cells = np.where(seen, np.where(occupied, BeliefMap.OCCUPIED, BeliefMap.FREE), BeliefMap.UNKNOWN)
+    return world, belief_from_numpy(cells, np.where(seen, np.asarray(world.letters), 0))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.1, 0.3]), st.sampled_from([2.0, 4.0]), st.sampled_from(FORMULAS))
+def test_labels_equal_the_reference(seed, density, known, text):
+    world, belief = _case(seed, density, known)
+    task, arrays = tasks[text], tasks[text].padded(SIZES)
+    subgoals, estimates = _labels(world, belief, arrays)
+    free, letters = ~np.asarray(world.occupied), np.asarray(world.letters)
+    observed = ~np.asarray(belief.unknown)
+    around = np.pad(~observed, 1, constant_values=True)
+    beside_unobserved = around[:-2, 1:-1] | around[2:, 1:-1] | around[1:-1, :-2] | around[1:-1, 2:]
+    frontier = observed & free & beside_unobserved
+    for s in range(FRONTIERS.max_subgoals):
+        for c in range(SIZES.classes):
+            probability = float(estimates.success_probability[s, c])
+            if not (subgoals.mask[s] and c < task.sizes.classes):
+                assert probability == 0.0
+                continue
+            stay = set(np.flatnonzero(np.asarray(arrays.class_stay[c])).tolist())
+            go = set(np.flatnonzero(np.asarray(arrays.class_go[c])).tolist())
+            own = np.asarray(subgoals.component) == s
+            expected = true_label(free, letters, observed, frontier, own, np.asarray(subgoals.cells[s]), stay, go)
+            assert probability == expected[0]
+            if expected[0]:
+                assert float(estimates.success_cost[s, c]) == pytest.approx(expected[1], rel=1e-5)
+            assert float(estimates.failure_cost[s, c]) == pytest.approx(expected[2], rel=1e-5)
+
+
+def _picture(rows):
+    """World and belief from a drawing: # wall, . free, a goal; upper case or _ (free) and = (wall) are unobserved."""
+    art = np.array([list(row) for row in rows])
+    occupied = np.isin(art, ["#", "="])
+    letters = np.isin(art, ["a", "A"]).astype(np.int32)
+    seen = np.isin(art, ["#", ".", "a", "s"])
+    start = tuple(int(entry) for entry in np.argwhere(art == "s")[0])
+    world = make_world(occupied, letters, start)
+    cells = np.where(seen, np.where(occupied, BeliefMap.OCCUPIED, BeliefMap.FREE), BeliefMap.UNKNOWN)
+    return world, belief_from_numpy(cells, np.where(seen, letters, 0))
+
+
+def _picture_labels(rows):
+    world, belief = _picture(rows)
+    subgoals, estimates = _labels(world, belief, tasks["F a"].padded(SIZES))
+    return np.asarray(subgoals.cells)[np.asarray(subgoals.mask)].tolist(), estimates
+
+
+def test_a_known_goal_behind_an_unknown_shortcut_counts():
+    # The goal has been seen across a gap, the way to it has not: through the unobserved cells and out again.
+    rows = [
+        "#########",
+        "#s.#.a#.#",
+        "#..#..#.#",
+        "#..___.##",
+        "#########",
+    ]
+    cells, estimates = _picture_labels(rows)
+    subgoal = cells.index([3, 2])
+    assert float(estimates.success_probability[subgoal, 0]) == 1.0
+    # (3,3), (3,4), diagonally to (2,5), up to (1,5).
+    assert float(estimates.success_cost[subgoal, 0]) == pytest.approx(2 + np.sqrt(2) + 1)
+
+
+def test_the_own_frontier_is_no_way_back():
+    # The only goal is known and on the robot's side: what lies beyond the subgoal does not satisfy anything.
+    rows = [
+        "######",
+        "#sa._=",
+        "#..._=",
+        "######",
+    ]
+    cells, estimates = _picture_labels(rows)
+    assert len(cells) == 1
+    assert float(estimates.success_probability[0, 0]) == 0.0
+    assert float(estimates.failure_cost[0, 0]) == pytest.approx(np.sqrt(2))
+
+
+def test_nothing_behind_a_frontier_costs_nothing_to_fail():
+    rows = [
+        "#####",
+        "#s.==",
+        "#####",
+    ]
+    cells, estimates = _picture_labels(rows)
+    assert cells == [[1, 2]]
+    assert float(estimates.failure_cost[0, 0]) == 0.0
+    assert float(estimates.success_cost[0, 0]) > 0.0

@@ -1,0 +1,50 @@
+"""Dependencies run one way: a room imports only from itself and from rooms above it (README, "The rooms of the house")."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import potlp_jax
+
+ORDER = ("types", "task", "world", "environments", "planning", "learning", "records", "trial", "sweep", "view", "cli")
+PACKAGE = Path(potlp_jax.__file__).parent
+
+
+def _room(module: str) -> str | None:
+    parts = module.split(".")
+    return parts[1] if parts[0] == "potlp_jax" and len(parts) > 1 else None
+
+
+def _imports(path: Path) -> list[str]:
+    modules = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            modules += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            modules += [f"{node.module}.{alias.name}" for alias in node.names]
+    return modules
+
+
+SOURCES = [path for path in sorted(PACKAGE.rglob("*.py")) if path != PACKAGE / "__init__.py"]
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_a_room_imports_only_from_rooms_above(path):
+    own = path.relative_to(PACKAGE).with_suffix("").parts[0]
+    for module in _imports(path):
+        room = _room(module)
+        if room is not None:
+            assert ORDER.index(room) <= ORDER.index(own), f"{path.relative_to(PACKAGE)} imports {module}"
+
+
+def test_only_one_module_imports_each_heavy_neighbour():
+    # Spot is imported where formulas become automata, typer by the command line alone.
+    for library, rooms in {"spot": {"task"}, "typer": {"cli"}, "matplotlib": {"view"}}.items():
+        users = {
+            path.relative_to(PACKAGE).with_suffix("").parts[0]
+            for path in SOURCES
+            if any(module.split(".")[0] == library for module in _imports(path))
+        }
+        assert users <= rooms, f"{library} is imported by {users - rooms}"
