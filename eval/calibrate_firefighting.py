@@ -1,8 +1,9 @@
-"""Calibrate what the paper leaves open about the fire-fighting building, on the seeds kept for that (Split.CALIBRATION).
+"""Calibrate what the paper leaves open about the fire-fighting building, on the seeds kept for that.
 
-Compares mean costs of the known-map planner and the baseline, over worlds possible for each task, with Table I of
-Bradley et al. 2021. Nothing learned is involved: run once, before any learned planner exists; the result is frozen in
-``FirefightingConfig``'s defaults and by a hash in ``tests/test_firefighting.py``.
+The seeds are those of ``Split.CALIBRATION``. Mean costs of the known-map planner and the baseline, over worlds that are
+possible for each task, are compared with Table I of Bradley et al. 2021. Nothing learned is involved: this was run
+before any learned planner existed, and the result is frozen in ``FirefightingConfig``'s defaults and by a hash in
+``tests/test_firefighting.py``.
 
     python -m eval.calibrate_firefighting --worlds 200
     python -m eval.calibrate_firefighting --worlds 60 --set hallway_length=110 --set dead_end_fraction=0.9 --range 110
@@ -44,7 +45,9 @@ def known_map_cost(world, task):
 def measure(config: FirefightingConfig, sensor: SensorConfig, count: int, with_baseline: bool) -> dict:
     """Means and standard errors per planner and task over the first ``count`` possible worlds of each task."""
     generator = Firefighting(config)
-    tasks = {name: Task.from_formula(text, propositions=generator.propositions) for name, text in generator.tasks.items()}
+    tasks = {
+        name: Task.from_formula(text, propositions=generator.propositions) for name, text in generator.tasks.items()
+    }
     costs = {planner: {name: [] for name in tasks} for planner in PAPER}
     drawn = dict.fromkeys(tasks, 0)
     for index in range(100 * count):
@@ -65,7 +68,9 @@ def measure(config: FirefightingConfig, sensor: SensorConfig, count: int, with_b
                     raise RuntimeError(f"baseline ended {trial.outcome} in world {index}, task {name}")
                 costs["baseline"][name].append(trial.cost)
     return {
-        planner: {name: _figures(values, PAPER[planner][name], drawn[name]) for name, values in by_task.items() if values}
+        planner: {
+            name: _figures(values, PAPER[planner][name], drawn[name]) for name, values in by_task.items() if values
+        }
         for planner, by_task in costs.items()
     }
 
@@ -73,14 +78,23 @@ def measure(config: FirefightingConfig, sensor: SensorConfig, count: int, with_b
 def _figures(values: list[float], paper: float, drawn: int) -> dict:
     mean = float(np.mean(values))
     error = float(np.std(values, ddof=1) / math.sqrt(len(values)))
-    return {"mean": mean, "standard_error": error, "paper": paper, "off": mean / paper - 1.0, "worlds": len(values), "drawn": drawn}
+    return {
+        "mean": mean,
+        "standard_error": error,
+        "paper": paper,
+        "off": mean / paper - 1.0,
+        "worlds": len(values),
+        "drawn": drawn,
+    }
 
 
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", type=int, default=100, help="possible worlds per task")
-    parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE", help="a field of FirefightingConfig")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="FIELD=VALUE", help="a field of FirefightingConfig"
+    )
     parser.add_argument("--range", type=float, default=SensorConfig().range_cells, help="sensing range in cells")
     parser.add_argument("--known-map-only", action="store_true")
     arguments = parser.parse_args()
@@ -92,8 +106,9 @@ def main() -> None:
     for planner, by_task in figures.items():
         for name, row in by_task.items():
             print(
-                f"  {planner:9} task {name}: {row['mean']:6.1f} ± {row['standard_error']:4.1f}"
-                f"   paper {row['paper']:5.1f}   off {100 * row['off']:+5.1f} %   ({row['worlds']} of {row['drawn']} worlds)"
+                f"  {planner:9} task {name}: {row['mean']:6.1f} ± {row['standard_error']:4.1f}   "
+                f"paper {row['paper']:5.1f}   off {100 * row['off']:+5.1f} %   "
+                f"({row['worlds']} of {row['drawn']} worlds)"
             )
 
 

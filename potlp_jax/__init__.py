@@ -1,1 +1,62 @@
-from potlp_jax.task.task import Task as Task
+"""Plan for temporal-logic tasks in buildings never seen before: PO-TLP, JAX-native and batched.
+
+The public names, from a formula to a trial:
+
+* a task: ``Task``, ``TaskArrays``, ``TaskError``, ``TaskSizes``, ``stack_tasks``
+* a world and what is known of it: ``World``, ``make_world``, ``BeliefMap``, ``SensorConfig``, ``observe``,
+  ``Subgoals``, ``FrontierConfig``, ``find_subgoals``
+* planning: ``product_transitions``, ``product_distances``, ``Estimates``, ``PlanningProblem``, ``enumerate_actions``,
+  ``SearchConfig``, ``Plan``, ``plan_actions``, ``solve_exact``, ``DecisionConfig``, ``Policy``, ``decide``
+* a whole trial: ``TrialConfig``, ``run_trial``, ``Trial``, ``Outcome``, ``load_trial``
+* sentinels and flags: ``NO_ACTION``, ``Status``
+"""
+
+from potlp_jax.planning.estimates import Estimates
+from potlp_jax.planning.exact import solve_exact
+from potlp_jax.planning.policies import DecisionConfig, Policy, decide
+from potlp_jax.planning.pouct import Plan, SearchConfig, plan_actions
+from potlp_jax.planning.problem import PlanningProblem, enumerate_actions
+from potlp_jax.planning.product import product_distances, product_transitions
+from potlp_jax.records import Outcome, Trial, load_trial
+from potlp_jax.task.formula import TaskError
+from potlp_jax.task.task import Task, TaskArrays, TaskSizes, stack_tasks
+from potlp_jax.trial import TrialConfig, run_trial
+from potlp_jax.types import NO_ACTION, Status
+from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
+from potlp_jax.world.grid import BeliefMap, World, make_world
+from potlp_jax.world.sensing import SensorConfig, observe
+
+__all__ = [
+    "NO_ACTION",
+    "BeliefMap",
+    "DecisionConfig",
+    "Estimates",
+    "FrontierConfig",
+    "Outcome",
+    "Plan",
+    "PlanningProblem",
+    "Policy",
+    "SearchConfig",
+    "SensorConfig",
+    "Status",
+    "Subgoals",
+    "Task",
+    "TaskArrays",
+    "TaskError",
+    "TaskSizes",
+    "Trial",
+    "TrialConfig",
+    "World",
+    "decide",
+    "enumerate_actions",
+    "find_subgoals",
+    "load_trial",
+    "make_world",
+    "observe",
+    "plan_actions",
+    "product_distances",
+    "product_transitions",
+    "run_trial",
+    "solve_exact",
+    "stack_tasks",
+]

@@ -60,9 +60,9 @@ class Stop:
     robot stops when nothing unobserved is left beside it.
     """
 
-    replan_distance: Float32[Array, ""]
-    budget: Float32[Array, ""]
-    is_frontier: Bool[Array, ""]
+    replan_distance: Float32[Array, "*batch"]
+    budget: Float32[Array, "*batch"]
+    is_frontier: Bool[Array, "*batch"]
 
 
 @dataclasses.dataclass(frozen=True)

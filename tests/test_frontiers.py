@@ -252,7 +252,9 @@ def partly_seen(padding: tuple[int, int] = (0, 0)):
     occupied[9, 11] = False
     world = make_world(occupied, np.zeros(occupied.shape, int), (9, 11))
     world = pad_world(world, world.shape[0] + padding[0], world.shape[1] + padding[1])
-    belief = jax.jit(observe, static_argnums=3)(BeliefMap.unobserved(world), world, world.start, SensorConfig(range_cells=7.0))
+    belief = jax.jit(observe, static_argnums=3)(
+        BeliefMap.unobserved(world), world, world.start, SensorConfig(range_cells=7.0)
+    )
     rows, columns = jnp.indices(world.shape)
     distance = jnp.abs(rows - world.start[0]) + jnp.abs(columns - world.start[1])
     return belief, belief.free, distance.astype(jnp.float32)
@@ -281,7 +283,7 @@ def test_vmap_equals_a_loop():
     beliefs = [belief_of(entry) for entry in cells]
     stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *beliefs)
     config = FrontierConfig(max_subgoals=4)
-    together = jax.vmap(functools.partial(find_subgoals, config=config))(stack, reachable, distance)
+    together = jax.jit(jax.vmap(functools.partial(find_subgoals, config=config)))(stack, reachable, distance)
     for index, belief in enumerate(beliefs):
         alone = find(belief, reachable[index], distance[index], config)
         chex.assert_trees_all_equal(jax.tree.leaves(alone), [leaf[index] for leaf in jax.tree.leaves(together)])

@@ -1,4 +1,4 @@
-"""Dependencies run one way: a room imports only from itself and from rooms above it (README, "The rooms of the house")."""
+"""Dependencies run one way: a room imports only from itself and from rooms above it (see README)."""
 
 import ast
 from pathlib import Path

@@ -79,7 +79,9 @@ def test_distances_equal_a_heap(world, text, data):
     free, letters, source = world
     task, arrays = tasks[text], tasks[text].padded(SIZES)
     state = data.draw(st.sampled_from(np.flatnonzero(~task.dfa.trap).tolist()))
-    _, distances = _solve(arrays, jnp.asarray(letters), jnp.asarray(free), jnp.asarray(source, jnp.int32), jnp.int32(state))
+    _, distances = _solve(
+        arrays, jnp.asarray(letters), jnp.asarray(free), jnp.asarray(source, jnp.int32), jnp.int32(state)
+    )
     expected = dijkstra.product_distances(free, letters, task.dfa.transitions, task.dfa.trap, source, state)
     np.testing.assert_allclose(np.asarray(distances), 0.5 * _dense(expected, SIZES.states), rtol=1e-5)
 
@@ -95,7 +97,12 @@ def test_optimistic_distances_equal_a_heap(world, text, seed):
     task, arrays = tasks[text], tasks[text].padded(SIZES)
     state = task.dfa.initial
     distances = _optimistic(
-        arrays, jnp.asarray(letters), jnp.asarray(known), jnp.asarray(unknown), jnp.asarray(source, jnp.int32), jnp.int32(state)
+        arrays,
+        jnp.asarray(letters),
+        jnp.asarray(known),
+        jnp.asarray(unknown),
+        jnp.asarray(source, jnp.int32),
+        jnp.int32(state),
     )
     expected = dijkstra.optimistic_distances(
         known, unknown, letters, task.dfa.transitions, task.dfa.trap, source, state

@@ -15,8 +15,8 @@ With door, start, goal and hazard as in ``BY_HAND`` (9 rows, 15 columns, wall in
 - ``F goal``: straight along row 4, ten steps: 10.
 - ``!hazard U goal``: ten columns to the right, out of row 4 and back in, diagonally, to pass (4, 10): 8 + 2√2. The door
   itself is passed straight: corners are not cut.
-- From (1, 1) to the goal: (4, 6) to (4, 8) is forced. From (1, 1) to (4, 6): three diagonal and two straight steps; from
-  there six steps: 8 + 3√2.
+- From (1, 1) to the goal: (4, 6) to (4, 8) is forced. From (1, 1) to (4, 6): three diagonal and two straight steps;
+  from there six steps: 8 + 3√2.
 """
 
 import math
@@ -29,7 +29,7 @@ import pytest
 from potlp_jax.environments.splits import world_key
 from potlp_jax.environments.toy import Toy, ToyConfig
 from potlp_jax.planning.product import product_distances, product_transitions
-from potlp_jax.task.task import Task
+from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.world.grid import World, WorldError
 
 BY_HAND = ToyConfig(door_row=4, start=(4, 2), goal=(4, 12), hazard=(4, 10))
@@ -61,13 +61,17 @@ def drawing_of(world: World) -> str:
 
 def cost_of(world: World, formula: str) -> float:
     """Cheapest accepting path from the start, by the planner's distances on the true map."""
-    task = Task.from_formula(formula, Toy.propositions).arrays
+    return float(known_map_cost(Task.from_formula(formula, Toy.propositions).arrays, world))
+
+
+@jax.jit
+def known_map_cost(task: TaskArrays, world: World) -> jax.Array:
     free = ~world.occupied
     transitions = product_transitions(task, world.letters, free)
     row, column = world.start
     state = task.transitions[task.initial, world.letters[row, column]]
     costs = product_distances(transitions, free, world.start[None], state[None], world.resolution)[0]
-    return float(jnp.min(jnp.where(task.accepting, costs, jnp.inf)))
+    return jnp.min(jnp.where(task.accepting, costs, jnp.inf))
 
 
 def test_the_world_worked_by_hand_is_drawn_above():

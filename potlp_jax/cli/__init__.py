@@ -45,10 +45,11 @@ _ABOUT = (
 )
 
 
-def _print_version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> bool:
     if wanted:
         typer.echo(f"potlp {package_version()}")
         raise typer.Exit
+    return wanted
 
 
 @app.callback(
@@ -76,6 +77,7 @@ def potlp(
 
 
 @app.command(
+    "task",
     epilog="""
 [bold]Examples[/bold]
 
@@ -84,10 +86,10 @@ def potlp(
 [cyan]potlp task "(!fire U extinguisher) & F fire" --propositions fire,extinguisher,exit --svg task.svg[/cyan]
 
 [cyan]potlp task automaton.hoa --json[/cyan]
-"""
+""",
 )
 @clear_errors
-def task(
+def task_command(
     formula: Annotated[
         str,
         typer.Argument(
@@ -110,6 +112,7 @@ def task(
 
 
 @app.command(
+    "run",
     epilog="""
 [bold]Examples[/bold]
 
@@ -120,10 +123,10 @@ def task(
 [cyan]potlp run firefighting --task "!fire U exit" --policy baseline --json[/cyan]
 
 [dim]Ends with exit code 1 if the task was not satisfied.[/dim]
-"""
+""",
 )
 @clear_errors
-def run(
+def run_command(
     environment: Environment,
     task: TaskName = "1",
     policy: Annotated[
@@ -145,6 +148,7 @@ def run(
 
 
 @app.command(
+    "compare",
     epilog="""
 [bold]Examples[/bold]
 
@@ -153,10 +157,10 @@ def run(
 [cyan]potlp compare firefighting -t 1 --policies baseline,optimistic,oracle --trials 100 --out out/table[/cyan]
 
 [dim]known-map (the floor) and baseline are always run: savings are measured between them.[/dim]
-"""
+""",
 )
 @clear_errors
-def compare(
+def compare_command(
     environment: Environment,
     task: TaskName = "1",
     policies: Annotated[str, typer.Option("--policies", help="Names, joined by commas.")] = "baseline,oracle",
@@ -177,6 +181,7 @@ def compare(
 
 
 @app.command(
+    "explain",
     epilog="""
 [bold]Examples[/bold]
 
@@ -185,10 +190,10 @@ def compare(
 [cyan]potlp explain out/fire/trial.json:12 --out tree.png[/cyan]
 
 [cyan]potlp explain out/fire:12 --json[/cyan]
-"""
+""",
 )
 @clear_errors
-def explain(
+def explain_command(
     decision: Annotated[
         str, typer.Argument(metavar="DECISION", help="FOLDER:INDEX or FILE:INDEX of a trial that `potlp run` recorded.")
     ],

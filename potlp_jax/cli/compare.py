@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,6 @@ from potlp_jax.cli.inputs import make_world, read_environment_task, read_policy,
 from potlp_jax.cli.output import (
     FAILED,
     console,
-    error_console,
     fail,
     note,
     output_folder,
@@ -46,6 +46,41 @@ class _Pair:
     budget: float
 
 
+@dataclasses.dataclass(frozen=True)
+class _Setting:
+    """What is compared: the worlds of a split from ``first`` on, a task, and the policies."""
+
+    environment: str
+    generator: Generator
+    split: Split
+    first: int
+    task: Task
+    policies: tuple[Policy, ...]
+    config: TrialConfig
+
+    def trial(self, world: World, seed: int, policy: Policy) -> Trial:
+        """The trial of a policy in world ``seed``; its key is the same for all policies."""
+        name = f"{self.environment}/{self.split}"
+        key = jax.random.key(seed)
+        return run_trial(world, self.task, policy, key, self.config, environment=name, seed=seed)
+
+    def pairs(self) -> Iterator[_Pair]:
+        """The worlds in which the task is possible, with a trial of every policy in each."""
+        impossible = 0
+        for seed in itertools.count(self.first):
+            world = make_world(self.generator, self.split, seed)
+            floor = self.trial(world, seed, Policy.KNOWN_MAP)
+            if floor.outcome is Outcome.SATISFIED:
+                impossible = 0
+                others = [self.trial(world, seed, policy) for policy in self.policies if policy is not Policy.KNOWN_MAP]
+                trials = {trial.policy: trial.summary() for trial in (floor, *others)}
+                yield _Pair(seed, trials, _budget(world, self.config))
+                continue
+            impossible += 1
+            if impossible == IMPOSSIBLE_IN_A_ROW:
+                fail(f"the task is impossible in {impossible} worlds in a row, up to seed {seed}; check it", FAILED)
+
+
 def compare_policies(
     environment: str,
     task_name: str,
@@ -58,25 +93,13 @@ def compare_policies(
     json: bool,
 ) -> None:
     """Run every policy in the same worlds and report the paired figures (docs/model.md, section 8)."""
-    generator, split = make(environment), read_split(split_name)
-    policies = _read_policies(policy_names)
+    generator, policies, split = make(environment), _read_policies(policy_names), read_split(split_name)
     task = read_environment_task(generator, task_name)
-    config, folder = trial_config(simulations), output_folder(out)
-    pairs: list[_Pair] = []
-    with progress_bar() as progress:
-        bar = progress.add_task("worlds (the first one compiles the planner)", total=trials)
-        for pair in _pairs(generator, task, policies, split, seed, config, f"{environment}/{split}"):
-            pairs.append(pair)
-            progress.update(bar, completed=len(pairs), description="worlds")
-            if not error_console().is_terminal:
-                note(
-                    f"world {pair.seed}: " + ", ".join(f"{name} {row['cost']:.1f}" for name, row in pair.trials.items())
-                )
-            if len(pairs) == trials:
-                break
-    comparison = Comparison.from_results(
-        {policy.value: [_result(pair, policy) for pair in pairs] for policy in policies}
-    )
+    setting = _Setting(environment, generator, split, seed, task, policies, trial_config(simulations))
+    folder = output_folder(out)
+    pairs = _run(setting, trials)
+    results = {policy.value: [_result(pair, policy) for pair in pairs] for policy in policies}
+    comparison = Comparison.from_results(results)
     redrawn = pairs[-1].seed - seed + 1 - trials
     report = {
         "environment": environment,
@@ -92,48 +115,30 @@ def compare_policies(
         _write(folder, report, heading, comparison, pairs)
     if json:
         print_json(report)
-    else:
-        _print(console(), heading, comparison)
-        if folder is not None:
-            console().print(f"wrote compare.json, trials.csv, scatter.png and table.txt in {folder}", markup=False)
+        return
+    _print(console(), heading, comparison)
+    if folder is not None:
+        console().print(f"wrote compare.json, trials.csv, scatter.png and table.txt in {folder}", markup=False)
 
 
-def _read_policies(names: str) -> list[Policy]:
+def _run(setting: _Setting, trials: int) -> list[_Pair]:
+    """The first ``trials`` pairs, with progress on stderr: a bar on a terminal, else a line per world."""
+    pairs: list[_Pair] = []
+    with progress_bar() as progress:
+        bar = progress.add_task("worlds (the first one compiles the planner)", total=trials)
+        for pair in itertools.islice(setting.pairs(), trials):
+            pairs.append(pair)
+            progress.update(bar, completed=len(pairs), description="worlds")
+            if progress.disable:
+                costs = ", ".join(f"{name} {row['cost']:.1f}" for name, row in pair.trials.items())
+                note(f"world {pair.seed} ({len(pairs)} of {trials}): {costs}")
+    return pairs
+
+
+def _read_policies(names: str) -> tuple[Policy, ...]:
     """Known map and baseline first, whether named or not; the others in their order, each once."""
     named = [read_policy(name) for name in names.split(",") if name.strip()]
-    return list(dict.fromkeys([Policy.KNOWN_MAP, Policy.BASELINE, *named]))
-
-
-def _pairs(
-    generator: Generator,
-    task: Task,
-    policies: Sequence[Policy],
-    split: Split,
-    first: int,
-    config: TrialConfig,
-    environment: str,
-) -> Iterator[_Pair]:
-    """The worlds from ``first`` on in which the task is possible, with a trial of every policy in each."""
-    impossible, seed = 0, first
-    while True:
-        world = make_world(generator, split, seed)
-
-        def trial(policy: Policy, world: World = world, seed: int = seed) -> Trial:
-            return run_trial(world, task, policy, jax.random.key(seed), config, environment=environment, seed=seed)
-
-        floor = trial(Policy.KNOWN_MAP)
-        if floor.outcome is Outcome.SATISFIED:
-            others = {policy.value: trial(policy).summary() for policy in policies if policy is not Policy.KNOWN_MAP}
-            yield _Pair(seed, {Policy.KNOWN_MAP.value: floor.summary(), **others}, _budget(world, config))
-            impossible = 0
-        else:
-            impossible += 1
-            if impossible == IMPOSSIBLE_IN_A_ROW:
-                fail(
-                    f"the task is impossible in {impossible} worlds in a row ({first} to {seed}); is it meant so?",
-                    FAILED,
-                )
-        seed += 1
+    return tuple(dict.fromkeys([Policy.KNOWN_MAP, Policy.BASELINE, *named]))
 
 
 def _budget(world: World, config: TrialConfig) -> float:

@@ -13,7 +13,6 @@ import dataclasses
 import enum
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -132,9 +131,9 @@ class FirefightingLayout:
 class Firefighting:
     """Generator of fire-fighting buildings (Bradley et al. 2021, section V-A)."""
 
-    name: ClassVar[str] = "firefighting"
-    propositions: ClassVar[tuple[str, ...]] = ("fire", "alarm", "extinguisher", "exit")
-    tasks: ClassVar[Mapping[str, str]] = MappingProxyType(
+    name: str = "firefighting"
+    propositions: tuple[str, ...] = ("fire", "alarm", "extinguisher", "exit")
+    tasks: Mapping[str, str] = MappingProxyType(
         {
             "1": "(!fire U alarm) | ((!fire U extinguisher) & F fire)",
             "2": "!fire U (alarm & F exit)",

@@ -4,9 +4,9 @@ Within a family, the key of a world is ``fold_in`` of the family's key with one 
 split and whose low bits are the index. ``fold_in`` enciphers that number (Threefry) under the family's key, so it is
 one-to-one: no two pairs (split, index) share a key.
 
-Rule of the project: parameters of an environment are chosen on CALIBRATION; training, tuning and mending look at TRAINING
-and VALIDATION; TEST is for the figures that are reported, and every run on it is logged. World ``N`` of the command line
-is index ``N`` of VALIDATION unless another split is named.
+Rule of the project: parameters of an environment are chosen on CALIBRATION; training, tuning and mending look at
+TRAINING and VALIDATION; TEST is for the figures that are reported, and every run on it is logged. World ``N`` of the
+command line is index ``N`` of VALIDATION unless another split is named.
 
 The key of a world makes only the world. What a trial draws comes from the trial's own key.
 """

@@ -7,7 +7,6 @@ door, so that both tasks can be satisfied in every world. What the configuration
 import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import ClassVar
 
 import numpy as np
 from jaxtyping import PRNGKeyArray
@@ -44,9 +43,9 @@ class ToyConfig:
 class Toy:
     """Generator of two-room worlds. Propositions: goal, hazard."""
 
-    name: ClassVar[str] = "toy"
-    propositions: ClassVar[tuple[str, ...]] = ("goal", "hazard")
-    tasks: ClassVar[Mapping[str, str]] = MappingProxyType({"1": "F goal", "2": "!hazard U goal"})
+    name: str = "toy"
+    propositions: tuple[str, ...] = ("goal", "hazard")
+    tasks: Mapping[str, str] = MappingProxyType({"1": "F goal", "2": "!hazard U goal"})
 
     def __init__(self, config: ToyConfig | None = None) -> None:
         self.config = ToyConfig() if config is None else config

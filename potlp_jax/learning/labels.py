@@ -99,7 +99,11 @@ def _labels_of_lanes(
         return phase
 
     transitions = jnp.stack(
-        [enter((porch, PORCH), (hidden, HIDDEN)), enter((hidden, HIDDEN), (way_back, SEEN)), enter((~hidden & ~own, SEEN))]
+        [
+            enter((porch, PORCH), (hidden, HIDDEN)),
+            enter((hidden, HIDDEN), (way_back, SEEN)),
+            enter((~hidden & ~own, SEEN)),
+        ]
     )
     start = jnp.where(real, PORCH, NO_STATE).astype(jnp.int32)
     cost = distances_by_lane(transitions, free, subgoals.cells[subgoal], start, world.resolution)

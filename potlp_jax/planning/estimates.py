@@ -18,9 +18,9 @@ class Estimates:
     ``success_probability`` is 0 and it means nothing.
     """
 
-    success_probability: Float32[Array, "S C"]
-    success_cost: Float32[Array, "S C"]
-    failure_cost: Float32[Array, "S C"]
+    success_probability: Float32[Array, "*batch S C"]
+    success_cost: Float32[Array, "*batch S C"]
+    failure_cost: Float32[Array, "*batch S C"]
 
 
 class Estimator(Protocol):

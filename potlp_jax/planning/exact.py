@@ -291,7 +291,9 @@ class _Closure:
         self._forward = [_mask(implies[a]) for a in range(count)]
         self._backward = [_mask(implies[:, b]) for b in range(count)]
         self._compounds = [
-            (m, sum(1 << int(c) for c in classes[m] if c != NO_CLASS)) for m in range(class_count, count) if implies[m, m]
+            (m, sum(1 << int(c) for c in classes[m] if c != NO_CLASS))
+            for m in range(class_count, count)
+            if implies[m, m]
         ]
         self._known: dict[tuple[Settled, int, bool], Settled] = {}
 

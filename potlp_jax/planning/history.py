@@ -24,7 +24,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
-from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.problem import PlanningProblem, take_rows
 from potlp_jax.types import NO_CLASS, NO_STATE
 
 WORD_BITS: int = 32
@@ -284,7 +284,7 @@ def settle(
     fails = _propagate_failures(tables, fails)
     # A condition holds if its failure would refute what is known to hold.
     refuted = _propagate_failures(tables, fails[None, :] | tables.backward)
-    return pack_bits(_overlaps(refuted, holds[None, :])), fails
+    return pack_bits(_overlaps(refuted, jnp.broadcast_to(holds, refuted.shape))), fails
 
 
 def _propagate_failures(tables: ActionTables, fails: UInt32[Array, "*N W"]) -> UInt32[Array, "*N W"]:
@@ -309,15 +309,15 @@ def _propagate_failures(tables: ActionTables, fails: UInt32[Array, "*N W"]) -> U
 def _action_rows(problem: PlanningProblem, condition_bits: UInt32[Array, "M W"]) -> ActionRow:
     task, subgoals, edges = problem.task, problem.subgoal_count, problem.edge_count
     states = task.state_mask.shape[-1]
-    classes = _rows(task.condition_classes, task.edge_condition)
+    classes = take_rows(task.condition_classes, task.edge_condition)
     real = jnp.broadcast_to(classes[None] != NO_CLASS, (subgoals, *classes.shape))
-    probability = jnp.where(real, _columns(problem.success_probability, classes), 0.0)
-    cost = jnp.where(real, _columns(problem.success_cost, classes), jnp.inf)
-    failure_cost = jnp.max(jnp.where(real, _columns(problem.failure_cost, classes), 0.0), axis=-1, initial=0.0)
+    probability = jnp.where(real, _by_subgoal(problem.success_probability, classes), 0.0)
+    cost = jnp.where(real, _by_subgoal(problem.success_cost, classes), jnp.inf)
+    failure_cost = jnp.max(jnp.where(real, _by_subgoal(problem.failure_cost, classes), 0.0), axis=-1, initial=0.0)
     order = jnp.argsort(cost, axis=-1, stable=True)
     probability, cost = (jnp.take_along_axis(values, order, axis=-1) for values in (probability, cost))
     sorted_classes = jnp.take_along_axis(jnp.broadcast_to(classes[None], real.shape), order, axis=-1)
-    cube_bits = jnp.where((sorted_classes != NO_CLASS)[..., None], _rows(condition_bits, sorted_classes), 0)
+    cube_bits = jnp.where((sorted_classes != NO_CLASS)[..., None], take_rows(condition_bits, sorted_classes), 0)
     backward, forward = pack_bits(task.implies.T), pack_bits(task.implies)
     states_of_edges = task.edges.T.astype(jnp.int32)
 
@@ -343,25 +343,15 @@ def _action_rows(problem: PlanningProblem, condition_bits: UInt32[Array, "M W"])
         cube_cost=by_action(cost, jnp.where(finish_cubes, 0.0, jnp.inf)),
         cube_bits=by_action(cube_bits, jnp.zeros((cubes, words), jnp.uint32)),
         failure_cost=by_action(failure_cost, jnp.float32(0.0)),
-        condition_bits=by_edge(_rows(condition_bits, task.edge_condition), no_bits),
-        forward=by_edge(_rows(forward, task.edge_condition), no_bits),
-        backward=by_edge(_rows(backward, task.edge_condition), no_bits),
+        condition_bits=by_edge(take_rows(condition_bits, task.edge_condition), no_bits),
+        forward=by_edge(take_rows(forward, task.edge_condition), no_bits),
+        backward=by_edge(take_rows(backward, task.edge_condition), no_bits),
         end_bits=_single_bit(to_state, max(1, -(-states // WORD_BITS))),
     )
 
 
-def _rows(values: Array, index: Array) -> Array:
-    """``values[index]``, zeros where there is nothing to index (a task without conditions)."""
-    if values.shape[0] == 0:
-        return jnp.zeros((*index.shape, *values.shape[1:]), values.dtype)
-    return values[jnp.maximum(index, 0)]
-
-
-def _columns(values: Array, index: Array) -> Array:
-    """``values[:, index]``, zeros where there is nothing to index."""
-    if values.shape[1] == 0:
-        return jnp.zeros((values.shape[0], *index.shape), values.dtype)
-    return values[:, jnp.maximum(index, 0)]
+def _by_subgoal(values: Float32[Array, "S C"], classes: Int32[Array, "E K"]) -> Float32[Array, "S E K"]:
+    return jnp.moveaxis(take_rows(values.T, classes), -1, 0)
 
 
 def _with_finish(values: Array, finish: Array) -> Array:

@@ -92,15 +92,15 @@ class Move:
     those of the current belief; ``search`` is None for policies that do not search.
     """
 
-    kind: Int32[Array, ""]
-    target_cell: Int32[Array, "2"]
-    target_state: Int32[Array, ""]
-    action: Int32[Array, ""]
-    value: Float32[Array, ""]
+    kind: Int32[Array, "*batch"]
+    target_cell: Int32[Array, "*batch 2"]
+    target_state: Int32[Array, "*batch"]
+    action: Int32[Array, "*batch"]
+    value: Float32[Array, "*batch"]
     path: KnownPath
     subgoals: Subgoals
     search: Search | None
-    status: UInt32[Array, ""]
+    status: UInt32[Array, "*batch"]
 
 
 @struct.dataclass(kw_only=True)
@@ -113,14 +113,14 @@ class Situation:
 
     belief: BeliefMap
     task: TaskArrays
-    cell: Int32[Array, "2"]
-    state: Int32[Array, ""]
-    transitions: Int32[Array, "H W Z"]
-    distances: Float32[Array, "H W Z"]
+    cell: Int32[Array, "*batch 2"]
+    state: Int32[Array, "*batch"]
+    transitions: Int32[Array, "*batch H W Z"]
+    distances: Float32[Array, "*batch H W Z"]
     subgoals: Subgoals
-    finish_cell: Int32[Array, "2"]
-    finish_state: Int32[Array, ""]
-    finish_cost: Float32[Array, ""]
+    finish_cell: Int32[Array, "*batch 2"]
+    finish_state: Int32[Array, "*batch"]
+    finish_cost: Float32[Array, "*batch"]
 
 
 def assess(
@@ -316,7 +316,7 @@ def _cut_before_unobserved(path: KnownPath, belief: BeliefMap) -> KnownPath:
     first_hidden = jnp.min(jnp.where(hidden, index, path.length + 1))
     length = jnp.minimum(path.length, first_hidden - 1)
     kept = jnp.minimum(index, length)
-    return path.replace(cells=path.cells[kept], states=path.states[kept], length=length)
+    return dataclasses.replace(path, cells=path.cells[kept], states=path.states[kept], length=length)
 
 
 def _nearest_frontier(situation: Situation) -> tuple[Int32[Array, "2"], Int32[Array, ""], Float32[Array, ""]]:
@@ -371,7 +371,7 @@ def _move(
     )
 
 
-def _unravel(index: Int32[Array, ""], shape: tuple[int, int, int]) -> tuple[Int32[Array, "2"], Int32[Array, ""]]:
+def _unravel(index: Int32[Array, ""], shape: tuple[int, ...]) -> tuple[Int32[Array, "2"], Int32[Array, ""]]:
     """Cell and state of an index into a flattened [H, W, Z] array."""
     _, width, states = shape
     index = index.astype(jnp.int32)

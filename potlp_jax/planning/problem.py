@@ -11,6 +11,7 @@ from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float32, Int32
 
 from potlp_jax.task.task import TaskArrays
+from potlp_jax.types import NO_CLASS
 
 
 class ProblemError(ValueError):
@@ -137,11 +138,9 @@ def enumerate_actions(problem: PlanningProblem) -> Bool[Array, "S E"]:
     task = problem.task
     robot, state = problem.subgoal_count, problem.dfa_state
     reachable = jnp.isfinite(problem.travel[robot, state][:, task.edges[:, 0]])
-    classes = task.condition_classes[task.edge_condition]
-    chance = (
-        jnp.where(classes >= 0, problem.success_probability[:, classes], 0.0) if classes.size else classes[None] > 0
-    )
-    possible = jnp.any(chance > 0, axis=-1)
+    classes = take_rows(task.condition_classes, task.edge_condition)
+    chance = take_rows(problem.success_probability.T, classes)
+    possible = jnp.any((classes != NO_CLASS)[..., None] & (chance > 0), axis=1).T
     real = problem.subgoal_mask[:, None] & task.edge_mask[None, :]
     return reachable & possible & real & ~task.accepting[state]
 
@@ -149,6 +148,14 @@ def enumerate_actions(problem: PlanningProblem) -> Bool[Array, "S E"]:
 def action_index(problem: PlanningProblem, subgoal: int, edge: int) -> int:
     """Index of the action that tries ``edge`` beyond ``subgoal``."""
     return subgoal * problem.edge_count + edge
+
+
+def take_rows(values: Array, index: Int32[Array, "*N"]) -> Array:
+    """``values[index]``: for a negative index the first row, and zeros where there is no row to take (a task without
+    conditions)."""
+    if values.shape[0] == 0:
+        return jnp.zeros((*index.shape, *values.shape[1:]), values.dtype)
+    return values[jnp.maximum(index, 0)]
 
 
 def _check_shapes(problem: PlanningProblem) -> None:
@@ -173,7 +180,7 @@ def _check_shapes(problem: PlanningProblem) -> None:
             )
 
 
-def _refuse(name: str, values: np.ndarray, wrong: np.ndarray, rule: str) -> None:
+def _refuse(name: str, values: np.ndarray, wrong: np.ndarray | np.bool_, rule: str) -> None:
     """Raise for the first wrong value, if any."""
     if not np.any(wrong):
         return

@@ -22,7 +22,7 @@ from potlp_jax.types import NO_STATE
 DIAGONAL: float = math.sqrt(2.0)
 """Length of a diagonal move in cells."""
 
-LANES: int = 16
+LANES: int = 8
 """Sources solved at a time: enough to fill vector units, few enough for a layer of costs to stay in cache."""
 
 NEIGHBOURS: tuple[tuple[int, int], ...] = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
@@ -36,8 +36,8 @@ class Wildcard:
     ``cells`` is True where the letter is free to choose; ``successors[z, z'']`` is True where the state may follow.
     """
 
-    cells: Bool[Array, "H W"]
-    successors: Bool[Array, "Z Z"]
+    cells: Bool[Array, "*batch H W"]
+    successors: Bool[Array, "*batch Z Z"]
 
 
 def product_transitions(
@@ -119,7 +119,7 @@ def distances_by_lane(
 def arrivals_by_lane(
     costs: Float32[Array, "Z H W Q"], free: Bool[Array, "H W"], resolution: Float32[Array, ""]
 ) -> Float32[Array, "Z H W Q"]:
-    """Cost of arriving in each cell by one move from the best neighbour, per state of the neighbour, letters ignored."""
+    """Cost of arriving in each cell by one move from the best neighbour, per state there, letters ignored."""
     links = _Links(free)
     return jax.vmap(lambda layer: links.cheapest_arrival(layer / resolution) * resolution)(costs)
 
@@ -236,8 +236,8 @@ class _Sweeper:
 class _Links:
     """The diagonal moves of a grid that cut no corner: ``inf`` where there is none, else their length.
 
-    ``falling[i, j]`` joins (i-1, j-1) and (i, j), ``rising[i, j]`` joins (i-1, j) and (i, j-1): each needs the two other
-    cells of its 2x2 square free, so both are stored per square, at its lower right cell.
+    ``falling[i, j]`` joins (i-1, j-1) and (i, j), ``rising[i, j]`` joins (i-1, j) and (i, j-1): each needs the two
+    other cells of its 2x2 square free, so both are stored per square, at its lower right cell.
     """
 
     def __init__(self, free: Bool[Array, "H W"]) -> None:
@@ -323,10 +323,10 @@ class KnownPath:
     path to its target, ``inf`` (and ``length`` 0) where the target is out of reach.
     """
 
-    cells: Int32[Array, "K1 2"]
-    states: Int32[Array, " K1"]
-    length: Int32[Array, ""]
-    cost: Float32[Array, ""]
+    cells: Int32[Array, "*batch K1 2"]
+    states: Int32[Array, "*batch K1"]
+    length: Int32[Array, "*batch"]
+    cost: Float32[Array, "*batch"]
 
 
 def shortest_path(
@@ -392,9 +392,7 @@ class _Predecessor:
         lengths = [1.0 if 0 in offset else DIAGONAL for offset in NEIGHBOURS]
         self.steps = jnp.asarray(lengths, jnp.float32) * resolution
 
-    def __call__(
-        self, cell: Int32[Array, "2"], state: Int32[Array, ""]
-    ) -> tuple[Int32[Array, "2"], Int32[Array, ""]]:
+    def __call__(self, cell: Int32[Array, "2"], state: Int32[Array, ""]) -> tuple[Int32[Array, "2"], Int32[Array, ""]]:
         states = self.transitions.shape[2]
         leads = self.transitions[cell[0], cell[1]] == state
         if self.wildcard is not None:

@@ -32,7 +32,18 @@ from potlp_jax.view.maps import (
     show_cells,
     state_handles,
 )
-from potlp_jax.view.style import AREA_COLOURS, CHOSEN, CHOSEN_ROW, FAINT, INK, ROBOT, STATE_COLOURS, new_figure, rgb
+from potlp_jax.view.style import (
+    AREA_COLOURS,
+    CHOSEN,
+    CHOSEN_ROW,
+    DOTS_PER_INCH,
+    FAINT,
+    INK,
+    ROBOT,
+    STATE_COLOURS,
+    new_figure,
+    rgb,
+)
 
 MAX_FRAMES: int = 36
 MAX_BYTES: int = 3_000_000
@@ -40,6 +51,7 @@ FRAME_MILLISECONDS: int = 700
 LAST_FRAME_MILLISECONDS: int = 3_000
 SHOWN_ACTIONS: int = 7
 LABEL_SIZE: float = 8.0
+ROW_INCHES: float = 0.25
 IMAGE_PIXELS: int = 400
 MIXED_COLOURS: int = 64
 THEME: tuple[str, ...] = ("#FFFFFF", INK, FAINT, CHOSEN, ROBOT, CHOSEN_ROW, WALL_SEEN, FREE_UNSEEN, WALL_UNSEEN)
@@ -97,7 +109,9 @@ class _Stage:
         self._panel.axis("off")
         _legend(self._axes, trial, self._task)
         formula = trial.task_text if len(trial.task_text) <= 90 else trial.task_text[:87] + "..."
-        self._axes.set_title(f"{formula}\n{describe_outcome(trial)}", size=9, color=INK)
+        place = 1 - 0.1 / self._figure.get_figheight()
+        heading = f"{formula}\n{describe_outcome(trial)}"
+        self._figure.text(0.5, place, heading, size=9, color=INK, ha="center", va="top")
         canvas = self._figure.canvas
         assert isinstance(canvas, FigureCanvasAgg)
         self._canvas = canvas
@@ -185,7 +199,8 @@ def _legend(axes: Axes, trial: Trial, task: Task) -> None:
 
 
 def _draw_panel(panel: Axes, trial: Trial, decision: Decision | None, task: Task) -> None:
-    panel.set(xlim=(0, 1), ylim=(SHOWN_ACTIONS + 2.4, -0.2))
+    inches = panel.get_window_extent().height / DOTS_PER_INCH
+    panel.set(xlim=(0, 1), ylim=(max(SHOWN_ACTIONS + 2.4, inches / ROW_INCHES), -0.2))
     if decision is None:
         accepting = bool(task.dfa.accepting[trial.states[-1]])
         lines = [
@@ -195,13 +210,11 @@ def _draw_panel(panel: Axes, trial: Trial, decision: Decision | None, task: Task
         ]
         _panel_text(panel, lines)
         return
-    head = (
-        f"decision {decision.index + 1} of {len(trial.decisions)}   step {decision.step}   state {decision.state}   "
-        f"expected cost {decision.value:.1f}"
-    )
+    head = f"decision {decision.index + 1} of {len(trial.decisions)}   step {decision.step}   state {decision.state}"
     if not decision.actions:
         _panel_text(panel, [head, *textwrap.wrap(_KINDS.get(decision.kind, decision.kind), 80)])
         return
+    head += f"   expected cost {decision.value:.1f}"
     panel.text(0.0, 0.1, head, size=9.5, weight="bold", va="center", color=INK)
     _action_rows(panel, rank_actions(decision), decision)
 

@@ -91,6 +91,7 @@ def _wrap_guard(guard: str) -> str:
             lines[-1] += f" | {part}"
         else:
             lines.append(part)
+    lines = [*(f"{line} |" for line in lines[:-1]), lines[-1]]
     broken = [piece for line in lines for piece in textwrap.wrap(line, 30)]
     shown = broken if len(broken) <= 6 else [*broken[:5], f"... {len(broken) - 5} more lines"]
     return "\n".join(shown)
@@ -106,7 +107,8 @@ def _positions(automaton: Automaton, edges: Sequence[_Edge]) -> dict[int, np.nda
     """Layers in the order that crosses least; the trap state stands below."""
     graph = networkx.DiGraph((edge.source, edge.target) for edge in edges)
     graph.add_nodes_from(automaton.states)
-    shown = [state for state in automaton.states if state not in automaton.trap]
+    # A task that cannot be satisfied has nothing but a trap.
+    shown = [state for state in automaton.states if state not in automaton.trap] or list(automaton.states)
     layers = _untangle(_layers(graph.subgraph(shown)), edges)
     widest = max((edge.size[0] for edge in edges if edge.source != edge.target and not edge.faint), default=1.0)
     tallest = max((edge.size[1] for edge in edges), default=0.2)
@@ -122,9 +124,9 @@ def _positions(automaton: Automaton, edges: Sequence[_Edge]) -> dict[int, np.nda
         for rank, state in enumerate(ranked):
             # A slight slant keeps three states of three layers off one line, so edges that skip a layer bend less.
             positions[state] = np.array([index * across, ((len(layer) - 1) / 2 - rank) * down])
-    lowest = min(position[1] for position in positions.values()) if positions else 0.0
+    lowest = min(position[1] for position in positions.values())
     middle = (len(layers) - 1) * across / 2
-    for rank, state in enumerate(sorted(automaton.trap)):
+    for rank, state in enumerate(sorted(automaton.trap - positions.keys())):
         positions[state] = np.array([middle + rank * across, lowest - down - 0.5])
     return positions
 
@@ -169,30 +171,44 @@ def _untangle(layers: list[list[int]], edges: Sequence[_Edge]) -> list[list[int]
 
 
 def _route(edges: Sequence[_Edge], positions: Mapping[int, np.ndarray], initial: int) -> None:
-    """Choose a bend per edge, shortest edges first, that meets no state and few other edges."""
-
-    def length(edge: _Edge) -> float:
-        return float(np.linalg.norm(positions[edge.target] - positions[edge.source]))
-
+    """Choose a bend per edge that meets no state and few other edges: short edges first, then loops, then long ones."""
     joined = {(edge.source, edge.target) for edge in edges}
+    gaps = [_length(edge, positions) for edge in edges if edge.source != edge.target]
     start = positions[initial]
-    routed: list[np.ndarray] = [np.linspace(start - [RADIUS + 0.6, 0], start - [RADIUS, 0], 20)]
-    for edge in sorted(edges, key=lambda edge: (edge.source == edge.target, edge.faint, length(edge))):
+    # Edges that are in the way a little, and loops with their guards, which must not be met at all.
+    routed = [np.linspace(start - [RADIUS + 0.6, 0], start - [RADIUS, 0], 20)]
+    loops: list[np.ndarray] = []
+    for edge in sorted(edges, key=lambda edge: (edge.faint, _length(edge, positions) or 1.1 * min(gaps, default=1.0))):
         bends = PAIR_BENDS if (edge.target, edge.source) in joined else BENDS
-        candidates = _candidates(edge, positions, bends)
-        costs = [_route_cost(points, edge, routed, positions) + 0.6 * rank for rank, points in enumerate(candidates)]
-        edge.points = candidates[int(np.argmin(costs))]
-        routed.append(edge.points)
+        candidates = _candidates(edge, positions, bends, samples=40)
+        costs = [
+            _route_cost(points, edge, routed, loops, positions) + 0.6 * rank for rank, points in enumerate(candidates)
+        ]
+        best = int(np.argmin(costs))
+        edge.points = _candidates(edge, positions, bends, samples=160)[best]
+        if edge.source == edge.target:
+            edge.label = _label_spots(edge, positions)[0]
+            grid = np.linspace(-0.5, 0.5, 8)
+            box = np.array([np.add(edge.label, np.multiply(edge.size, spot)) for spot in itertools.product(grid, grid)])
+            loops.append(np.concatenate([candidates[best], box]))
+        else:
+            routed.append(candidates[best])
 
 
-def _candidates(edge: _Edge, positions: Mapping[int, np.ndarray], bends: Sequence[float]) -> list[np.ndarray]:
+def _length(edge: _Edge, positions: Mapping[int, np.ndarray]) -> float:
+    return float(np.linalg.norm(positions[edge.target] - positions[edge.source]))
+
+
+def _candidates(
+    edge: _Edge, positions: Mapping[int, np.ndarray], bends: Sequence[float], samples: int
+) -> list[np.ndarray]:
     start, end = positions[edge.source], positions[edge.target]
     if edge.source == edge.target:
-        return [_loop(start, angle) for angle in LOOP_ANGLES]
-    return [_bend(start, end, bend) for bend in bends]
+        return [_loop(start, angle, samples) for angle in LOOP_ANGLES]
+    return [_bend(start, end, bend, samples) for bend in bends]
 
 
-def _bend(start: np.ndarray, end: np.ndarray, bend: float, samples: int = 40) -> np.ndarray:
+def _bend(start: np.ndarray, end: np.ndarray, bend: float, samples: int) -> np.ndarray:
     """A quadratic curve from rim to rim; ``bend`` is the height of its control point relative to the distance."""
     across = np.array([-(end - start)[1], (end - start)[0]])
     control = (start + end) / 2 + bend * across
@@ -201,7 +217,7 @@ def _bend(start: np.ndarray, end: np.ndarray, bend: float, samples: int = 40) ->
     return points[(_distance(points, start) > RADIUS) & (_distance(points, end) > RADIUS + 0.03)]
 
 
-def _loop(centre: np.ndarray, angle: float, samples: int = 40) -> np.ndarray:
+def _loop(centre: np.ndarray, angle: float, samples: int) -> np.ndarray:
     """A drop-shaped loop on the rim of a state, around the direction ``angle`` (degrees)."""
     direction = math.radians(angle)
     spread, reach = math.radians(55), 0.95
@@ -214,21 +230,25 @@ def _loop(centre: np.ndarray, angle: float, samples: int = 40) -> np.ndarray:
 
 
 def _route_cost(
-    points: np.ndarray, edge: _Edge, routed: Sequence[np.ndarray], positions: Mapping[int, np.ndarray]
+    points: np.ndarray,
+    edge: _Edge,
+    routed: Sequence[np.ndarray],
+    loops: Sequence[np.ndarray],
+    positions: Mapping[int, np.ndarray],
 ) -> float:
     cost = 0.0
     for state, centre in positions.items():
         if state not in (edge.source, edge.target):
-            cost += 8.0 * float(np.mean(_distance(points, centre) < RADIUS + 0.16) > 0)
-            cost += 30.0 * float(np.mean(_distance(points, centre) < RADIUS + 0.16))
-    for other in routed:
-        gaps = np.linalg.norm(points[:, None] - other[None], axis=-1)
-        near = gaps.min(axis=1) < 0.13
+            near = _distance(points, centre) < RADIUS + 0.16
+            cost += 8.0 * float(near.any()) + 30.0 * float(near.mean())
+    # Near their states all edges meet; farther out they must not.
+    ends = [positions[edge.source], positions[edge.target]]
+    away = np.all([_distance(points, end) > RADIUS + 0.12 for end in ends], axis=0)
+    for other in (*routed, *loops):
+        near = np.linalg.norm(points[:, None] - other[None], axis=-1).min(axis=1) < 0.13
         cost += 12.0 * float(near.mean())
-        if edge.source == edge.target:
-            # Near its own state a loop always meets the other edges; farther out it must not.
-            away = _distance(points, positions[edge.source]) > RADIUS + 0.12
-            cost += 3.0 * float((near & away).any())
+        if edge.source == edge.target or any(other is loop for loop in loops):
+            cost += 4.0 * float((near & away).any())
     return cost
 
 

@@ -67,7 +67,9 @@ def outcome_table(comparison: Comparison) -> RichTable:
 def loss_lines(comparison: Comparison) -> list[str]:
     """One line per policy whose trials lost something to the bounds of arrays or loops."""
     return [
-        f"{policy}: " + ", ".join(f"{count} trials with {name.replace('_', ' ')}" for name, count in counts.items())
+        f"{policy}: "
+        + ", ".join(f"{count} trials with {name.replace('_', ' ')}" for name, count in counts.items())
+        + " (left out of the first table)"
         for policy, counts in comparison.losses.items()
         if counts
     ]

@@ -13,6 +13,7 @@ The tree is a nested dict, the form that ``potlp_jax.planning.pouct.tree_top`` g
 
 import dataclasses
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -26,6 +27,7 @@ from potlp_jax.records import ActionRecord, Decision, Trial
 from potlp_jax.view.style import CHOSEN, FAINT, INK, new_figure
 
 LEVEL_INCHES: float = 2.35
+ROW_INCHES: float = 0.56
 BOX_WIDTH: float = 0.76
 """Of a node in the picture of a tree, as a share of the distance between levels."""
 
@@ -92,26 +94,27 @@ def draw_tree(tree: Mapping[str, Any], title: str | None = None, *, depth: int =
 
     The width of a line follows the share of simulations that took it; dashed lines are failures.
     """
-    nodes, height = _arrange(tree, depth, breadth)
+    nodes, rows = _arrange(tree, depth, breadth)
     levels = 1 + max(node.level for node in nodes)
-    width = 0.3 + LEVEL_INCHES * levels
-    figure = new_figure(width, max(2.2, 0.58 * height) + 0.9)
+    width = max(7.0, 0.3 + LEVEL_INCHES * levels)
+    heading = textwrap.wrap(title, int(width / 0.09)) if title else []
+    top, bottom = 1.1 + 0.36 * len(heading), max(rows, 2.0) + 0.2
+    figure = new_figure(width, ROW_INCHES * (top + bottom))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    top = 0.9 / 0.58
-    axes.set(xlim=(-0.1, levels), ylim=(max(height, 3.8) + 0.2, -top))
+    axes.set(xlim=(-0.1, (width - 0.3) / LEVEL_INCHES), ylim=(bottom, -top))
     axes.axis("off")
     for node in nodes:
         if node.parent is not None:
             _draw_branch(axes, node, node.parent, tree["visits"])
     for node in nodes:
         _draw_node(axes, node)
-    if title:
-        axes.text(-0.05, -top + 0.45, title, size=10, weight="bold", va="center", color=INK)
+    for line, text in enumerate(heading):
+        axes.text(-0.03, -top + 0.3 + 0.36 * line, text, size=10, weight="bold", va="center", color=INK)
     key = (
         "solid: success, dashed: failure, width: share of simulations, coloured: least expected cost\n"
         "P: probability of the outcome, Q: expected cost of the action, n: visits, D: distance"
     )
-    axes.text(-0.05, -top + 0.95, key, size=8, va="center", color="#6E6E6E")
+    axes.text(-0.03, -0.55, key, size=8, va="center", color="#6E6E6E")
     return figure
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from typing import cast
@@ -210,9 +211,10 @@ def letter_name(letter: int, propositions: Sequence[str]) -> str:
 
 
 def describe_outcome(trial: Trial) -> str:
-    """Policy, cost and how the trial ended, in one line."""
-    where = f"{trial.environment}" + (f", seed {trial.seed}" if trial.seed is not None else "")
-    return f"{where}  ·  policy {trial.policy}  ·  cost {trial.cost:.1f}  ·  {trial.outcome.value}"
+    """Environment, policy, cost and how the trial ended, in one line; of a map's path only the name is left."""
+    environment = re.sub(r"^map:(?:[^,]*/)?([^/,]+)(,.*)?(/\w+)$", r"map:\1\3", trial.environment)
+    seed = "" if trial.seed is None else f", seed {trial.seed}"
+    return f"{environment}{seed}  ·  policy {trial.policy}  ·  cost {trial.cost:.1f}  ·  {trial.outcome.value}"
 
 
 def _title(trial: Trial, width: float) -> list[str]:

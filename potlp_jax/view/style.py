@@ -21,8 +21,12 @@ STATE_COLOURS: tuple[str, ...] = (
     "#56B4E9",
     "#6A3D9A",
     "#B79F00",
+    "#882255",
+    "#332288",
+    "#E69F00",
+    "#117733",
 )
-"""Strong colours: automaton states (repeating after eight, where the numbers beside them tell states apart)."""
+"""Strong colours: automaton states (repeating after twelve, where the numbers beside them tell states apart)."""
 
 AREA_COLOURS: tuple[str, ...] = (
     "#EE8866",

@@ -181,7 +181,7 @@ def _label(grid: _Grid, width: int) -> _Grid:
         return _over_frontier(grid, shorten, _over_frontier(grid, hook, (parent, jnp.bool_(False))))
 
     parent, _ = jax.lax.while_loop(lambda carry: carry[1], one_round, (grid.parent, grid.count > 0))
-    return grid.replace(parent=parent)
+    return dataclasses.replace(grid, parent=parent)
 
 
 def _summarise(grid: _Grid, width: int) -> tuple[Int32[Array, "cells"], Int32[Array, "cells"]]:

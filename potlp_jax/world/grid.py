@@ -9,6 +9,7 @@ class. Functions take one world unless they say otherwise.
 """
 
 import base64
+import dataclasses
 import zlib
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -90,7 +91,8 @@ class World:
     @property
     def shape(self) -> tuple[int, int]:
         """Rows and columns."""
-        return self.occupied.shape
+        height, width = self.occupied.shape[-2:]
+        return height, width
 
 
 @struct.dataclass(kw_only=True)
@@ -191,7 +193,8 @@ def pad_world(world: World, height: int, width: int) -> World:
     if height < rows or width < columns:
         raise WorldError(f"a world of {rows}x{columns} cells cannot be padded to {height}x{width}: give a larger size")
     missing = ((0, height - rows), (0, width - columns))
-    return world.replace(
+    return dataclasses.replace(
+        world,
         occupied=jnp.asarray(np.pad(np.asarray(world.occupied), missing, constant_values=True)),
         letters=jnp.asarray(np.pad(np.asarray(world.letters), missing)),
         appearance=world.appearance.padded(0, height - rows, 0, width - columns),
@@ -255,7 +258,7 @@ def world_from_dict(data: Mapping[str, Any]) -> World:
         raise WorldError(f"not the values of a world: {error!r}") from error
     if not (0 < rows <= world.shape[0] and 0 < columns <= world.shape[1]):
         raise WorldError(f"the extent {rows}x{columns} does not fit the {world.shape[0]}x{world.shape[1]} grid")
-    return world.replace(extent=jnp.asarray(np.array([rows, columns], np.int32)))
+    return dataclasses.replace(world, extent=jnp.asarray(np.array([rows, columns], np.int32)))
 
 
 def pack_array(array: Shaped[np.ndarray, "..."]) -> dict[str, Any]:

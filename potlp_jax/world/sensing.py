@@ -67,8 +67,8 @@ def observe(belief: BeliefMap, world: World, cell: Int32[Array, "2"], config: Se
     """The belief with all that is in line of sight from ``cell`` added. ``config`` is static."""
     seen = visible(world.occupied, cell, config)
     truth = jnp.where(world.occupied, jnp.int8(BeliefMap.OCCUPIED), jnp.int8(BeliefMap.FREE))
-    return belief.replace(
-        cells=jnp.where(seen, truth, belief.cells), letters=jnp.where(seen, world.letters, belief.letters)
+    return dataclasses.replace(
+        belief, cells=jnp.where(seen, truth, belief.cells), letters=jnp.where(seen, world.letters, belief.letters)
     )
 
 

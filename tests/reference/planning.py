@@ -150,24 +150,40 @@ class ReferenceProblem:
         return found
 
 
-def literal_q(problem, history, action):
-    """Q(b_h, a), Eq. 3 as it is written."""
-    p, r_s, r_f = problem.estimate(history, action)
-    cost = problem.distance(history, action)
-    if action == FINISH:
+class Recursion:
+    """Eq. 3 as it is written. With ``remember``, the value of a history is looked up if it was worked out before for
+    one with the same outcomes, place, state, debt and visits, in whatever order it got there."""
+
+    def __init__(self, problem, remember=True):
+        self.problem, self.memo = problem, ({} if remember else None)
+
+    def q(self, history, action):
+        """Q(b_h, a)."""
+        p, r_s, r_f = self.problem.estimate(history, action)
+        cost = self.problem.distance(history, action)
+        if action == FINISH:
+            return cost
+        cost += p * (r_s + self.value([*history, (action, True)]))
+        if p < 1:
+            cost += (1 - p) * (r_f + self.value([*history, (action, False)]))
         return cost
-    cost += p * (r_s + literal_value(problem, [*history, (action, True)]))
-    if p < 1:
-        cost += (1 - p) * (r_f + literal_value(problem, [*history, (action, False)]))
-    return cost
 
+    def value(self, history=()):
+        """Least Q after a history; 0 where the task is satisfied, the dead-end cost where nothing is left to do."""
+        history, problem = list(history), self.problem
+        place, state, owed = problem.situation(history)
+        if state in problem.accepting:
+            return 0.0
+        if self.memo is None:
+            return self._least(history)
+        facts = frozenset((a[0], problem.edges[a[1]][2], outcome) for a, outcome in history)
+        key = (place, state, owed, facts, frozenset(problem.visited(history)))
+        if key not in self.memo:
+            self.memo[key] = self._least(history)
+        return self.memo[key]
 
-def literal_value(problem, history=()):
-    """Least Q after a history; 0 where the task is satisfied, the dead-end cost where nothing is left to do."""
-    history = list(history)
-    if problem.situation(history)[1] in problem.accepting:
-        return 0.0
-    return min((literal_q(problem, history, a) for a in problem.actions(history)), default=problem.dead_end_cost)
+    def _least(self, history):
+        return min((self.q(history, a) for a in self.problem.actions(history)), default=self.problem.dead_end_cost)
 
 
 def dictionary_pouct(problem, simulations, exploration, seed=0):

@@ -1,0 +1,292 @@
+"""The command line: what it prints and writes, exit codes, and where its output goes."""
+
+import csv
+import json
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from potlp_jax.cli import app
+from potlp_jax.environments import make
+from potlp_jax.environments.splits import world_key
+from potlp_jax.records import Outcome, load_trial
+from potlp_jax.task.task import Task
+from potlp_jax.world.grid import WorldError
+
+# Few simulations: what is tested is the command line, not the planner.
+FAST = ("--simulations", "20")
+
+
+def _potlp(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def _json(result):
+    assert result.exit_code == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    """A trial of the toy environment with everything that `potlp run` writes."""
+    folder = tmp_path_factory.mktemp("run")
+    result = _potlp("run", "toy", "--task", "2", "--seed", "1", "--out", folder, *FAST)
+    assert result.exit_code == 0, result.output
+    return folder
+
+
+def test_help_leads_a_newcomer_to_the_commands():
+    result = _potlp("--help")
+    assert result.exit_code == 0
+    for part in ("task", "run", "compare", "explain", "--version", "potlp run toy"):
+        assert part in result.stdout
+    for command in ("task", "run", "compare", "explain"):
+        shown = _potlp(command, "--help")
+        assert shown.exit_code == 0
+        assert "Examples" in shown.stdout
+        assert f"potlp {command}" in shown.stdout
+        assert "--json" in shown.stdout
+
+
+def test_version():
+    result = _potlp("--version")
+    assert result.exit_code == 0
+    assert result.stdout.startswith("potlp 0.")
+
+
+def test_task_as_json_is_its_description():
+    data = _json(_potlp("task", "!hazard U goal", "--propositions", "goal,hazard", "--json"))
+    assert data == json.loads(json.dumps(Task.shipped("toy-2").describe()))
+
+
+def test_task_as_text_and_picture(tmp_path):
+    svg = tmp_path / "task.svg"
+    result = _potlp("task", "toy-2", "--svg", svg)
+    assert result.exit_code == 0
+    for part in ("!hazard U goal", "initial", "accepting", "trap", "!goal & hazard", "0→1"):
+        assert part in result.stdout
+    texts = ["".join(node.itertext()) for node in ElementTree.parse(svg).iter("{http://www.w3.org/2000/svg}text")]
+    assert "!goal & !hazard" in texts
+
+
+def test_task_from_a_hoa_file(tmp_path):
+    file = tmp_path / "task.hoa"
+    file.write_text(Task.shipped("firefighting-4").to_hoa())
+    data = _json(_potlp("task", file, "--json"))
+    assert data["formula"] == "!fire U exit"
+    assert data["propositions"] == ["fire", "alarm", "extinguisher", "exit"]
+
+
+def test_max_positive_literals_reaches_the_task():
+    literals = _json(_potlp("task", "F (a & b | c)", "--max-positive-literals", "1", "--json"))
+    assert [outcome["cube"] for outcome in literals["classes"]] == ["c"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("task", "G a"), "co-safe"),
+        (("task", "F (a &"), "^"),
+        (("task", "F b", "--propositions", "a"), "unknown proposition"),
+        (("task", "missing.hoa"), "missing.hoa"),
+        (("task", "F a", "--svg", "picture.docx"), "docx"),
+        (("run", "castle"), "toy, firefighting, map:FILE.yaml"),
+        (("run", "map:missing.yaml"), "missing.yaml"),
+        (("run", "toy", "--task", "9"), "1 (F goal)"),
+        (("run", "toy", "--task", "F dragon"), "dragon"),
+        (("run", "toy", "--policy", "clever"), "known-map, baseline"),
+        (("run", "toy", "--split", "holiday"), "validation"),
+        (("run", "toy", "--seed", "999999999999"), "--seed"),
+        (("compare", "toy", "--policies", "oracle,clever"), "clever"),
+        (("explain", "nothing"), "FOLDER:INDEX"),
+        (("explain", "nowhere/trial.json:0"), "nowhere/trial.json"),
+    ],
+)
+def test_bad_input_is_one_message_and_exit_code_2(arguments, message):
+    result = _potlp(*arguments)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert "Traceback" not in result.output
+    assert result.stdout == ""
+
+
+def test_bad_options_have_exit_code_2():
+    assert _potlp("run", "toy", "--seed", "-1").exit_code == 2
+    assert _potlp("compare", "toy", "--trials", "0").exit_code == 2
+    assert _potlp("run").exit_code == 2
+    assert _potlp("dance").exit_code == 2
+
+
+def test_run_writes_record_picture_and_animation(recorded):
+    trial = load_trial(recorded / "trial.json")
+    assert trial.outcome is Outcome.SATISFIED
+    assert (trial.environment, trial.seed, trial.policy) == ("toy/validation", 1, "oracle")
+    world = make("toy").generate(world_key("validation", 1, "toy"))
+    assert trial.path[0] == tuple(int(entry) for entry in world.start)
+    assert trial.config["decision"]["search"]["simulations"] == 20
+    with Image.open(recorded / "trial.png") as picture:
+        assert picture.size[0] > 400
+        assert len(picture.convert("RGB").getcolors(1 << 20) or []) > 20
+    with Image.open(recorded / "trial.gif") as animation:
+        assert animation.n_frames == len(trial.decisions) + 1
+
+
+def test_run_as_json_is_the_summary(recorded, tmp_path):
+    data = _json(
+        _potlp("run", "toy", "-t", "2", "--seed", "1", "--out", tmp_path / "new", "--no-animation", "--json", *FAST)
+    )
+    files = data.pop("files")
+    assert data == load_trial(recorded / "trial.json").summary()
+    assert [Path(file).name for file in files] == ["trial.json", "trial.png"]
+    assert not (tmp_path / "new" / "trial.gif").exists()
+
+
+def test_run_without_out_writes_nothing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = _potlp("run", "toy", "-t", "2", "--policy", "baseline")
+    assert result.exit_code == 0
+    assert "satisfied" in result.stdout
+    assert not list(tmp_path.iterdir())
+
+
+def test_task_that_is_not_satisfied_has_exit_code_1():
+    result = _potlp("run", "toy", "--task", "!hazard U (goal & hazard)", "--policy", "baseline", "--json")
+    assert result.exit_code == 1
+    assert json.loads(result.stdout)["outcome"] == "infeasible"
+
+
+def test_out_that_is_a_file_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    result = _potlp("run", "toy", "--out", tmp_path / "file")
+    assert result.exit_code == 2
+    assert "is a file" in result.stderr
+
+
+def test_explain_prints_the_actions_of_a_decision(recorded):
+    decision = load_trial(recorded / "trial.json").decisions[0]
+    result = _potlp("explain", f"{recorded}:0")
+    assert result.exit_code == 0
+    for part in ("P_S", "R_S", "R_F", "visits", f"expected cost {decision.value:.2f}"):
+        assert part in result.stdout
+    data = _json(_potlp("explain", f"{recorded}/trial.json:0", "--json"))
+    assert data["choice"] == decision.choice
+    assert len(data["actions"]) == len(decision.actions) > 0
+    assert data["trial"]["policy"] == "oracle"
+
+
+def test_explain_draws_the_tree(recorded, tmp_path):
+    result = _potlp("explain", f"{recorded}:0", "--out", tmp_path / "tree.svg")
+    assert result.exit_code == 0, result.output
+    assert "another action" not in result.stderr
+    texts = "".join(ElementTree.parse(tmp_path / "tree.svg").getroot().itertext())
+    assert "robot" in texts
+    assert "succeeds" in texts
+
+
+def test_explain_refuses_what_is_not_there(recorded, tmp_path):
+    result = _potlp("explain", f"{recorded}:500")
+    assert result.exit_code == 2
+    assert "no decision 500" in result.stderr
+    (tmp_path / "trial.json").write_text('{"format": "something else"}')
+    assert "not a trial record" in _potlp("explain", f"{tmp_path}:0").stderr
+
+
+def test_decision_of_a_policy_that_does_not_search(tmp_path):
+    _potlp("run", "toy", "-t", "2", "--policy", "baseline", "--out", tmp_path, "--no-animation")
+    assert "does not search" in _potlp("explain", f"{tmp_path}:0").stdout
+    result = _potlp("explain", f"{tmp_path}:0", "--out", tmp_path / "tree.png")
+    assert result.exit_code == 2
+    assert "no tree" in result.stderr
+
+
+def test_compare_reports_pairs_and_writes_its_files(tmp_path):
+    result = _potlp(
+        "compare", "toy", "--task", "2", "--policies", "oracle", "--trials", "3", "--out", tmp_path, "--json", *FAST
+    )
+    data = _json(result)
+    assert data == json.loads((tmp_path / "compare.json").read_text())
+    assert (data["worlds"], data["seeds"], data["redrawn"]) == (3, [0, 1, 2], 0)
+    assert [row["policy"] for row in data["satisfied"]["rows"]] == ["known-map", "baseline", "oracle"]
+    with (tmp_path / "trials.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 9
+    oracle = [float(row["cost"]) for row in rows if row["policy"] == "oracle"]
+    assert data["charged"]["rows"][2]["mean_cost"] == pytest.approx(sum(oracle) / 3)
+    # 20 (H + W) on the toy's 9 by 15 cells.
+    assert {float(row["budget"]) for row in rows} == {480.0}
+    assert "how trials ended" in (tmp_path / "table.txt").read_text()
+    assert Image.open(tmp_path / "scatter.png").size[0] > 400
+    assert "world 2" in result.stderr
+
+
+def test_impossible_worlds_are_redrawn(monkeypatch):
+    from potlp_jax.environments.toy import Toy, ToyConfig
+
+    plain = Toy.generate
+
+    def generate(self, key):
+        """The goal of every world but the third and fourth is where the robot cannot go without the hazard."""
+        world = plain(self, key)
+        seeds = [world_key("validation", seed, "toy") for seed in (2, 3)]
+        return world if any((key == seed).all() for seed in seeds) else world.replace(letters=world.letters * 0)
+
+    monkeypatch.setattr(Toy, "generate", generate)
+    assert ToyConfig().height == 9
+    data = _json(_potlp("compare", "toy", "-t", "2", "--policies", "baseline", "--trials", "2", "--json"))
+    assert (data["seeds"], data["redrawn"]) == ([2, 3], 2)
+
+
+def test_task_that_is_never_possible_fails(monkeypatch):
+    monkeypatch.setattr("potlp_jax.cli.compare.IMPOSSIBLE_IN_A_ROW", 3)
+    result = _potlp("compare", "toy", "--task", "!hazard U (goal & hazard)", "--policies", "baseline")
+    assert result.exit_code == 1
+    assert "impossible in 3 worlds in a row" in result.stderr
+
+
+def test_unknown_environment_lists_the_known_ones():
+    with pytest.raises(WorldError, match="toy, firefighting"):
+        make("castle")
+
+
+def _process(code: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_exit_codes_of_the_process():
+    program = Path(sys.executable).with_name("potlp")
+    good = subprocess.run([program, "task", "F a", "--json"], capture_output=True, text=True, timeout=120, check=False)
+    assert good.returncode == 0
+    assert json.loads(good.stdout)["accepting"] == [1]
+    assert good.stderr == ""
+    bad = subprocess.run([program, "task", "F (a"], capture_output=True, text=True, timeout=120, check=False)
+    assert bad.returncode == 2
+    assert bad.stdout == ""
+    assert bad.stderr.startswith("potlp: ")
+
+
+def test_interrupt_has_exit_code_130():
+    interrupted = _process(
+        "import signal, os, sys\n"
+        "import potlp_jax.cli.task as command\n"
+        "command.show_task = lambda *args: os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.argv = ['potlp', 'task', 'F a']\n"
+        "from potlp_jax.cli import main\n"
+        "main()\n"
+    )
+    assert interrupted.returncode == 130
+    assert "Traceback" not in interrupted.stderr
+
+
+def test_help_does_not_wait_for_the_planner():
+    result = _process(
+        "import sys\n"
+        "import potlp_jax.cli\n"
+        "slow = {'potlp_jax.trial', 'potlp_jax.planning.pouct', 'matplotlib', 'spot'} & set(sys.modules)\n"
+        "sys.exit(', '.join(slow) or 0)\n"
+    )
+    assert result.returncode == 0, result.stderr

@@ -1,0 +1,117 @@
+"""PlanningProblem: types, validation, enumeration of actions."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from potlp_jax.planning.history import action_terms, initial_history
+from potlp_jax.planning.problem import PlanningProblem, ProblemError, enumerate_actions
+from tests.reference.problems import FORMULAS, SIZES, padded_problem, problem_of, random_fields, random_problem, task_of
+
+TASK = "F a & F b"
+
+
+def broken(name, index=(), value=None, formula=TASK, subgoals=2):
+    """A valid problem but for one value."""
+    fields = random_fields(task_of(formula), subgoals, seed=0)
+    fields[name] = np.array(fields[name], dtype=float if name != "dfa_state" else int)
+    fields[name][index] = value
+    return problem_of(task_of(formula), fields)
+
+
+def test_random_problems_are_valid():
+    for seed, formula in enumerate(FORMULAS):
+        random_problem(formula, seed % 3, seed).check()
+
+
+@pytest.mark.parametrize(
+    ("name", "index", "value"),
+    [
+        ("travel", (0, 1, 1, 2), -1.0),
+        ("travel", (2, 0, 0, 0), np.nan),
+        ("finish", (1, 1), -0.5),
+        ("finish", (2, 0), np.nan),
+        ("success_probability", (1, 2), 1.5),
+        ("success_probability", (0, 0), -0.1),
+        ("success_probability", (0, 3), np.nan),
+        ("success_cost", (1, 0), 0.0),
+        ("success_cost", (1, 1), -2.0),
+        ("success_cost", (0, 1), np.inf),
+        ("success_cost", (0, 1), np.nan),
+        ("failure_cost", (0, 0), -1.0),
+        ("failure_cost", (1, 4), np.nan),
+        ("failure_cost", (1, 4), np.inf),
+        ("dead_end_cost", (), 0.0),
+        ("dead_end_cost", (), -1.0),
+        ("dead_end_cost", (), np.inf),
+        ("dfa_state", (), 4),
+        ("dfa_state", (), -1),
+    ],
+)
+def test_check_names_field_index_and_value(name, index, value):
+    with pytest.raises(ProblemError) as error:
+        broken(name, index, value).check()
+    message = str(error.value)
+    assert (f"{name}[{', '.join(map(str, index))}]" if index else name) in message
+    assert str(value) in message
+
+
+def test_check_ignores_padding():
+    fields = random_fields(task_of(TASK), 2, seed=0)
+    fields["subgoal_mask"] = np.array([True, False])
+    fields["success_cost"][1] = -1.0
+    fields["success_probability"][1] = np.nan
+    problem_of(task_of(TASK), fields).check()
+
+
+def test_check_names_the_field_whose_shape_is_wrong():
+    wrong = dict.fromkeys(("success_probability", "success_cost", "failure_cost"), jnp.ones((2, 4)))
+    with pytest.raises(ProblemError, match=r"success_probability has shape \(2, 4\), expected \(2, 5\)"):
+        dataclasses.replace(random_problem(TASK, 2, 0), **wrong).check()
+
+
+def test_from_arrays_is_traceable_and_sets_types():
+    fields = random_fields(task_of(TASK), 2, seed=3)
+    problem = jax.jit(lambda fields: PlanningProblem.from_arrays(task_of(TASK).arrays, **fields))(fields)
+    assert problem.travel.dtype == jnp.float32
+    assert problem.dfa_state.dtype == jnp.int32
+    assert problem.subgoal_mask.dtype == jnp.bool_
+    assert (problem.subgoal_count, problem.edge_count, problem.action_count) == (2, 5, 11)
+    problem.check()
+
+
+def test_enumerated_actions_are_those_available_at_the_root():
+    at_root = jax.jit(lambda problem: action_terms(problem, initial_history(problem)).available[:-1])
+    enumerated = jax.jit(enumerate_actions)
+    counts = set()
+    for seed in range(40):
+        task = task_of(FORMULAS[seed % len(FORMULAS)])
+        problem = padded_problem(task, random_fields(task, 1 + seed % 3, seed), SIZES, 3)
+        found = enumerated(problem)
+        np.testing.assert_array_equal(found.reshape(-1), at_root(problem))
+        counts.add(int(found.sum()))
+    assert len(counts) > 3
+
+
+def test_enumerated_actions_by_hand():
+    # Edges of F a & F b: 0->1 (b), 0->2 (a), 0->3 (both), 1->3, 2->3.
+    fields = random_fields(task_of(TASK), 2, seed=0)
+    fields["dfa_state"] = 0
+    fields["travel"] = np.full_like(fields["travel"], np.inf)
+    fields["travel"][2, 0, 0, 0] = 5.0  # the first subgoal with nothing done
+    fields["travel"][2, 0, 1, 1] = 7.0  # the second after b, which is on the way
+    fields["success_probability"] = np.full((2, 5), 0.5)
+    edges = task_of(TASK).edges.tolist()
+    found = np.asarray(enumerate_actions(problem_of(task_of(TASK), fields)))
+    expected = [[z in (0,) for z, _ in edges], [z in (1,) for z, _ in edges]]
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize(("formula", "subgoals"), [("F a & F b", 0), ("X a", 2), ("X a", 0)])
+def test_nothing_to_enumerate(formula, subgoals):
+    problem = random_problem(formula, subgoals, 0)
+    assert enumerate_actions(problem).shape == (subgoals, len(task_of(formula).edges))
+    assert not np.any(enumerate_actions(problem))

@@ -1,0 +1,411 @@
+"""Pictures: the files are made, show what they should, and their texts do not cover each other."""
+
+import dataclasses
+import io
+import itertools
+import json
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.collections import LineCollection, PathCollection
+from matplotlib.colors import to_hex
+from matplotlib.patches import Circle
+from PIL import Image, ImageSequence
+from rich.console import Console
+
+from potlp_jax.records import NEVER_SEEN, ActionRecord, Decision, Outcome, Trial
+from potlp_jax.sweep.statistics import Comparison, TrialResult
+from potlp_jax.task.task import Task
+from potlp_jax.view.animation import frame_steps, save_animation
+from potlp_jax.view.automata import Automaton, draw_automaton
+from potlp_jax.view.comparisons import draw_scatter, loss_lines, outcome_table, savings_table
+from potlp_jax.view.decisions import action_table, decision_to_dict, draw_tree, rank_actions
+from potlp_jax.view.maps import (
+    FREE_SEEN,
+    FREE_UNSEEN,
+    HATCH,
+    WALL_SEEN,
+    WALL_UNSEEN,
+    cell_image,
+    describe_outcome,
+    draw_trial,
+    place_labels,
+)
+from potlp_jax.view.style import CHOSEN, PictureError, area_colour, new_figure, rgb, save_figure, state_colour
+from potlp_jax.world.grid import make_world, pad_world
+
+PROPOSITIONS = ("goal", "hazard")
+HEIGHT, WIDTH = 12, 26
+DOOR = (6, 12)
+
+
+def _world(goal=(9, 22), hazard=(3, 20)):
+    occupied = np.ones((HEIGHT, WIDTH), bool)
+    occupied[1:-1, 1:12] = occupied[1:-1, 13:-1] = False
+    occupied[DOOR] = False
+    letters = np.zeros((HEIGHT, WIDTH), np.int32)
+    letters[goal], letters[hazard] = 1, 2
+    return make_world(occupied, letters, (6, 2))
+
+
+def _action(index, q_value, subgoal: int | None = 0, **others):
+    values = dict(success_probability=0.25, success_cost=12.5, failure_cost=7.0, distance=10.0, visits=40)
+    finish = subgoal is None
+    return ActionRecord(
+        index=index,
+        subgoal=subgoal,
+        cell=None if finish else DOOR,
+        from_state=None if finish else 0,
+        to_state=None if finish else 1,
+        q_value=q_value,
+        **(values | others),
+    )
+
+
+def _decision(index, step, cell, actions=()):
+    return Decision(
+        index=index,
+        step=step,
+        cell=cell,
+        state=0,
+        key=(0, index),
+        kind="action" if actions else "frontier",
+        choice=actions[0].index if actions else None,
+        target=DOOR,
+        target_state=0,
+        value=31.4,
+        fallback=False,
+        status=0,
+        subgoals=(DOOR, (2, 11)),
+        actions=actions,
+        path=(cell, DOOR),
+    )
+
+
+@pytest.fixture(scope="module")
+def trial() -> Trial:
+    """A walk through the door to the goal, with the cells within six columns seen from each step."""
+    world = _world()
+    path = [(6, column) for column in range(2, 20)] + [(7, 20), (8, 21), (9, 22)]
+    first_seen = np.full((HEIGHT, WIDTH), NEVER_SEEN, np.int32)
+    for step, (_, column) in reversed(list(enumerate(path[:-1]))):
+        first_seen[:, max(0, column - 6) : min(column + 2, 20)] = step
+    task = Task.shipped("toy-2")
+    actions = (_action(0, 31.4), _action(3, 48.25, subgoal=1), _action(8, 55.0, subgoal=None))
+    decisions = [_decision(index, 4 * index, path[4 * index], actions if index < 3 else ()) for index in range(5)]
+    return Trial(
+        outcome=Outcome.SATISFIED,
+        cost=21.2,
+        path=tuple(path),
+        word=tuple([0] * (len(path) - 1) + [1]),
+        states=tuple([0] * (len(path) - 1) + [1]),
+        decisions=tuple(decisions),
+        first_seen=first_seen,
+        world=world,
+        task_text=task.text,
+        task_hoa=task.to_hoa(),
+        propositions=PROPOSITIONS,
+        policy="oracle",
+        environment="toy/validation",
+        seed=3,
+        status=0,
+        config={},
+        versions={},
+    )
+
+
+def _colours(image) -> set[tuple[int, ...]]:
+    return {tuple(colour) for colour in np.asarray(image.convert("RGB")).reshape(-1, 3).tolist()}
+
+
+def _overlaps(figure, texts) -> list[tuple[str, str]]:
+    renderer = figure.canvas.get_renderer()
+    boxes = [(text.get_text(), text.get_window_extent(renderer)) for text in texts if text.get_text()]
+    return [(a, b) for (a, first), (b, second) in itertools.combinations(boxes, 2) if first.overlaps(second)]
+
+
+def test_picture_of_a_trial_shows_every_part(trial, tmp_path):
+    figure = draw_trial(trial)
+    save_figure(figure, tmp_path / "trial.png")
+    colours = _colours(Image.open(tmp_path / "trial.png"))
+    for part in (FREE_SEEN, WALL_SEEN, FREE_UNSEEN, HATCH, CHOSEN, area_colour(0), state_colour(0), state_colour(1)):
+        assert rgb(part) in colours, part
+    (axes,) = figure.axes
+    names = {text.get_text() for text in axes.texts}
+    assert {"goal", "hazard", "1"} <= names
+    heading = " ".join(text.get_text() for text in figure.texts)
+    for part in (trial.task_text, "oracle", "21.2", "satisfied", "seed 3"):
+        assert part in heading
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert {"state 0 (initial)", "state 1 (accepting)", "never seen", "start", "end", "goal", "hazard"} <= set(legend)
+    assert not _overlaps(figure, [*axes.texts, *figure.texts, *figure.legends[0].get_texts()])
+
+
+def test_trial_without_decisions_has_a_picture(trial, tmp_path):
+    start = dataclasses.replace(
+        trial,
+        decisions=(),
+        path=trial.path[:1],
+        states=trial.states[:1],
+        word=trial.word[:1],
+        outcome=Outcome.INFEASIBLE,
+    )
+    save_figure(draw_trial(start), tmp_path / "start.png")
+    assert save_animation(start, tmp_path / "start.gif") == 1
+
+
+@pytest.mark.parametrize(
+    ("environment", "shown"),
+    [
+        ("firefighting/test", "firefighting/test, seed 3"),
+        ("map:/some/where/lab.yaml,places=a/b.yaml,resolution=0.3/validation", "map:lab.yaml/validation, seed 3"),
+        ("map:lab.yaml/validation", "map:lab.yaml/validation, seed 3"),
+    ],
+)
+def test_heading_names_the_environment_briefly(trial, environment, shown):
+    assert describe_outcome(dataclasses.replace(trial, environment=environment)).startswith(
+        f"{shown}  ·  policy oracle"
+    )
+
+
+def test_raster_colours_cells_by_what_is_known():
+    occupied = np.ones((5, 6), bool)
+    occupied[1:4, 1:5] = False
+    letters = np.zeros((5, 6), np.int32)
+    letters[2, 2], letters[2, 3] = 1, 3
+    seen = np.zeros((5, 6), bool)
+    seen[:, :4] = True
+    image = cell_image(make_world(occupied, letters, (1, 1)), seen, PROPOSITIONS, hatch=False, pixels=60)
+    assert image.shape == (50, 60, 3)
+
+    def cell(row, column):
+        pixels = image[10 * row : 10 * row + 10, 10 * column : 10 * column + 10].reshape(-1, 3)
+        return {tuple(pixel) for pixel in pixels.tolist()}
+
+    assert cell(0, 0) == {rgb(WALL_SEEN)}
+    assert cell(1, 1) == {rgb(FREE_SEEN)}
+    assert cell(1, 4) == {rgb(FREE_UNSEEN)}
+    assert cell(0, 5) == {rgb(WALL_UNSEEN)}
+    assert cell(2, 2) == {rgb(area_colour(0))}
+    assert cell(2, 3) == {rgb(area_colour(0)), rgb(area_colour(1))}
+
+
+def test_padding_is_not_drawn(trial):
+    seen = np.pad(trial.first_seen != NEVER_SEEN, ((0, 20), (0, 30)))
+    padded = pad_world(trial.world, HEIGHT + 20, WIDTH + 30)
+    np.testing.assert_array_equal(
+        cell_image(padded, seen, PROPOSITIONS, hatch=True),
+        cell_image(trial.world, trial.first_seen != NEVER_SEEN, PROPOSITIONS, hatch=True),
+    )
+
+
+def test_way_back_does_not_hide_the_way_out(trial):
+    path = trial.path[:10] + trial.path[8::-1]
+    states = tuple([0] * 10 + [1] * 9)
+    back = dataclasses.replace(trial, path=path, states=states, word=states, decisions=())
+    (lines,) = (artist for artist in draw_trial(back).axes[0].collections if isinstance(artist, LineCollection))
+    segments = np.array(lines.get_segments())
+    out, home = segments[4, 0], segments[14, 0]
+    assert out[0] == pytest.approx(home[0])
+    assert out[1] > 6 > home[1]
+    assert {to_hex(colour) for colour in lines.get_colors()} == {state_colour(0).lower(), state_colour(1).lower()}
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    cells=st.sets(st.tuples(st.integers(1, 28), st.integers(1, 58)), min_size=1, max_size=12), seed=st.integers(0, 99)
+)
+def test_area_labels_stay_apart_and_inside(cells, seed):
+    letters = np.zeros((30, 60), np.int32)
+    generator = np.random.default_rng(seed)
+    for cell in cells:
+        letters[cell] = generator.integers(1, 4)
+    occupied = np.ones((30, 60), bool)
+    occupied[1:-1, 1:-1] = False
+    world = make_world(occupied, letters, (1, 1))
+    labels = place_labels(world, PROPOSITIONS, [(1, 1)], inches_per_cell=0.15)
+    assert labels
+    for label in labels:
+        assert np.all(np.subtract(label.spot, label.half_size) >= -0.5)
+        assert np.all(np.add(label.spot, label.half_size) <= (59.5, 29.5))
+        column, row = label.anchor
+        assert letters[int(row), int(column)] > 0
+    for one, other in itertools.combinations(labels, 2):
+        assert np.any(np.abs(np.subtract(one.spot, other.spot)) >= np.add(one.half_size, other.half_size))
+
+
+def test_animation_has_a_frame_per_decision_and_one_for_the_end(trial, tmp_path):
+    seen = []
+    frames = save_animation(trial, tmp_path / "trial.gif", progress=lambda done, total: seen.append((done, total)))
+    assert frames == len(trial.decisions) + 1
+    assert seen == [(count + 1, frames) for count in range(frames)]
+    animation = Image.open(tmp_path / "trial.gif")
+    pictures = [frame.convert("RGB") for frame in ImageSequence.Iterator(animation)]
+    assert len(pictures) == frames
+    arrays = [np.asarray(picture) for picture in pictures]
+    assert all(np.any(first != second) for first, second in itertools.pairwise(arrays))
+    # What was not seen gets less, and the palette keeps the colours.
+    unseen = [int(np.all(array == rgb(FREE_UNSEEN), axis=-1).sum()) for array in arrays]
+    assert unseen[0] > 2 * unseen[-1]
+    assert {rgb(state_colour(0)), rgb(CHOSEN), rgb(WALL_SEEN)} <= _colours(pictures[1])
+    assert (tmp_path / "trial.gif").stat().st_size < 3_000_000
+
+
+def test_animation_is_thinned_out_evenly(trial):
+    many = dataclasses.replace(trial, decisions=tuple(_decision(index, 0, (6, 2)) for index in range(101)))
+    kept = frame_steps(many, 11)
+    assert kept[-1] is None
+    assert [decision.index for decision in kept if decision is not None] == [0, 11, 22, 33, 44, 56, 67, 78, 89, 100]
+
+
+def test_animation_that_is_too_large_loses_frames(trial, tmp_path):
+    whole = save_animation(trial, tmp_path / "whole.gif")
+    size = (tmp_path / "whole.gif").stat().st_size
+    assert save_animation(trial, tmp_path / "less.gif", max_bytes=size - 1) < whole
+    assert (tmp_path / "less.gif").stat().st_size < size
+
+
+@pytest.mark.parametrize("name", ["toy-2", "firefighting-1", "firefighting-2", "firefighting-3", "firefighting-4"])
+def test_automaton_is_complete_and_its_texts_stay_apart(name, tmp_path):
+    task = Task.shipped(name)
+    figure = draw_automaton(Automaton.from_description(task.describe()), task.text)
+    path = tmp_path / "task.svg"
+    save_figure(figure, path)
+    root = ElementTree.parse(path).getroot()
+    shown = ["".join(node.itertext()).strip() for node in root.iter("{http://www.w3.org/2000/svg}text")]
+    for state in range(task.dfa.num_states):
+        assert str(state) in shown
+    described = task.describe()
+    joined = " ".join(" ".join(shown).split())
+    for move in described["transitions"]:
+        if move["from"] not in described["trap"]:
+            for cube in move["guard"].split(" | "):
+                assert cube in joined
+    circles = [patch for patch in figure.axes[0].patches if isinstance(patch, Circle)]
+    assert len(circles) == task.dfa.num_states + len(described["accepting"])
+    assert ("trap" in shown) == bool(described["trap"])
+    assert not _overlaps(figure, figure.axes[0].texts)
+
+
+def test_pictures_are_reproducible(tmp_path):
+    task = Task.shipped("toy-2")
+    for name in ("a.svg", "b.svg"):
+        save_figure(draw_automaton(Automaton.from_description(task.describe())), tmp_path / name)
+    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
+
+
+def test_automaton_with_one_state_and_without_accepting_state():
+    single = Automaton(states=(0,), initial=0, accepting=frozenset({0}), trap=frozenset(), guards={(0, 0): "true"})
+    hopeless = Automaton(states=(0,), initial=0, accepting=frozenset(), trap=frozenset({0}), guards={(0, 0): "true"})
+    assert "true" in [text.get_text() for text in draw_automaton(single).axes[0].texts]
+    assert "trap" in [text.get_text() for text in draw_automaton(hopeless).axes[0].texts]
+
+
+def test_unknown_kind_of_picture_is_refused(tmp_path):
+    with pytest.raises(PictureError, match="docx"):
+        save_figure(new_figure(1.0, 1.0), tmp_path / "picture.docx")
+    assert not list(tmp_path.iterdir())
+
+
+def test_action_table_marks_the_choice(trial):
+    console = Console(width=120, record=True, file=io.StringIO())
+    console.print(action_table(trial, trial.decisions[1]))
+    lines = [line.split() for line in console.export_text().splitlines()]
+    chosen = next(line for line in lines if line[:1] == ["*"])
+    assert chosen == ["*", "s0:", "0→1", "6,12", "0.250", "12.5", "7.0", "10.0", "31.4", "40"]
+    assert ["finish", "-", "0.250", "12.5", "7.0", "10.0", "55.0", "40"] in lines
+
+
+def test_decision_as_json_is_ranked_and_finite(trial):
+    actions = (_action(0, float("inf")), _action(1, 9.0), _action(2, 3.0))
+    decision = dataclasses.replace(trial.decisions[0], actions=actions, choice=2)
+    data = json.loads(json.dumps(decision_to_dict(decision), allow_nan=False))
+    assert [action["index"] for action in data["actions"]] == [2, 1, 0]
+    assert data["actions"][-1]["q_value"] is None
+    assert data["choice"] == 2
+
+
+def test_chosen_action_leads_among_equals(trial):
+    decision = dataclasses.replace(trial.decisions[0], actions=(_action(0, 5.0), _action(1, 5.0)), choice=1)
+    assert [action.index for action in rank_actions(decision)] == [1, 0]
+
+
+def _node(name, outcome, q, visits, children=()):
+    return {
+        "name": name,
+        "outcome": outcome,
+        "probability": 0.5,
+        "q": q,
+        "visits": visits,
+        "distance": 4.0,
+        "children": list(children),
+    }
+
+
+def test_tree_shows_both_outcomes_and_stops_at_its_depth():
+    deep = _node("s1: 1→2", "success", 3.0, 20, [_node("finish", "success", 1.0, 20)])
+    tree = _node(
+        "robot",
+        None,
+        7.0,
+        100,
+        [
+            _node("s0: 0→1", "success", 7.0, 40, [deep]),
+            _node("s0: 0→1", "failure", 7.0, 30),
+            _node("s1: 0→1", "failure", float("inf"), 30),
+        ],
+    )
+    figure = draw_tree(tree, "a decision", depth=2)
+    texts = " ".join(text.get_text() for text in figure.axes[0].texts)
+    for part in ("robot", "s0: 0→1  succeeds", "s0: 0→1  fails", "s1: 1→2  succeeds", "Q 7.0", "Q ∞", "n 40", "P 0.50"):
+        assert part in texts
+    assert "finish" not in texts
+    styles = [line.get_linestyle() for line in figure.axes[0].lines]
+    assert sorted(styles) == ["-", "-", "--", "--"]
+    assert not _overlaps(figure, figure.axes[0].texts)
+
+
+def _trial_rows(*costs, outcome="satisfied"):
+    return [{"cost": cost, "outcome": outcome} for cost in costs]
+
+
+def test_scatter_places_worlds_and_marks_failures():
+    trials = {
+        "known-map": _trial_rows(5.0, 8.0),
+        "baseline": _trial_rows(10.0, 8.0),
+        "oracle": [*_trial_rows(6.0), *_trial_rows(30.0, outcome="stuck")],
+    }
+    figure = draw_scatter(trials, "a comparison")
+    points = {
+        str(artist.get_label()): np.asarray(artist.get_offsets()).tolist()
+        for artist in figure.axes[0].collections
+        if isinstance(artist, PathCollection)
+    }
+    assert points["oracle (1 worlds)"] == [[10.0, 6.0]]
+    assert points["known-map (2 worlds)"] == [[10.0, 5.0], [8.0, 8.0]]
+    assert [[8.0, 30.0]] in points.values()
+    assert "not satisfied" in points
+
+
+def test_comparison_tables():
+    def rows(*costs, outcome="satisfied", status=0):
+        return [TrialResult(cost, outcome, 100.0, status) for cost in costs]
+
+    comparison = Comparison.from_results(
+        {
+            "known-map": rows(10.0, 10.0, 10.0),
+            "baseline": rows(20.0, 20.0, 20.0),
+            "oracle": [*rows(12.0, 12.0), *rows(50.0, outcome="stuck", status=2)],
+        },
+        resamples=50,
+    )
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(savings_table(comparison.satisfied, "satisfied"))
+    console.print(outcome_table(comparison))
+    lines = [line.split() for line in console.export_text().splitlines()]
+    assert ["oracle", "80.0%", "80.0", "..", "80.0%", "40.0%", "40.0", "±", "0.0%", "12.0"] in lines
+    assert ["oracle", "2", "1"] in lines
+    assert loss_lines(comparison) == ["oracle: 1 trials with tree overflow (left out of the first table)"]
