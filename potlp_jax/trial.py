@@ -9,7 +9,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float32, Int32, PRNGKeyArray
 
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.estimates import Estimator
+from potlp_jax.planning.history import ActionTerms
 from potlp_jax.planning.policies import DecisionConfig, Move, MoveKind, Policy, assess, decide, planning_problem
 from potlp_jax.planning.pouct import Plan, SearchConfig, Tree, search_tree
 from potlp_jax.planning.problem import PlanningProblem
@@ -72,6 +73,7 @@ class Leg:
     cells: tuple[tuple[int, int], ...]
 
 
+@runtime_checkable
 class Robot(Protocol):
     """What the loop asks of a robot: a simulated one, or a real one."""
 
@@ -264,8 +266,9 @@ _KIND_NAMES = {
 def _decision_record(
     move: Move, index: int, step: int, cell: tuple[int, int], state: int, key: PRNGKeyArray
 ) -> Decision:
-    move = jax.device_get(move)
     kind = int(move.kind)
+    subgoals = np.asarray(move.subgoals.cells)[np.asarray(move.subgoals.mask)]
+    path = np.asarray(move.path.cells)[: int(move.path.length) + 1]
     goes = kind != MoveKind.NONE
     return Decision(
         index=index,
@@ -280,9 +283,9 @@ def _decision_record(
         value=float(move.value),
         fallback=kind == MoveKind.FALLBACK,
         status=int(move.status),
-        subgoals=tuple(_cell(subgoal) for subgoal in move.subgoals.cells[move.subgoals.mask]),
+        subgoals=tuple(_cell(subgoal) for subgoal in subgoals),
         actions=_action_records(move),
-        path=tuple(_cell(entry) for entry in move.path.cells[: int(move.path.length) + 1]),
+        path=tuple(_cell(entry) for entry in path),
     )
 
 
@@ -290,24 +293,28 @@ def _action_records(move: Move) -> tuple[ActionRecord, ...]:
     """The available actions at the root, as the search saw them."""
     if move.search is None:
         return ()
-    plan, terms, edges = move.search.plan, move.search.terms, move.search.problem.task.edges
+    edges, cells = np.asarray(move.search.problem.task.edges), np.asarray(move.subgoals.cells)
+    terms = {
+        field.name: np.asarray(getattr(move.search.terms, field.name)) for field in dataclasses.fields(ActionTerms)
+    }
+    q_values, visits = np.asarray(move.search.plan.q_values), np.asarray(move.search.plan.visits)
     records = []
-    for index in np.flatnonzero(terms.available):
+    for index in np.flatnonzero(terms["available"]):
         subgoal, edge = divmod(int(index), len(edges))
-        finish = subgoal == len(move.subgoals.mask)
+        finish = subgoal == len(cells)
         records.append(
             ActionRecord(
                 index=int(index),
                 subgoal=None if finish else subgoal,
-                cell=None if finish else _cell(move.subgoals.cells[subgoal]),
+                cell=None if finish else _cell(cells[subgoal]),
                 from_state=None if finish else int(edges[edge, 0]),
                 to_state=None if finish else int(edges[edge, 1]),
-                success_probability=float(terms.success_probability[index]),
-                success_cost=float(terms.success_cost[index]),
-                failure_cost=float(terms.failure_cost[index]),
-                distance=float(terms.distance[index]),
-                q_value=float(plan.q_values[index]),
-                visits=int(plan.visits[index]),
+                success_probability=float(terms["success_probability"][index]),
+                success_cost=float(terms["success_cost"][index]),
+                failure_cost=float(terms["failure_cost"][index]),
+                distance=float(terms["distance"][index]),
+                q_value=float(q_values[index]),
+                visits=int(visits[index]),
             )
         )
     return tuple(records)
@@ -374,7 +381,9 @@ def _follow(
     def step(carry):
         belief, first_seen, moved, travelled = carry
         here, there = path.cells[moved], path.cells[moved + 1]
-        belief = observe(belief, world, there, config)
+        # On a map that holds no secret there is nothing to look for.
+        look = partial(observe, world=world, cell=there, config=config)
+        belief = jax.lax.cond(jnp.any(belief.unknown), look, lambda belief: belief, belief)
         first_seen = jnp.where((first_seen == NEVER_SEEN) & ~belief.unknown, steps + moved + 1, first_seen)
         diagonal = jnp.all(here != there)
         return belief, first_seen, moved + 1, travelled + jnp.where(diagonal, DIAGONAL, 1.0).astype(jnp.float32)

@@ -25,11 +25,16 @@ def assert_equals_recursion(problem, remember=True):
     return exact
 
 
-@given(formula=st.sampled_from(FORMULAS), subgoals=st.integers(0, 2), seed=st.integers(0, 10**6))
+@given(
+    formula=st.sampled_from(FORMULAS),
+    subgoals=st.integers(0, 2),
+    seed=st.integers(0, 10**6),
+    backward=st.booleans(),
+)
 @settings(max_examples=60, deadline=None)
-def test_equals_the_literal_recursion(formula, subgoals, seed):
+def test_equals_the_literal_recursion(formula, subgoals, seed, backward):
     unreachable = 0.5 if subgoals == 2 else 0.2
-    assert_equals_recursion(random_problem(formula, subgoals, seed, unreachable=unreachable))
+    assert_equals_recursion(random_problem(formula, subgoals, seed, unreachable=unreachable, backward=backward))
 
 
 @given(formula=st.sampled_from(FORMULAS), seed=st.integers(0, 10**6))
@@ -73,7 +78,9 @@ def test_two_things_behind_one_subgoal():
     """Having found one thing, the robot looks for the other without leaving: D is 0 and nothing is owed."""
     task = task_of("F a & F b")
     fields = random_fields(task, 1, 0)
-    fields |= {"travel": np.full((2, 4, 1, 4), 10.0), "finish": np.full((2, 4), np.inf), "dfa_state": 0}
+    travel = np.full((2, 4, 1, 4), np.inf)
+    travel[:, range(4), :, range(4)] = 10.0
+    fields |= {"travel": travel, "finish": np.full((2, 4), np.inf), "dfa_state": 0}
     chance = np.zeros((1, 5))
     conditions = {tuple(edge): int(m) for edge, m in zip(task.edges.tolist(), task.arrays.edge_condition, strict=True)}
     chance[0, conditions[0, 1]], chance[0, conditions[1, 3]] = 1.0, 1.0

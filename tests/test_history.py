@@ -129,22 +129,22 @@ def test_success_is_certain_the_second_time_and_owes_the_way_back():
     task = task_of("F(a & F(b & F a))")
     fields = random_fields(task, 2, 0, unreachable=0.0)
     fields["dfa_state"], fields["success_probability"] = 0, np.full((2, 5), 0.5)
-    problem = problem_of(task, fields)
+    problem = padded_problem(task, fields, SIZES, SUBGOALS)
     first = edge_of(task, 0, 1)
-    start = action_terms(problem, initial_history(problem))
+    start = terms_jit(problem, initial_history(problem))
     assert float(start.success_probability[first]) == 0.5
-    assert float(start.distance[first]) == float(problem.travel[2, 0, 0, 0])
-    history = step(problem, initial_history(problem), jnp.int32(first), jnp.asarray(True))
+    assert float(start.distance[first]) == float(problem.travel[SUBGOALS, 0, 0, 0])
+    history = step_jit(problem, initial_history(problem), jnp.int32(first), jnp.asarray(True))
     assert (int(history.place), int(history.state)) == (0, 1)
     cost_of_a = float(problem.success_cost[0, int(task.arrays.edge_condition[first])])
     assert float(history.owed) == cost_of_a
-    terms = action_terms(problem, history)
+    terms = terms_jit(problem, history)
     inside, outside = edge_of(task, 1, 3), edge_of(task, 1, 3) + problem.edge_count
     assert float(terms.distance[inside]) == 0.0
     np.testing.assert_allclose(terms.distance[outside], cost_of_a + problem.travel[0, 1, 1, 1], rtol=1e-6)
-    history = step(problem, history, jnp.int32(outside), jnp.asarray(True))
+    history = step_jit(problem, history, jnp.int32(outside), jnp.asarray(True))
     last = edge_of(task, 3, 2)
-    terms = action_terms(problem, history)
+    terms = terms_jit(problem, history)
     assert bool(terms.certain[last])
     assert float(terms.success_probability[last]) == 1.0
     assert not bool(terms.certain[last + problem.edge_count])
@@ -155,17 +155,17 @@ def test_live_cycle_is_not_walked_twice():
     task = task_of("F(a & X b)")
     fields = random_fields(task, 1, 0, unreachable=0.0, finish_chance=0.0)
     fields["dfa_state"], fields["success_probability"] = 0, np.full((1, 3), 0.5)
-    problem = problem_of(task, fields)
+    problem = padded_problem(task, fields, SIZES, SUBGOALS)
     out, back = edge_of(task, 0, 1), edge_of(task, 1, 0)
     history = initial_history(problem)
     for action in (out, back):
-        assert bool(action_terms(problem, history).available[action])
-        history = step(problem, history, jnp.int32(action), jnp.asarray(True))
-    terms = action_terms(problem, history)
+        assert bool(terms_jit(problem, history).available[action])
+        history = step_jit(problem, history, jnp.int32(action), jnp.asarray(True))
+    terms = terms_jit(problem, history)
     assert bool(terms.certain[out])
     assert bool(terms.available[out])  # certain, but the rollout has learnt something since it was there
-    history = step(problem, history, jnp.int32(out), jnp.asarray(True))
-    assert not bool(action_terms(problem, history).available[back])
+    history = step_jit(problem, history, jnp.int32(out), jnp.asarray(True))
+    assert not bool(terms_jit(problem, history).available[back])
 
 
 def test_certain_condition_of_impossible_cubes_costs_its_cheapest():
@@ -176,11 +176,11 @@ def test_certain_condition_of_impossible_cubes_costs_its_cheapest():
     fields["dfa_state"], fields["success_probability"] = 0, np.full((1, 5), 0.5)
     condition = int(task.arrays.edge_condition[only_a])
     fields["success_probability"][0, condition] = 0.0
-    problem = problem_of(task, fields)
+    problem = padded_problem(task, fields, SIZES, SUBGOALS)
     assert bool(task.arrays.implies[int(task.arrays.edge_condition[both]), condition])
-    history = step(problem, initial_history(problem), jnp.int32(both), jnp.asarray(True))
+    history = step_jit(problem, initial_history(problem), jnp.int32(both), jnp.asarray(True))
     history = history.replace(state=jnp.int32(1))
-    terms = action_terms(problem, history)
+    terms = terms_jit(problem, history)
     assert float(terms.success_probability[only_a]) == 1.0
     assert float(terms.success_cost[only_a]) == float(problem.success_cost[0, condition])
 

@@ -675,8 +675,6 @@ def test_specifications():
     assert parse_spec("map:a/b.yaml") == RosMapConfig("a/b.yaml")
     config = RosMapConfig("b.yaml", "c.yaml", 0.4, 0.0)
     assert parse_spec("map:b.yaml,radius=0,resolution=0.4,places=c.yaml") == config
-    assert parse_spec(config.spec) == config
-    assert RosMapConfig("b.yaml").spec == "map:b.yaml"
 
 
 @pytest.mark.parametrize(

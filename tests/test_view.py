@@ -22,7 +22,7 @@ from potlp_jax.task.task import Task
 from potlp_jax.view.animation import frame_steps, save_animation
 from potlp_jax.view.automata import Automaton, draw_automaton
 from potlp_jax.view.comparisons import draw_scatter, loss_lines, outcome_table, savings_table
-from potlp_jax.view.decisions import action_table, decision_to_dict, draw_tree, rank_actions
+from potlp_jax.view.decisions import action_table, decision_to_dict, rank_actions
 from potlp_jax.view.maps import (
     FREE_SEEN,
     FREE_UNSEEN,
@@ -35,6 +35,7 @@ from potlp_jax.view.maps import (
     place_labels,
 )
 from potlp_jax.view.style import CHOSEN, PictureError, area_colour, new_figure, rgb, save_figure, state_colour
+from potlp_jax.view.trees import draw_tree
 from potlp_jax.world.grid import make_world, pad_world
 
 PROPOSITIONS = ("goal", "hazard")
@@ -333,38 +334,51 @@ def test_chosen_action_leads_among_equals(trial):
     assert [action.index for action in rank_actions(decision)] == [1, 0]
 
 
-def _node(name, outcome, q, visits, children=()):
+def _tree_node(actions=(), value=7.0, **others):
+    flags = {"accepting": False, "dead_end": False} | others
+    return {"place": None, "state": 0, "value": value, "visits": 100, "actions": list(actions), **flags}
+
+
+def _tree_action(subgoal, q_value, visits, success=None, failure=None):
+    ends = (None, None) if subgoal is None else (0, 1)
     return {
-        "name": name,
-        "outcome": outcome,
-        "probability": 0.5,
-        "q": q,
+        "index": 0,
+        "subgoal": subgoal,
+        "from_state": ends[0],
+        "to_state": ends[1],
+        "q_value": q_value,
         "visits": visits,
         "distance": 4.0,
-        "children": list(children),
+        "success": success,
+        "failure": failure,
     }
 
 
-def test_tree_shows_both_outcomes_and_stops_at_its_depth():
-    deep = _node("s1: 1→2", "success", 3.0, 20, [_node("finish", "success", 1.0, 20)])
-    tree = _node(
-        "robot",
-        None,
-        7.0,
-        100,
+def _tree_outcome(probability, node, value=3.0):
+    return {"probability": probability, "cost": 2.5, "value": value, "node": node}
+
+
+def test_tree_shows_outcomes_and_follows_the_best_action():
+    done = _tree_outcome(1.0, _tree_node(accepting=True), 0.0)
+    after_success = _tree_node([_tree_action(None, 3.0, 30, success=done)])
+    other = _tree_node([_tree_action(9, 1.0, 5, success=done)])
+    tree = _tree_node(
         [
-            _node("s0: 0→1", "success", 7.0, 40, [deep]),
-            _node("s0: 0→1", "failure", 7.0, 30),
-            _node("s1: 0→1", "failure", float("inf"), 30),
-        ],
+            _tree_action(0, 7.0, 40, _tree_outcome(0.75, after_success), _tree_outcome(0.25, None, None)),
+            _tree_action(1, 8.0, 30, _tree_outcome(0.5, other), _tree_outcome(0.5, _tree_node(dead_end=True))),
+            _tree_action(2, float("inf"), 0, _tree_outcome(1.0, None, None)),
+        ]
     )
-    figure = draw_tree(tree, "a decision", depth=2)
-    texts = " ".join(text.get_text() for text in figure.axes[0].texts)
-    for part in ("robot", "s0: 0→1  succeeds", "s0: 0→1  fails", "s1: 1→2  succeeds", "Q 7.0", "Q ∞", "n 40", "P 0.50"):
-        assert part in texts
-    assert "finish" not in texts
+    figure = draw_tree(tree, "a decision", breadth=2)
+    shown = [text.get_text() for text in figure.axes[0].texts]
+    assert "robot in state 0\nV 7.0  n 100" in shown
+    assert "s0: 0→1 succeeds  P 0.75\nQ 7.0  n 40  D 4.0\nR 2.5, then 3.0" in shown
+    assert "s0: 0→1 fails  P 0.25\nQ 7.0  n 40  D 4.0\nR 2.5, then not tried" in shown
+    assert "finish\nQ 3.0  n 30  D 4.0\nR 2.5, then done" in shown
+    assert "s1: 0→1 fails  P 0.50\nQ 8.0  n 30  D 4.0\nR 2.5, then a dead end" in shown
+    assert not any(text.startswith(("s2", "s9")) for text in shown)
     styles = [line.get_linestyle() for line in figure.axes[0].lines]
-    assert sorted(styles) == ["-", "-", "--", "--"]
+    assert sorted(styles) == ["-", "-", "-", "--", "--"]
     assert not _overlaps(figure, figure.axes[0].texts)
 
 

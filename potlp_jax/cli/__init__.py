@@ -201,7 +201,7 @@ def explain_command(
         Path | None,
         typer.Option("--out", "-o", help="Search again and draw the top of the tree (.png, .svg or .pdf)."),
     ] = None,
-    depth: Annotated[int, typer.Option(min=1, max=6, help="Levels of the tree that are drawn.")] = 3,
+    depth: Annotated[int, typer.Option(min=1, max=5, help="Actions in a row in the picture of the tree.")] = 2,
     json: Json = False,
 ) -> None:
     """Explain one decision: the actions that were weighed, their estimates and expected costs."""

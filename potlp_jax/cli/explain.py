@@ -5,10 +5,15 @@ from pathlib import Path
 
 from potlp_jax.cli.output import console, fail, note, print_json
 from potlp_jax.cli.run import RECORD
+from potlp_jax.planning.pouct import tree_top
 from potlp_jax.records import Decision, Trial, load_trial
 from potlp_jax.trial import replay_decision
-from potlp_jax.view.decisions import action_table, decision_to_dict, describe_decision, draw_tree
+from potlp_jax.view.decisions import action_table, decision_to_dict, describe_decision
 from potlp_jax.view.style import save_figure
+from potlp_jax.view.trees import draw_tree
+
+BREADTH: int = 4
+"""Actions per node in the picture of a tree."""
 
 
 def explain_decision(name: str, out: Path | None, depth: int, json: bool) -> None:
@@ -45,10 +50,8 @@ def _read_decision(name: str) -> tuple[Trial, Decision]:
 def _draw(trial: Trial, decision: Decision, out: Path, depth: int) -> None:
     if not decision.actions:
         fail(f"decision {decision.index} of policy {trial.policy} did not search: there is no tree to draw")
-    from potlp_jax.planning.pouct import tree_top
-
     problem, plan, tree = replay_decision(trial, decision.index)
     if int(plan.action) != decision.choice:
         note("searching again chose another action than recorded: the versions of the software may differ")
-    top = tree_top(problem, tree, depth=depth)
-    save_figure(draw_tree(top, describe_decision(trial, decision), depth=depth), out)
+    top = tree_top(problem, tree, depth=depth, width=BREADTH)
+    save_figure(draw_tree(top, describe_decision(trial, decision), breadth=BREADTH), out)

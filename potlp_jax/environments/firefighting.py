@@ -68,13 +68,13 @@ class FirefightingConfig:
     room_height: int = 60
     hallway_length: int = 120
     hallway_width: int = 7
-    hallway_spacing: int = 20
+    hallway_spacing: int = 22
     dead_end_fraction: float = 0.85
     dead_end_opens_into_robot_room: float = 0.85
     dead_end_wall: int = 1
     stub_filled: bool = False
     alarm_depth: int = 1
-    fire_range: tuple[float, float] = (0.1, 0.9)
+    fire_range: tuple[float, float] = (0.1, 0.6)
     fire_thickness: int = 2
     patch_radius: int = 0
     smoke_density: float = 0.3

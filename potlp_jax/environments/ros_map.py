@@ -53,15 +53,6 @@ class RosMapConfig:
     resolution: float = 0.2
     radius: float = 0.1
 
-    @property
-    def spec(self) -> str:
-        """The text from which `parse_spec` makes this configuration; places given as an object are left out."""
-        options = [f"places={self.places}"] if isinstance(self.places, str) else []
-        for name in ("resolution", "radius"):
-            if getattr(self, name) != getattr(RosMapConfig, name):
-                options.append(f"{name}={getattr(self, name)}")
-        return ",".join([f"{PREFIX}{self.file}", *options])
-
 
 @dataclass(frozen=True, eq=False)
 class CleanMap:
@@ -75,7 +66,7 @@ class RosMap:
     """Worlds on one map; they differ in the start, unless the places fix it.
 
     Attributes:
-        name: the specification, as `from_spec` reads it.
+        name: ``map:`` and the name of the file, without its folder and ending.
         propositions: names, in the order of the letters' bits.
         tasks: formulas by name, from the places.
         image_map: the map as its server would publish it; ``image_map.frame`` converts metres to pixels.
@@ -96,7 +87,8 @@ class RosMap:
         places = config.places if isinstance(config.places, Places) else _find_places(config, self.image_map)
         self.places = places
         self.clean = clean_map(self.image_map, config.resolution, config.radius, places.start, places.source)
-        self.name = config.spec
+        # Not the path as typed: the name separates the seeds, and a map is the same map from every folder.
+        self.name = f"{PREFIX}{Path(config.file).stem}"
         self.propositions: tuple[str, ...] = places.names
         self.tasks: Mapping[str, str] = dict(places.tasks)
         self._letters = place_letters(places, self.clean.free, self.clean.frame)

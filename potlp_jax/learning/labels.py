@@ -92,7 +92,7 @@ def _labels_of_lanes(
     # Also a frontier that known space does not reach: a goal may have been seen across a gap, or through a fire.
     way_back = frontier_cells(belief, jnp.ones_like(free))[:, :, None] & ~own
 
-    def enter(*ways: tuple[Bool[Array, "H W lanes"] | Bool[Array, "H W 1"], int]) -> Int32[Array, "H W lanes"]:
+    def enter(*ways: tuple[Bool[Array, "H W _"], int]) -> Int32[Array, "H W lanes"]:
         phase = jnp.full(staying.shape, NO_STATE, jnp.int32)
         for allowed, next_phase in ways:
             phase = jnp.where(allowed & staying, next_phase, phase)

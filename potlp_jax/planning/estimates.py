@@ -1,6 +1,6 @@
 """What an estimator answers: how each outcome class fares beyond each subgoal."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from flax import struct
 from jaxtyping import Array, Float32
@@ -23,6 +23,7 @@ class Estimates:
     failure_cost: Float32[Array, "*batch S C"]
 
 
+@runtime_checkable
 class Estimator(Protocol):
     """A pytree that can be called inside jit: the true map, or a network with its parameters."""
 

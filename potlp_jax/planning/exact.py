@@ -134,7 +134,7 @@ class Rollouts:
         }
         self._closure = _Closure(np.asarray(task.implies), np.asarray(task.condition_classes), task.class_mask.shape[0])
         self._classes = [[int(c) for c in row if c != NO_CLASS] for row in np.asarray(task.condition_classes)]
-        self._relevant = _relevant_conditions(np.asarray(task.transitions), list(self._edges.values()))
+        self._relevant = _relevant_conditions(np.asarray(problem.travel), list(self._edges.values()))
         self._terms: dict[tuple[int, int, Settled], Terms] = {}
 
     def root(self) -> Position:
@@ -199,7 +199,7 @@ class Rollouts:
         if settled.holds >> condition & 1:
             return position._replace(place=subgoal, state=state, visited=position.visited | here)
         after = self._closure.settle(settled, condition, success)
-        knowledge = position.knowledge[:subgoal] + (after,) + position.knowledge[subgoal + 1 :]
+        knowledge = (*position.knowledge[:subgoal], after, *position.knowledge[subgoal + 1 :])
         return Position(subgoal, state, knowledge, here)
 
     def essence(self, position: Position) -> Position:
@@ -326,11 +326,12 @@ class _Closure:
         return fails
 
 
-def _relevant_conditions(transitions: np.ndarray, edges: list[tuple[int, int, int]]) -> list[int]:
+def _relevant_conditions(travel: np.ndarray, edges: list[tuple[int, int, int]]) -> list[int]:
     """Per state, the conditions of edges that can still be attempted, as a mask."""
-    count = len(transitions)
-    reach = np.eye(count, dtype=bool)
-    reach[np.arange(count)[:, None], transitions] = True
+    count = travel.shape[1]
+    reach = np.eye(count, dtype=bool) | np.isfinite(travel).any(axis=(0, 2))
+    for source, target, _ in edges:
+        reach[source, target] = True
     for via in range(count):
         reach |= reach[:, [via]] & reach[[via]]
     relevant = [0] * count

@@ -43,44 +43,44 @@ def guess_values(
     sweeps: int,
 ) -> Guess:
     """Guess for every action of one problem; ``success_probability`` and ``success_cost`` are those of the root."""
-    rows = tables.actions
     nodes, states, actions = tables.distance.shape
-    distance = tables.distance.reshape(nodes * states, actions)
-    inside = tables.stays_inside.reshape(nodes * states, actions)
-    possible = success_probability > 0
-    accepting = jnp.broadcast_to(tables.accepting[None], (nodes, states)).reshape(-1)
-    after_success = rows.subgoal * states + rows.to_state
-    after_failure = rows.subgoal * states + jnp.maximum(rows.from_state, 0)
-    dead_end = jnp.broadcast_to(dead_end_cost, (actions,))
+    subgoals, edges = nodes - 1, (actions - 1) // max(nodes - 1, 1)
 
-    def outcomes(leave: Float32[Array, "N"], stay: Float32[Array, "N"], again: Float32[Array, "A"]) -> Guess:
+    def by_subgoal(values: Array) -> Array:
+        return values[:-1].reshape(subgoals, edges)
+
+    rows = tables.actions
+    probability, won, lost = map(by_subgoal, (success_probability, success_cost, rows.failure_cost))
+    source, target = by_subgoal(rows.from_state), by_subgoal(rows.to_state)
+    # A way that begins where it ends is no way: the robot goes on inside.
+    starts = source[:, None, :] == jnp.arange(states, dtype=jnp.int32)[None, :, None]
+    inside = jnp.eye(subgoals, dtype=jnp.bool_)[:, None, :, None] & starts[:, :, None, :]
+    way = jnp.where(inside, jnp.inf, tables.distance[:-1, :, :-1].reshape(subgoals, states, subgoals, edges))
+    # Just after a failure the same attempt is out of the question; elsewhere failures are forgotten.
+    other = ~jnp.eye(edges, dtype=jnp.bool_)[None] & (source[:, :, None] == source[:, None, :])
+    place = jnp.arange(subgoals, dtype=jnp.int32)[:, None]
+
+    def after(leave: Float32[Array, "S Z"], stay: Float32[Array, "S Z"], again: Float32[Array, "S E"]) -> Guess:
         return Guess(
-            success_leave=leave[after_success],
-            success_stay=stay[after_success],
-            failure_leave=leave[after_failure],
+            success_leave=leave[place, target],
+            success_stay=stay[place, target],
+            failure_leave=leave[place, jnp.maximum(source, 0)],
             failure_stay=again,
-            dead_end_cost=dead_end,
+            dead_end_cost=jnp.broadcast_to(dead_end_cost, (subgoals, edges)),
         )
 
-    def attempt(guess: Guess) -> Float32[Array, "A"]:
-        """Expected cost of each action from the subgoal on."""
-        success = success_cost + guess.value(jnp.full((actions,), True), success_cost)
-        failure = rows.failure_cost + guess.value(jnp.full((actions,), False), rows.failure_cost)
-        cost = success_probability * success + (1.0 - success_probability) * failure
-        return jnp.where(possible, cost, jnp.inf)
-
     def sweep(_, guess: Guess) -> Guess:
-        cost = attempt(guess)
-        leave = jnp.min(jnp.where(inside, jnp.inf, distance + cost[None]), axis=1)
-        beyond = jnp.where(inside, cost[None], jnp.inf)
-        stay = jnp.min(beyond, axis=1)
-        index = jnp.arange(actions, dtype=jnp.int32)
-        best = jnp.min(jnp.where(beyond <= stay[:, None], index[None], actions), axis=1)
-        second = jnp.min(jnp.where(index[None] == best[:, None], jnp.inf, beyond), axis=1)
-        # Just after a failure the same attempt is out of the question; elsewhere failures are forgotten.
-        again = jnp.where(best[after_failure] == index, second[after_failure], stay[after_failure])
-        return outcomes(jnp.where(accepting, 0.0, leave), jnp.where(accepting, 0.0, stay), again)
+        flags = jnp.full((subgoals, edges), True)
+        success, failure = won + guess.value(flags, won), lost + guess.value(~flags, lost)
+        cost = probability * success + (1.0 - probability) * failure
+        cost = jnp.where(probability > 0, cost, jnp.inf)
+        elsewhere = jnp.min(way + cost[None, None], axis=(2, 3), initial=jnp.inf)
+        leave = jnp.minimum(elsewhere, tables.distance[:-1, :, -1])
+        stay = jnp.min(jnp.where(starts, cost[:, None, :], jnp.inf), axis=2, initial=jnp.inf)
+        again = jnp.min(jnp.where(other, cost[:, None, :], jnp.inf), axis=2, initial=jnp.inf)
+        return after(jnp.where(tables.accepting[None], 0.0, leave), jnp.where(tables.accepting[None], 0.0, stay), again)
 
-    unknown = jnp.where(accepting, 0.0, jnp.inf)
-    start = outcomes(unknown, unknown, jnp.full((actions,), jnp.inf))
-    return jax.lax.fori_loop(0, sweeps, sweep, start)
+    unknown = jnp.broadcast_to(jnp.where(tables.accepting, 0.0, jnp.inf)[None], (subgoals, states))
+    start = after(unknown, unknown, jnp.full((subgoals, edges), jnp.inf))
+    guess = jax.lax.fori_loop(0, sweeps, sweep, start)
+    return jax.tree.map(lambda values: jnp.append(values.reshape(-1), jnp.float32(0.0)), guess)

@@ -74,14 +74,17 @@ class ActionTerms:
 class ActionRow:
     """What does not depend on the history, per action (leading axis or axes ``*A``).
 
-    ``subgoal``, ``from_state``, ``to_state`` are (S, NO_STATE, an accepting state) for finish. Cubes are sorted by
-    R_S; ``cube_bits`` marks each cube's class in the masks over conditions and is empty for padding.
-    ``forward`` and ``backward`` are the conditions that the action's condition implies and is implied by.
+    ``subgoal``, ``from_state``, ``to_state`` are (S, NO_STATE, an accepting state) for finish; ``from_state`` is
+    NO_STATE too where the action is not real. ``accepts``: success satisfies the task. Cubes are sorted by R_S;
+    ``cube_bits`` marks each cube's class in the masks over conditions and is empty for padding. ``forward`` and
+    ``backward`` are the conditions that the action's condition implies and is implied by; ``end_bits`` marks
+    ``to_state`` in the masks over states.
     """
 
     subgoal: Int32[Array, "*A"]
     from_state: Int32[Array, "*A"]
     to_state: Int32[Array, "*A"]
+    accepts: Bool[Array, "*A"]
     cube_probability: Float32[Array, "*A K"]
     cube_cost: Float32[Array, "*A K"]
     cube_bits: UInt32[Array, "*A K W"]
@@ -96,15 +99,13 @@ class ActionRow:
 class ActionTables:
     """A problem, rearranged by action for search.
 
-    ``actions`` has the leading axis A. ``distance[u, z, a]`` is the travel of action ``a`` from node ``u`` in state
-    ``z`` without what is owed: 0 where ``stays_inside`` (same subgoal, same state), inf where the action is not real.
-    ``backward`` lists for each condition those that imply it; ``cubes`` the classes of each of the Q conditions of
-    several cubes, which are the last Q of the M.
+    ``actions`` has the leading axis A. ``distance[u, z, a]`` is the way of action ``a`` from node ``u`` in state ``z``,
+    inf where the action is not real. ``backward`` lists for each condition those that imply it; ``cubes`` the classes
+    of each of the Q conditions of several cubes, which are the last Q of the M.
     """
 
     actions: ActionRow
     distance: Float32[Array, "*B S1 Z A"]
-    stays_inside: Bool[Array, "*B S1 Z A"]
     accepting: Bool[Array, "*B Z"]
     backward: UInt32[Array, "*B M W"]
     cubes: UInt32[Array, "*B Q W"]
@@ -170,23 +171,11 @@ def action_tables(problem: PlanningProblem) -> ActionTables:
         task.condition_classes[:, :, None] == jnp.arange(condition_bits.shape[0], dtype=jnp.int32)[None, None, :],
         axis=1,
     )
-    distance = _with_finish(
-        jnp.where(
-            problem.subgoal_mask[None, None, :, None] & task.edge_mask[None, None, None, :],
-            problem.travel[..., task.edges[:, 0]],
-            jnp.inf,
-        ).reshape(subgoals + 1, states, subgoals * edges),
-        problem.finish,
-    )
-    rows = _action_rows(problem, condition_bits)
-    node, state = jnp.arange(subgoals + 1)[:, None, None], jnp.arange(states)[None, :, None]
-    inside = (rows.subgoal[None, None, :] == node) & (rows.from_state[None, None, :] == state)
-    real = _with_finish((problem.subgoal_mask[:, None] & task.edge_mask[None, :]).reshape(-1), jnp.array(False))
-    inside = inside & real[None, None, :]
+    real = problem.subgoal_mask[:, None] & task.edge_mask[None, :]
+    travel = jnp.where(real[None, None], problem.travel[..., task.edges[:, 0]], jnp.inf)
     return ActionTables(
-        actions=rows,
-        distance=jnp.where(inside, 0.0, distance),
-        stays_inside=inside,
+        actions=_action_rows(problem, condition_bits),
+        distance=_with_finish(travel.reshape(subgoals + 1, states, subgoals * edges), problem.finish),
         accepting=task.accepting & task.state_mask,
         backward=pack_bits(task.implies.T),
         cubes=pack_bits(cubes)[classes:],
@@ -201,9 +190,7 @@ def terms_of_all(tables: ActionTables, history: History) -> ActionTerms:
         _per_action(words, rows.subgoal.shape[0]) for words in (history.holds, history.fails, history.visited[:-1])
     )
     probability, success_cost, certain = knowledge_terms(rows, holds, fails)
-    base = tables.distance[history.place, history.state]
-    inside = tables.stays_inside[history.place, history.state]
-    distance = jnp.where(inside, 0.0, base + history.owed)
+    distance = distance_of(rows, history, tables.distance[history.place, history.state])
     leads_back = certain & _overlaps(visited, rows.end_bits)
     live = ~tables.accepting[history.state]
     return ActionTerms(
@@ -214,6 +201,12 @@ def terms_of_all(tables: ActionTables, history: History) -> ActionTerms:
         certain=certain,
         available=jnp.isfinite(distance) & (probability > 0) & ~leads_back & live,
     )
+
+
+def distance_of(rows: ActionRow, history: History, way: Float32[Array, "*A"]) -> Float32[Array, "*A"]:
+    """D: the way and what is owed; nothing for going on beyond the same subgoal in the same state (MODEL.md 5)."""
+    inside = (rows.subgoal == history.place) & (rows.from_state == history.state)
+    return jnp.where(inside, 0.0, way + history.owed)
 
 
 def knowledge_terms(
@@ -334,11 +327,14 @@ def _action_rows(problem: PlanningProblem, condition_bits: UInt32[Array, "M W"])
     accepting_state = jnp.argmax(task.accepting & task.state_mask).astype(jnp.int32)
     finish_cubes = jnp.arange(cubes) == 0
     to_state = by_edge(states_of_edges[1], accepting_state)
+    real_action = problem.subgoal_mask[:, None] & task.edge_mask[None, :]
+    from_state = jnp.where(real_action, states_of_edges[0][None], NO_STATE)
     node = jnp.broadcast_to(jnp.arange(subgoals, dtype=jnp.int32)[:, None], (subgoals, edges))
     return ActionRow(
         subgoal=by_action(node, jnp.int32(subgoals)),
-        from_state=by_edge(states_of_edges[0], jnp.int32(NO_STATE)),
+        from_state=by_action(from_state, jnp.int32(NO_STATE)),
         to_state=to_state,
+        accepts=(task.accepting & task.state_mask)[to_state],
         cube_probability=by_action(probability, finish_cubes.astype(jnp.float32)),
         cube_cost=by_action(cost, jnp.where(finish_cubes, 0.0, jnp.inf)),
         cube_bits=by_action(cube_bits, jnp.zeros((cubes, words), jnp.uint32)),

@@ -20,13 +20,15 @@ References:
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float32, Int32, PRNGKeyArray, UInt32
+from jaxtyping import Array, Bool, Float32, Int32, PRNGKeyArray, Shaped, UInt32
 
 from potlp_jax.planning.heuristic import Guess, guess_values
 from potlp_jax.planning.history import (
@@ -35,9 +37,12 @@ from potlp_jax.planning.history import (
     ActionTerms,
     History,
     action_tables,
+    action_terms,
+    distance_of,
     initial_history,
     knowledge_of,
     knowledge_terms,
+    step,
     step_row,
     terms_of_all,
 )
@@ -53,7 +58,8 @@ class SearchConfig:
       simulations: descents per search; each adds at most one node.
       exploration: weight of the exploration term in units of the root's guessed value, so that the unit of cost does
         not matter: the descent takes the least ``Q - exploration * V_root * sqrt(log(n) / (1 + n_a))``.
-      max_depth: actions per descent; a longer one is cut, valued by what is known of its last node, and flagged.
+      max_depth: actions per descent; one that gets there is cut, valued by what is known of its last node, and
+        flagged.
       tree_capacity: nodes per tree, at least 1; None for one more than simulations. A full tree is flagged.
       guess_sweeps: attempts that the guess at untried outcomes looks ahead.
     """
@@ -217,10 +223,12 @@ class _Descent:
 
 @struct.dataclass(kw_only=True)
 class _Context:
-    """What stays the same during a search; ``scale`` is the weight of exploration in units of cost."""
+    """What stays the same during a search; ``scale`` is the weight of exploration in units of cost, ``packed`` holds
+    what a descent needs to know of an action in one row (``_pack_rows``)."""
 
     tables: ActionTables
     guess: Guess
+    packed: UInt32[Array, "*B A n"]
     root: History
     dead_end_cost: Float32[Array, "*B"]
     scale: Float32[Array, "*B"]
@@ -234,7 +242,7 @@ def _search_batch(
     """The search; ``leaves`` are those of a problem, with a leading batch axis."""
     prepare = jax.vmap(functools.partial(_prepare, structure, sweeps=config.guess_sweeps))
     context, q_values, values = prepare(leaves, seeds)
-    context = context.replace(scale=jnp.float32(config.exploration) * values)
+    context = dataclasses.replace(context, scale=jnp.float32(config.exploration) * values)
 
     def simulate(index, tree):
         descent = _descend(context, tree, index, config)
@@ -257,6 +265,7 @@ def _prepare(
     context = _Context(
         tables=tables,
         guess=guess,
+        packed=_pack_rows((tables.actions, guess)),
         root=root,
         dead_end_cost=problem.dead_end_cost,
         scale=problem.dead_end_cost,
@@ -305,22 +314,22 @@ def _descend(context: _Context, tree: Tree, simulation: Int32[Array, ""], config
     def descend(descent: _Descent) -> _Descent:
         node, history = descent.node, descent.history
         q_values, visits = tree.q_values[rows, node], tree.visits[rows, node]
-        total = jnp.sum(visits, axis=1, dtype=jnp.int32) + 1
+        total = _fold(jnp.add, visits, 0) + 1
         width = context.scale * jnp.sqrt(jnp.log(total.astype(jnp.float32)))
         bound = q_values - width[:, None] * jax.lax.rsqrt((visits + 1).astype(jnp.float32))
-        least = jnp.min(bound, axis=1)
+        least = _fold(jnp.minimum, bound, jnp.inf)
         # Minimum, then the first index that attains it: faster than argmin, and ties go to the lowest index.
-        action = jnp.min(jnp.where(bound <= least[:, None], action_index, actions - 1), axis=1)
+        action = _fold(jnp.minimum, jnp.where(bound <= least[:, None], action_index, actions - 1), actions - 1)
         moves = descent.active & ~jnp.isinf(least)
-        others = jnp.min(jnp.where(action_index == action[:, None], jnp.inf, q_values), axis=1)
+        others = _fold(jnp.minimum, jnp.where(action_index == action[:, None], jnp.inf, q_values), jnp.inf)
 
-        row, guess = _rows_of(tables.actions, action), _rows_of(context.guess, action)
+        row, guess = _unpack_rows(context.packed[rows, action], (tables.actions, context.guess))
         probability, success_cost, distance = jax.vmap(_terms_of_one)(tables, row, history, action)
         success = _uniform(context.seeds, simulation, descent.level) < probability
-        accepted = jnp.take_along_axis(tables.accepting, row.to_state[:, None], axis=1)[:, 0]
-
         branch = 2 * action + success.astype(jnp.int32)
-        child, sibling = tree.children[rows, node, branch], tree.children[rows, node, branch ^ 1]
+        outcomes = tree.children.reshape(batch, capacity, actions, 2)[rows, node, action]
+        child = jnp.where(success, outcomes[:, 1], outcomes[:, 0])
+        sibling = jnp.where(success, outcomes[:, 0], outcomes[:, 1])
         guessed = guess.value(~success, jnp.where(success, row.failure_cost, success_cost))
         known = tree.values[rows, jnp.maximum(sibling, 0)]
         other_value = jnp.where(sibling == Tree.UNVISITED, guessed, known)
@@ -329,7 +338,7 @@ def _descend(context: _Context, tree: Tree, simulation: Int32[Array, ""], config
         cost = jnp.where(success, success_cost, row.failure_cost)
         base = distance + ((1.0 - weight) * other_cost + weight * cost)
 
-        finished = moves & success & accepted
+        finished = moves & success & row.accepts
         expands = moves & ~finished & (child == Tree.UNVISITED)
         goes_deeper = moves & ~finished & ~expands
         ended = descent.active & ~moves
@@ -375,9 +384,8 @@ def _terms_of_one(
     """P_S, R_S and D of one available action of one row."""
     holds, fails = knowledge_of(row.subgoal, history)
     probability, success_cost, _ = knowledge_terms(row, holds, fails)
-    travel = tables.distance[history.place, history.state, action]
-    inside = tables.stays_inside[history.place, history.state, action]
-    return probability, success_cost, jnp.where(inside, 0.0, travel + history.owed)
+    way = tables.distance[history.place, history.state, action]
+    return probability, success_cost, distance_of(row, history, way)
 
 
 def _expand(context: _Context, tree: Tree, descent: _Descent) -> tuple[Tree, Float32[Array, "B"]]:
@@ -391,14 +399,15 @@ def _expand(context: _Context, tree: Tree, descent: _Descent) -> tuple[Tree, Flo
     node = jnp.where(expands & has_room, tree.size, capacity)
     leaf_value = jnp.where(expands, values, jnp.where(cut, tree.values[rows, descent.node], descent.leaf_value))
     parent = jnp.where(has_room, descent.parent, capacity)
-    tree = tree.replace(
+    tree = dataclasses.replace(
+        tree,
         q_values=tree.q_values.at[rows, node].set(q_values, mode="drop", unique_indices=True),
         values=tree.values.at[rows, node].set(values, mode="drop", unique_indices=True),
         children=tree.children.at[rows, parent, descent.branch].set(tree.size, mode="drop", unique_indices=True),
         size=tree.size + (expands & has_room).astype(jnp.int32),
         status=tree.status
-        | status_if(expands & ~has_room, Status.TREE_OVERFLOW)
-        | status_if(cut, Status.DEPTH_OVERFLOW),
+        | _status_of_rows(expands & ~has_room, Status.TREE_OVERFLOW)
+        | _status_of_rows(cut, Status.DEPTH_OVERFLOW),
     )
     return tree, leaf_value
 
@@ -414,7 +423,8 @@ def _back_up(tree: Tree, descent: _Descent, leaf_value: Float32[Array, "B"]) -> 
         taken = node < capacity
         q_value = descent.base[level] + descent.weight[level] * value
         value = jnp.where(taken, jnp.minimum(descent.others[level], q_value), value)
-        tree = tree.replace(
+        tree = dataclasses.replace(
+            tree,
             q_values=tree.q_values.at[rows, node, action].set(q_value, mode="drop", unique_indices=True),
             visits=tree.visits.at[rows, node, action].set(descent.counts[level] + 1, mode="drop", unique_indices=True),
             values=tree.values.at[rows, node].set(value, mode="drop", unique_indices=True),
@@ -432,7 +442,8 @@ def _plan(context: _Context, tree: Tree) -> Plan:
     available = jnp.isfinite(least)
     action = jnp.min(jnp.where(q_values <= least[:, None], index, finish), axis=1)
     attempts = available & (action != finish)
-    row = _rows_of(context.tables.actions, action)
+    batch = jnp.arange(action.shape[0], dtype=jnp.int32)
+    row, _ = _unpack_rows(context.packed[batch, action], (context.tables.actions, context.guess))
     accepted = jnp.take_along_axis(context.tables.accepting, context.root.state[:, None], axis=1)[:, 0]
     return Plan(
         action=jnp.where(available, action, NO_ACTION),
@@ -443,15 +454,31 @@ def _plan(context: _Context, tree: Tree) -> Plan:
         q_values=q_values,
         visits=tree.visits[:, Tree.ROOT],
         status=tree.status
-        | status_if(accepted, Status.ACCEPTING_ROOT)
-        | status_if(~available & ~accepted, Status.DEAD_END),
+        | _status_of_rows(accepted, Status.ACCEPTING_ROOT)
+        | _status_of_rows(~available & ~accepted, Status.DEAD_END),
     )
 
 
-def _rows_of(tables: _PerAction, action: Int32[Array, "B"]) -> _PerAction:
-    """The row of each batch entry's action."""
-    batch = jnp.arange(action.shape[0], dtype=jnp.int32)
-    return jax.tree.map(lambda leaf: leaf[batch, action], tables)
+def _pack_rows(rows: Any) -> UInt32[Array, "A n"]:
+    """All that a pytree of per-action arrays says of an action, as one row of bits: one lookup instead of many."""
+    columns = []
+    for leaf in jax.tree.leaves(rows):
+        values = leaf.astype(jnp.uint32) if leaf.dtype == jnp.bool_ else leaf
+        columns.append(jax.lax.bitcast_convert_type(values, jnp.uint32).reshape(leaf.shape[0], -1))
+    return jnp.concatenate(columns, axis=1)
+
+
+def _unpack_rows(packed: UInt32[Array, "B n"], like: _PerAction) -> _PerAction:
+    """Inverse of ``_pack_rows`` for one action per batch entry; ``like`` is the batch of what was packed."""
+    leaves, structure = jax.tree.flatten(like)
+    rows, start = [], 0
+    for leaf in leaves:
+        shape = leaf.shape[2:]
+        size = math.prod(shape)
+        bits = packed[:, start : start + size].reshape(-1, *shape)
+        rows.append(bits != 0 if leaf.dtype == jnp.bool_ else jax.lax.bitcast_convert_type(bits, leaf.dtype))
+        start += size
+    return jax.tree.unflatten(structure, rows)
 
 
 def _uniform(seeds: UInt32[Array, "B 2"], simulation: Int32[Array, ""], level: Int32[Array, ""]) -> Float32[Array, "B"]:
@@ -468,6 +495,110 @@ def _mix(bits: UInt32[Array, "B"]) -> UInt32[Array, "B"]:
     return bits ^ (bits >> 16)
 
 
+def _status_of_rows(flags: Bool[Array, "B"], status: Status) -> UInt32[Array, "B"]:
+    return jax.vmap(lambda flag: status_if(flag, status))(flags)
+
+
+def _fold(
+    operation: Callable[[Array, Array], Array], values: Shaped[Array, "B A"], neutral: int | float
+) -> Shaped[Array, "B"]:
+    """Reduce over actions. Slices are combined first: on CPU XLA vectorises that, but not a reduction of rows."""
+    width = 8 * max(1, -(-values.shape[1] // 128))
+    count = -(-values.shape[1] // width)
+    padded = jnp.pad(values, ((0, 0), (0, count * width - values.shape[1])), constant_values=neutral)
+    slices = [padded[:, i * width : (i + 1) * width] for i in range(count)]
+    combined = functools.reduce(operation, slices)
+    columns = [combined[:, i] for i in range(width)]
+    return functools.reduce(operation, columns)
+
+
 def _align(flags: Bool[Array, "B"], like: Array) -> Bool[Array, "B ..."]:
     """Give flags the rank of ``like``."""
     return flags.reshape(flags.shape + (1,) * (like.ndim - 1))
+
+
+def tree_top(problem: PlanningProblem, tree: Tree, *, depth: int = 2, width: int = 4) -> dict[str, Any]:
+    """The best of a searched tree as nested plain values, for pictures and JSON. Host only.
+
+    Args:
+      problem: the unbatched problem that was searched.
+      tree: its tree, unbatched, from ``search_tree``.
+      depth: actions per branch.
+      width: actions per node: those of least Q, ties by index.
+
+    Returns:
+      A node: ``place`` (None at the robot), ``state``, ``value``, ``visits``, ``accepting``, ``dead_end`` and
+      ``actions`` (empty at the last level). An action: ``index``, ``subgoal``, ``from_state``, ``to_state`` (all None
+      for finish), ``q_value``, ``visits``, ``distance`` (D), ``success`` and ``failure``. An outcome (None where it
+      cannot occur): ``probability``, ``cost`` (R_S or R_F), ``value`` and ``node``, both None where not searched.
+    """
+    return _TreeViewer(problem, tree, width).node(Tree.ROOT, initial_history(problem), depth)
+
+
+class _TreeViewer:
+    """Replays histories down a tree on the host."""
+
+    def __init__(self, problem: PlanningProblem, tree: Tree, width: int) -> None:
+        self._problem, self._width = problem, width
+        self._q_values, self._visits = np.asarray(tree.q_values), np.asarray(tree.visits)
+        self._children, self._values = np.asarray(tree.children), np.asarray(tree.values)
+        self._accepting = np.asarray(problem.task.accepting)
+
+    def node(self, index: int, history: History, depth: int) -> dict[str, Any]:
+        """A node of the tree with the branches below it."""
+        q_values, visits = self._q_values[index], self._visits[index]
+        order = [int(a) for a in np.argsort(q_values, kind="stable")[: self._width] if np.isfinite(q_values[a])]
+        terms = _action_terms(self._problem, history)
+        actions = [self._action(index, action, terms, history, depth) for action in order] if depth > 0 else []
+        accepting = bool(self._accepting[int(history.state)])
+        return {
+            **self._where(history),
+            "value": float(self._values[index]),
+            "visits": int(visits.sum()),
+            "accepting": accepting,
+            "dead_end": not accepting and bool(np.isinf(q_values).all()),
+            "actions": actions,
+        }
+
+    def _where(self, history: History) -> dict[str, Any]:
+        place = int(history.place)
+        return {"place": None if place == self._problem.subgoal_count else place, "state": int(history.state)}
+
+    def _action(self, index: int, action: int, terms: ActionTerms, history: History, depth: int) -> dict[str, Any]:
+        finish = action == self._problem.action_count - 1
+        subgoal, edge = divmod(action, max(self._problem.edge_count, 1))
+        ends = [None, None] if finish else np.asarray(self._problem.task.edges)[edge].tolist()
+        probability = float(terms.success_probability[action])
+        costs = {True: float(terms.success_cost[action]), False: float(terms.failure_cost[action])}
+        chances = {True: probability, False: 1.0 - probability}
+
+        def outcome(success: bool) -> dict[str, Any] | None:
+            if chances[success] == 0.0:
+                return None
+            found = self._outcome(index, action, success, history, depth)
+            return {"probability": chances[success], "cost": costs[success], **found}
+
+        return {
+            "index": action,
+            "subgoal": None if finish else subgoal,
+            "from_state": ends[0],
+            "to_state": ends[1],
+            "q_value": float(self._q_values[index, action]),
+            "visits": int(self._visits[index, action]),
+            "distance": float(terms.distance[action]),
+            "success": outcome(True),
+            "failure": outcome(False),
+        }
+
+    def _outcome(self, index: int, action: int, success: bool, history: History, depth: int) -> dict[str, Any]:
+        after = _step(self._problem, history, jnp.int32(action), jnp.asarray(success))
+        if self._accepting[int(after.state)]:
+            satisfied = {"value": 0.0, "visits": 0, "accepting": True, "dead_end": False, "actions": []}
+            return {"value": 0.0, "node": {**self._where(after), **satisfied}}
+        child = int(self._children[index, 2 * action + success])
+        if child == Tree.UNVISITED:
+            return {"value": None, "node": None}
+        return {"value": float(self._values[child]), "node": self.node(child, after, depth - 1)}
+
+
+_action_terms, _step = jax.jit(action_terms), jax.jit(step)

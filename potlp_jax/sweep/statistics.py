@@ -22,7 +22,11 @@ KNOWN_MAP = "known-map"
 SATISFIED = "satisfied"
 
 LOSSES: Status = Status.SUBGOAL_OVERFLOW | Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW | Status.NOT_CONVERGED
-"""Status bits by which a fixed-size array or loop took something away from a trial; they are counted apart."""
+"""Status bits by which a fixed-size array or loop took something away from a trial; they are counted."""
+
+UNRELIABLE: Status = Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW | Status.NOT_CONVERGED
+"""Losses after which a trial is not what its planner would have done. It is never averaged in. (That only the nearest
+subgoals are kept is part of the model, MODEL.md section 6.)"""
 
 CONFIDENCE: float = 0.95
 RESAMPLES: int = 9_999
@@ -70,7 +74,7 @@ class Table:
 class Comparison:
     """The paired comparison.
 
-    ``satisfied`` has the worlds in which every policy ended satisfied and none lost anything to a bound of its arrays;
+    ``satisfied`` has the worlds in which every policy ended satisfied, without an ``UNRELIABLE`` bit;
     ``charged`` has all worlds, with a trial that did not end satisfied charged its budget. ``outcomes`` counts the
     ends of trials per policy, ``losses`` the trials per policy and status bit of ``LOSSES``.
     """
@@ -96,7 +100,7 @@ class Comparison:
             policy: np.array([trial.outcome == SATISFIED for trial in trials], bool)
             for policy, trials in results.items()
         }
-        lost = [np.array([trial.status & LOSSES != 0 for trial in trials], bool) for trials in results.values()]
+        lost = [np.array([trial.status & UNRELIABLE != 0 for trial in trials], bool) for trials in results.values()]
         kept = np.all(list(ended.values()), axis=0) & ~np.any(lost, axis=0)
         charged = {policy: np.where(ended[policy], costs[policy], budgets[policy]) for policy in results}
         return cls(

@@ -33,7 +33,7 @@ class SensorConfig:
         range_cells: how far it sees, Euclidean, in cells. Its cost grows with the range times the grid's longer side.
     """
 
-    range_cells: float = 110.0
+    range_cells: float = 104.0
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.range_cells) and self.range_cells >= 0):

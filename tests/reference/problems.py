@@ -29,8 +29,11 @@ def task_of(formula, max_positive_literals=None):
     return Task.from_formula(formula, max_positive_literals=max_positive_literals)
 
 
-def random_fields(task, subgoals, seed, finish_chance=0.2, unreachable=0.3):
-    """The fields of a problem over the task's unpadded arrays, as NumPy arrays."""
+def random_fields(task, subgoals, seed, finish_chance=0.2, unreachable=0.3, backward=False):
+    """The fields of a problem over the task's unpadded arrays, as NumPy arrays.
+
+    Ways lead to states that the automaton can reach; with ``backward`` to any.
+    """
     rng = np.random.default_rng(seed)
     states, classes = task.sizes.states, task.sizes.classes
     live = np.flatnonzero(~task.dfa.accepting & ~task.dfa.trap)
@@ -39,16 +42,29 @@ def random_fields(task, subgoals, seed, finish_chance=0.2, unreachable=0.3):
         values = rng.uniform(1.0, 60.0, shape)
         return np.where(rng.random(shape) < chance_of_none, np.inf, values)
 
+    travel = costs((subgoals + 1, states, subgoals, states), unreachable)
+    if not backward:
+        travel[:, ~reachable_states(task)[:, None, :].repeat(subgoals, axis=1)] = np.inf
     return {
-        "travel": costs((subgoals + 1, states, subgoals, states), unreachable),
+        "travel": travel,
         "finish": costs((subgoals + 1, states), 1.0 - finish_chance) * 4.0,
         "success_probability": rng.choice([0.0, 0.3, 0.5, 0.8, 1.0], (subgoals, classes), p=[0.1, 0.3, 0.3, 0.2, 0.1]),
         "success_cost": rng.uniform(1.0, 40.0, (subgoals, classes)),
         "failure_cost": rng.uniform(0.0, 40.0, (subgoals, classes)),
-        "dfa_state": int(rng.choice(live)),
+        "dfa_state": int(live[0] if rng.random() < 0.7 else rng.choice(live)),
         "subgoal_mask": np.ones(subgoals, bool),
         "dead_end_cost": 300.0,
     }
+
+
+def reachable_states(task):
+    """``[z, z']``: some word leads from z to z'."""
+    states = task.sizes.states
+    reach = np.eye(states, dtype=bool)
+    for _ in range(states):
+        for letter in range(task.dfa.transitions.shape[1]):
+            reach |= reach[task.dfa.transitions[:, letter]]
+    return reach
 
 
 def problem_of(task, fields):

@@ -1,0 +1,145 @@
+"""The top of a searched tree as a picture, from the nested values of ``potlp_jax.planning.pouct.tree_top``."""
+
+import dataclasses
+import math
+import textwrap
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from potlp_jax.view.style import CHOSEN, FAINT, INK, new_figure
+
+LEVEL_INCHES: float = 2.35
+ROW_INCHES: float = 0.62
+BOX_WIDTH: float = 0.8
+BOX_HEIGHT: float = 0.82
+"""Of a box, as shares of the distances between levels and rows."""
+
+KEY = (
+    "solid: success, dashed: failure; coloured: least expected cost, followed further\n"
+    "P: probability of the outcome, Q: expected cost of the action, n: simulations, D: distance, R: cost of the outcome"
+)
+
+
+@dataclasses.dataclass
+class _Box:
+    """One outcome of one action (at the root: where the search began)."""
+
+    text: str
+    best: bool
+    success: bool = True
+    share: float = 1.0
+    children: list["_Box"] = dataclasses.field(default_factory=list)
+    level: int = 0
+    height: float = 0.0
+
+
+def draw_tree(tree: Mapping[str, Any], title: str | None = None, *, breadth: int = 3) -> Figure:
+    """The tree from left to right: up to ``breadth`` actions of a node, each with its outcomes, the best followed.
+
+    The width of a line follows the share of simulations that it stands for.
+    """
+    text = f"robot in state {tree['state']}\nV {_number(tree['value'])}  n {tree['visits']}"
+    root = _Box(text, best=True, children=_children(tree, breadth, tree["visits"]))
+    rows = _arrange(root, level=0, row=0.0)
+    boxes = list(_walk(root))
+    width = max(7.0, 0.3 + LEVEL_INCHES * (1 + max(box.level for box in boxes)))
+    heading = textwrap.wrap(title, int(width / 0.09)) if title else []
+    top, bottom = 1.0 + 0.34 * len(heading), max(rows, 2.0) + 0.15
+    figure = new_figure(width, ROW_INCHES * (top + bottom))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set(xlim=(-0.1, (width - 0.3) / LEVEL_INCHES), ylim=(bottom, -top))
+    axes.axis("off")
+    for box in boxes:
+        for child in box.children:
+            _draw_branch(axes, box, child)
+        _draw_box(axes, box)
+    for line, part in enumerate(heading):
+        axes.text(-0.03, -top + 0.3 + 0.34 * line, part, size=10, weight="bold", va="center", color=INK)
+    axes.text(-0.03, -0.45, KEY, size=8, va="center", color="#6E6E6E")
+    return figure
+
+
+def _children(node: Mapping[str, Any], breadth: int, simulations: int) -> list[_Box]:
+    """Both outcomes of a node's first actions; only those of the best action are followed."""
+    boxes = []
+    for rank, action in enumerate(node["actions"][:breadth]):
+        for name in ("success", "failure"):
+            outcome = action[name]
+            if outcome is None:
+                continue
+            below = outcome["node"] if rank == 0 else None
+            boxes.append(
+                _Box(
+                    _outcome_text(action, outcome, name == "success"),
+                    best=rank == 0,
+                    success=name == "success",
+                    share=outcome["probability"] * action["visits"] / max(simulations, 1),
+                    children=[] if below is None else _children(below, breadth, simulations),
+                )
+            )
+    return boxes
+
+
+def _outcome_text(action: Mapping[str, Any], outcome: Mapping[str, Any], success: bool) -> str:
+    finish = action["subgoal"] is None
+    name = "finish" if finish else f"s{action['subgoal']}: {action['from_state']}→{action['to_state']}"
+    head = name if finish else f"{name} {'succeeds' if success else 'fails'}  P {outcome['probability']:.2f}"
+    figures = f"Q {_number(action['q_value'])}  n {action['visits']}  D {_number(action['distance'])}"
+    return f"{head}\n{figures}\nR {_number(outcome['cost'])}, then {_then(outcome)}"
+
+
+def _then(outcome: Mapping[str, Any]) -> str:
+    node = outcome["node"]
+    if node is not None and node["accepting"]:
+        return "done"
+    if outcome["value"] is None:
+        return "not tried"
+    return "a dead end" if node is not None and node["dead_end"] else _number(outcome["value"])
+
+
+def _arrange(box: _Box, level: int, row: float) -> float:
+    """Places: leaves one below the other, a box beside the middle of its children. Returns the next free row."""
+    box.level = level
+    if not box.children:
+        box.height = row + 0.5
+        return row + 1
+    for child in box.children:
+        row = _arrange(child, level + 1, row)
+    box.height = (box.children[0].height + box.children[-1].height) / 2
+    return row
+
+
+def _walk(box: _Box) -> Iterator[_Box]:
+    yield box
+    for child in box.children:
+        yield from _walk(child)
+
+
+def _draw_branch(axes: Axes, parent: _Box, child: _Box) -> None:
+    start, end = parent.level + BOX_WIDTH, child.level
+    axes.plot(
+        [start, start + 0.05, end - 0.05, end],
+        [parent.height, parent.height, child.height, child.height],
+        color=CHOSEN if child.best else FAINT,
+        linewidth=0.7 + 4.0 * math.sqrt(child.share),
+        linestyle="solid" if child.success else (0, (3, 1.5)),
+        solid_capstyle="butt",
+        zorder=2 if child.best else 1,
+    )
+
+
+def _draw_box(axes: Axes, box: _Box) -> None:
+    colour, line = (CHOSEN, 1.4) if box.best else (FAINT, 0.8)
+    corner = (box.level, box.height - BOX_HEIGHT / 2)
+    axes.add_patch(
+        Rectangle(corner, BOX_WIDTH, BOX_HEIGHT, facecolor="white", edgecolor=colour, linewidth=line, zorder=3)
+    )
+    axes.text(box.level + 0.02, box.height, box.text, size=7.5, va="center", linespacing=1.3, color=INK, zorder=4)
+
+
+def _number(value: float) -> str:
+    return f"{value:.1f}" if math.isfinite(value) else "∞"
