@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from potlp_jax.planning.exact import solve_exact
-from potlp_jax.planning.pouct import SearchConfig, Tree, plan_actions, search_tree, tree_top
+from potlp_jax.planning.pouct import SearchConfig, Tree, plan_actions, search, search_tree, tree_top
 from potlp_jax.task.task import TaskSizes
 from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL, Status
 from tests.reference.planning import FINISH, ReferenceProblem, dictionary_pouct
@@ -142,6 +142,11 @@ def test_vmap_equals_loop(problems, plans):
         assert_same_plans(alone, jax.tree.map(lambda leaf, i=i: leaf[i], plans))
 
 
+def test_batched_search_equals_vmap(problems, plans):
+    batch, _ = search(jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems), keys(len(problems)), SearchConfig())
+    assert_same_plans(batch, plans)
+
+
 def test_nested_vmap_and_scan_equal_loop():
     problem = shared_shape("F a & F b", 3)
     grid = keys(6).reshape(2, 3)
@@ -249,7 +254,10 @@ def test_ties_go_to_the_lowest_index():
 
 
 def test_full_tree_and_deep_descent_are_flagged():
-    problem = shared_shape("F((a | b) & X(b | c))", 0, unreachable=0.0)
+    task = task_of("F a & F b")
+    fields = random_fields(task, 2, 0, unreachable=0.0, finish_chance=0.0)
+    fields |= {"dfa_state": 0, "success_probability": np.full((2, 5), 0.5)}
+    problem = padded_problem(task, fields, SIZES, SUBGOALS)
     config = SearchConfig(simulations=64, tree_capacity=2, max_depth=1)
     plan, tree = tree_jit(problem, jax.random.key(0), config=config)
     assert int(plan.status) == Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW

@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float32, Int32, PRNGKeyArray, Shaped, UInt32
+from jaxtyping import Array, Bool, Float32, Int32, Key, PRNGKeyArray, Shaped, UInt32
 
 from potlp_jax.planning.heuristic import Guess, guess_values
 from potlp_jax.planning.history import (
@@ -153,7 +153,9 @@ def search_tree(
     return _as_result([array[0] for array in arrays])
 
 
-def search(problems: PlanningProblem, keys: PRNGKeyArray, config: SearchConfig = SearchConfig()) -> tuple[Plan, Tree]:
+def search(
+    problems: PlanningProblem, keys: Key[Array, "B"], config: SearchConfig = SearchConfig()
+) -> tuple[Plan, Tree]:
     """``search_tree`` for a batch: every leaf of ``problems``, and ``keys``, has the same leading axis B."""
     leaves, structure = jax.tree.flatten(problems)
     return _as_result(_lockstep(structure, config)(jax.vmap(_seed)(keys), *leaves))
@@ -199,7 +201,8 @@ def _lockstep(structure: Any, config: SearchConfig) -> Any:
 
 @struct.dataclass(kw_only=True)
 class _Descent:
-    """One descent of all rows. ``history`` is that of ``node``, or of the leaf to be expanded below it.
+    """One descent of all rows. ``history`` is that of ``node``, or of the leaf to be expanded below it at ``branch`` of
+    ``parent`` (beyond the tree's capacity where none is). ``leaf_value`` is what the tree knows of ``node``.
 
     ``nodes``, ``actions``, ``base``, ``weight``, ``others`` are records per level: after the child's value ``v`` is
     known, ``Q(node, action) = base + weight * v`` and the node's value is the lesser of that and ``others``, the least
@@ -314,25 +317,24 @@ def _descend(context: _Context, tree: Tree, simulation: Int32[Array, ""], config
     def descend(descent: _Descent) -> _Descent:
         node, history = descent.node, descent.history
         q_values, visits = tree.q_values[rows, node], tree.visits[rows, node]
-        total = _fold(jnp.add, visits, 0) + 1
+        total = jnp.sum(_combine(jnp.add, visits, 0), axis=1, dtype=jnp.int32) + 1
         width = context.scale * jnp.sqrt(jnp.log(total.astype(jnp.float32)))
         bound = q_values - width[:, None] * jax.lax.rsqrt((visits + 1).astype(jnp.float32))
-        least = _fold(jnp.minimum, bound, jnp.inf)
+        least = _least_of_each(bound, jnp.inf)
         # Minimum, then the first index that attains it: faster than argmin, and ties go to the lowest index.
-        action = _fold(jnp.minimum, jnp.where(bound <= least[:, None], action_index, actions - 1), actions - 1)
+        action = _least_of_each(jnp.where(bound <= least[:, None], action_index, actions - 1), actions - 1)
         moves = descent.active & ~jnp.isinf(least)
-        others = _fold(jnp.minimum, jnp.where(action_index == action[:, None], jnp.inf, q_values), jnp.inf)
+        others = _least_of_each(jnp.where(action_index == action[:, None], jnp.inf, q_values), jnp.inf)
 
         row, guess = _unpack_rows(context.packed[rows, action], (tables.actions, context.guess))
         probability, success_cost, distance = jax.vmap(_terms_of_one)(tables, row, history, action)
         success = _uniform(context.seeds, simulation, descent.level) < probability
-        branch = 2 * action + success.astype(jnp.int32)
-        outcomes = tree.children.reshape(batch, capacity, actions, 2)[rows, node, action]
-        child = jnp.where(success, outcomes[:, 1], outcomes[:, 0])
-        sibling = jnp.where(success, outcomes[:, 0], outcomes[:, 1])
+        children = tree.children.reshape(batch, capacity, actions, 2)[rows, node, action]
+        values = tree.values[rows[:, None], jnp.maximum(children, 0)]
+        picked, other = success.astype(jnp.int32), 1 - success.astype(jnp.int32)
+        child = children[rows, picked]
         guessed = guess.value(~success, jnp.where(success, row.failure_cost, success_cost))
-        known = tree.values[rows, jnp.maximum(sibling, 0)]
-        other_value = jnp.where(sibling == Tree.UNVISITED, guessed, known)
+        other_value = jnp.where(children[rows, other] == Tree.UNVISITED, guessed, values[rows, other])
         other_cost = jnp.where(success, row.failure_cost, success_cost) + other_value
         weight = jnp.where(success, probability, 1.0 - probability)
         cost = jnp.where(success, success_cost, row.failure_cost)
@@ -341,16 +343,15 @@ def _descend(context: _Context, tree: Tree, simulation: Int32[Array, ""], config
         finished = moves & success & row.accepts
         expands = moves & ~finished & (child == Tree.UNVISITED)
         goes_deeper = moves & ~finished & ~expands
-        ended = descent.active & ~moves
         advanced = jax.vmap(step_row)(tables, row, history, success)
         return _Descent(
             level=descent.level + 1,
             active=goes_deeper,
             node=jnp.where(goes_deeper, child, node),
             history=jax.tree.map(lambda new, old: jnp.where(_align(moves, new), new, old), advanced, history),
-            leaf_value=jnp.where(finished, 0.0, jnp.where(ended, tree.values[rows, node], descent.leaf_value)),
+            leaf_value=jnp.where(finished, 0.0, jnp.where(goes_deeper, values[rows, picked], descent.leaf_value)),
             parent=jnp.where(expands, node, descent.parent),
-            branch=jnp.where(expands, branch, descent.branch),
+            branch=jnp.where(expands, 2 * action + picked, descent.branch),
             nodes=descent.nodes.at[descent.level].set(jnp.where(moves, node, capacity)),
             actions=descent.actions.at[descent.level].set(action),
             counts=descent.counts.at[descent.level].set(jnp.take_along_axis(visits, action[:, None], axis=1)[:, 0]),
@@ -365,7 +366,7 @@ def _descend(context: _Context, tree: Tree, simulation: Int32[Array, ""], config
         active=jnp.full((batch,), True),
         node=jnp.full((batch,), Tree.ROOT, jnp.int32),
         history=context.root,
-        leaf_value=jnp.zeros((batch,), jnp.float32),
+        leaf_value=tree.values[:, Tree.ROOT],
         parent=jnp.full((batch,), capacity, jnp.int32),
         branch=jnp.zeros((batch,), jnp.int32),
         nodes=jnp.full((depth, batch), capacity, jnp.int32),
@@ -397,7 +398,7 @@ def _expand(context: _Context, tree: Tree, descent: _Descent) -> tuple[Tree, Flo
     expands, cut = descent.parent < capacity, descent.active
     has_room = tree.size < capacity
     node = jnp.where(expands & has_room, tree.size, capacity)
-    leaf_value = jnp.where(expands, values, jnp.where(cut, tree.values[rows, descent.node], descent.leaf_value))
+    leaf_value = jnp.where(expands, values, descent.leaf_value)
     parent = jnp.where(has_room, descent.parent, capacity)
     tree = dataclasses.replace(
         tree,
@@ -499,17 +500,19 @@ def _status_of_rows(flags: Bool[Array, "B"], status: Status) -> UInt32[Array, "B
     return jax.vmap(lambda flag: status_if(flag, status))(flags)
 
 
-def _fold(
+def _least_of_each(values: Shaped[Array, "B A"], worst: int | float) -> Shaped[Array, "B"]:
+    """Minimum over actions; ``worst`` is not less than any value."""
+    return jnp.min(_combine(jnp.minimum, values, worst), axis=1)
+
+
+def _combine(
     operation: Callable[[Array, Array], Array], values: Shaped[Array, "B A"], neutral: int | float
-) -> Shaped[Array, "B"]:
-    """Reduce over actions. Slices are combined first: on CPU XLA vectorises that, but not a reduction of rows."""
+) -> Shaped[Array, "B w"]:
+    """Reduce over actions up to a few columns, slice by slice: on CPU XLA vectorises that, but not whole rows."""
     width = 8 * max(1, -(-values.shape[1] // 128))
     count = -(-values.shape[1] // width)
     padded = jnp.pad(values, ((0, 0), (0, count * width - values.shape[1])), constant_values=neutral)
-    slices = [padded[:, i * width : (i + 1) * width] for i in range(count)]
-    combined = functools.reduce(operation, slices)
-    columns = [combined[:, i] for i in range(width)]
-    return functools.reduce(operation, columns)
+    return functools.reduce(operation, [padded[:, i * width : (i + 1) * width] for i in range(count)])
 
 
 def _align(flags: Bool[Array, "B"], like: Array) -> Bool[Array, "B ..."]:
