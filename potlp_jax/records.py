@@ -46,7 +46,11 @@ class Outcome(StrEnum):
 
 @dataclasses.dataclass(frozen=True)
 class ActionRecord:
-    """One available action of a decision. ``subgoal`` is None for the finish action; costs in units of resolution."""
+    """One available action of a decision; costs are in units of the resolution.
+
+    ``index`` is that of ``Plan`` for the task's own arrays, ``s * E + e``, however the trial padded them; ``subgoal``
+    is None for the finish action.
+    """
 
     index: int
     subgoal: int | None

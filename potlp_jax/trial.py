@@ -277,7 +277,7 @@ def _decision_record(
         state=state,
         key=tuple(int(word) for word in jax.random.key_data(key)),
         kind=_KIND_NAMES[kind],
-        choice=None if int(move.action) == NO_ACTION else int(move.action),
+        choice=None if int(move.action) == NO_ACTION else _unpadded_index(move, int(move.action)),
         target=_cell(move.target_cell) if goes else None,
         target_state=int(move.target_state) if goes else None,
         value=float(move.value),
@@ -287,6 +287,14 @@ def _decision_record(
         actions=_action_records(move),
         path=tuple(_cell(entry) for entry in path),
     )
+
+
+def _unpadded_index(move: Move, action: int) -> int:
+    """Index of an action in the task's own arrays: records do not depend on padded edges."""
+    assert move.search is not None
+    edge_mask = np.asarray(move.search.problem.task.edge_mask)
+    subgoal, edge = divmod(action, len(edge_mask))
+    return subgoal * int(np.sum(edge_mask)) + edge
 
 
 def _action_records(move: Move) -> tuple[ActionRecord, ...]:
@@ -304,7 +312,7 @@ def _action_records(move: Move) -> tuple[ActionRecord, ...]:
         finish = subgoal == len(cells)
         records.append(
             ActionRecord(
-                index=int(index),
+                index=_unpadded_index(move, int(index)),
                 subgoal=None if finish else subgoal,
                 cell=None if finish else _cell(cells[subgoal]),
                 from_state=None if finish else int(edges[edge, 0]),

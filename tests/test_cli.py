@@ -273,6 +273,8 @@ def test_interrupt_has_exit_code_130():
     interrupted = _process(
         "import signal, os, sys\n"
         "import potlp_jax.cli.task as command\n"
+        # A process started in the background inherits that interrupts are ignored.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "command.show_task = lambda *args: os.kill(os.getpid(), signal.SIGINT)\n"
         "sys.argv = ['potlp', 'task', 'F a']\n"
         "from potlp_jax.cli import main\n"

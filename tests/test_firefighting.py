@@ -236,7 +236,7 @@ def test_the_same_key_gives_the_same_world():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"room_height": 40}, "the three hallways need 47 rows, room_height is 40"),
+        ({"room_height": 40}, "the three hallways need 51 rows, room_height is 40"),
         ({"hallway_spacing": 7}, "hallway_spacing must exceed"),
         ({"hallway_width": 0}, "hallway_width"),
         ({"dead_end_fraction": 1.0}, "no room for the closing wall"),
