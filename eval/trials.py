@@ -6,8 +6,8 @@ Suites:
   maps          real ROS maps of POTLP_EXTERNAL_DATA with places drawn at random, 52 trials
   revealed      125 fire-fighting worlds × 4 tasks, every policy on a fully revealed map: exactly the known-map cost
 
-    python -m eval.trials firefighting rooms maps revealed --out out/trials --processes 2
-    python -m eval.trials --report out/trials
+    python -m eval.trials firefighting rooms maps revealed --processes 2
+    python -m eval.trials --report docs/results/trials
 
 Results are appended as JSON lines; the same command again continues where it stopped.
 """
@@ -232,8 +232,8 @@ def _line(policy: str, rows: list[dict[str, Any]]) -> str:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("suites", nargs="*", choices=["firefighting", "rooms", "maps", "revealed"], default=[])
-    parser.add_argument("--out", type=Path, default=Path("out/trials"))
+    parser.add_argument("suites", nargs="*", metavar="SUITE", help="firefighting, rooms, maps or revealed")
+    parser.add_argument("--out", type=Path, default=Path("docs/results/trials"))
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--report", type=Path, metavar="DIR", help="print the figures of a run and stop")
     arguments = parser.parse_args()

@@ -78,6 +78,17 @@ def test_converges_to_the_exact_solution(problems, solutions):
         assert int(plans.status[i]) & (Status.DEAD_END | Status.ACCEPTING_ROOT) == exact.status
 
 
+def test_a_hundred_thousand_simulations_are_exact(problems, solutions):
+    """There is no sampling error to speak of standard errors: what is left is rounding."""
+    config = SearchConfig(simulations=100_000, exploration=0.5, tree_capacity=20_000)
+    for problem, exact in list(zip(problems, solutions, strict=True))[:3]:
+        plan = plan_jit(problem, jax.random.key(0), config=config)
+        assert not int(plan.status) & (Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW)
+        np.testing.assert_allclose(plan.value, exact.value, rtol=1e-5)
+        if int(plan.action) != NO_ACTION:
+            np.testing.assert_allclose(exact.q_values[int(plan.action)], exact.value, rtol=1e-5)
+
+
 def test_regret_is_small_at_the_default_budget(plans, solutions):
     actions = [int(action) for action in plans.action]
     regrets = [x.q_values[a] / x.value - 1.0 for a, x in zip(actions, solutions, strict=True) if a != NO_ACTION]
