@@ -12,7 +12,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from potlp_jax.cli import app
-from potlp_jax.environments import make
+from potlp_jax.environments import FAMILIES, make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.records import Outcome, load_trial
 from potlp_jax.task.task import Task
@@ -249,8 +249,14 @@ def test_task_that_is_never_possible_fails(monkeypatch):
 
 
 def test_unknown_environment_lists_the_known_ones():
-    with pytest.raises(WorldError, match="toy, firefighting"):
+    with pytest.raises(WorldError, match="toy, firefighting, rooms"):
         make("castle")
+
+
+def test_every_family_of_worlds_is_found_by_its_name():
+    for family in FAMILIES:
+        if not family.startswith("map:"):
+            assert make(family).name == family
 
 
 def _process(code: str) -> subprocess.CompletedProcess[str]:

@@ -23,7 +23,8 @@ Json = Annotated[bool, typer.Option("--json", help="Write JSON, and nothing else
 Environment = Annotated[
     str,
     typer.Argument(
-        metavar="ENV", help="[cyan]toy[/cyan], [cyan]firefighting[/cyan], or [cyan]map:FILE.yaml[/cyan] (a ROS map)."
+        metavar="ENV",
+        help="[cyan]toy[/cyan], [cyan]firefighting[/cyan], [cyan]rooms[/cyan], or [cyan]map:FILE.yaml[/cyan] (ROS map).",
     ),
 ]
 TaskName = Annotated[

@@ -3,7 +3,7 @@
 from potlp_jax.environments.base import Generator
 from potlp_jax.world.grid import WorldError
 
-FAMILIES: tuple[str, ...] = ("toy", "firefighting", "map:FILE.yaml")
+FAMILIES: tuple[str, ...] = ("toy", "firefighting", "rooms", "map:FILE.yaml")
 """The names that ``make`` understands."""
 
 
@@ -11,7 +11,7 @@ def make(name: str) -> Generator:
     """The generator of a family of worlds, as named on the command line.
 
     Args:
-        name: ``toy``, ``firefighting``, or ``map:FILE.yaml`` for worlds on a ROS map.
+        name: ``toy``, ``firefighting``, ``rooms``, or ``map:FILE.yaml`` for worlds on a ROS map.
 
     Raises:
         WorldError: there is no such family.
@@ -26,6 +26,10 @@ def make(name: str) -> Generator:
         from potlp_jax.environments.firefighting import Firefighting
 
         return Firefighting()
+    if name == "rooms":
+        from potlp_jax.environments.rooms import Rooms
+
+        return Rooms()
     if name.startswith("map:"):
         from potlp_jax.environments.ros_map import RosMap
 
