@@ -24,7 +24,7 @@ Environment = Annotated[
     str,
     typer.Argument(
         metavar="ENV",
-        help="[cyan]toy[/cyan], [cyan]firefighting[/cyan], [cyan]rooms[/cyan], or [cyan]map:FILE.yaml[/cyan] (ROS map).",
+        help="[cyan]toy[/cyan], [cyan]firefighting[/cyan], [cyan]rooms[/cyan] or [cyan]map:FILE.yaml[/cyan] (ROS map).",
     ),
 ]
 TaskName = Annotated[
