@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from potlp_jax import Task
+from potlp_jax.planning.portals import CAPACITY, find_active_cells, portals_pay
 from potlp_jax.planning.product import (
     DIAGONAL,
     LANES,
@@ -200,9 +201,140 @@ def test_more_sources_than_lanes_keep_their_order():
     travel, finish = jax.jit(distance_table)(
         transitions, jnp.asarray(free), arrays.accepting, everything[2], everything[3], targets, jnp.float32(1)
     )
-    np.testing.assert_array_equal(np.asarray(travel), together[:, cells[:4, 0], cells[:4, 1]])
+    np.testing.assert_allclose(np.asarray(travel), together[:, cells[:4, 0], cells[:4, 1]], rtol=1e-6)
     accepted = np.where(np.asarray(arrays.accepting), together, np.inf).min(axis=(1, 2, 3))
-    np.testing.assert_array_equal(np.asarray(finish), accepted)
+    np.testing.assert_allclose(np.asarray(finish), accepted, rtol=1e-6)
+
+
+LARGE = (15, 20)
+"""A map on which a few letters leave most cells neutral."""
+
+
+@jax.jit
+@chex.assert_max_traces(n=1)
+def _table(arrays, letters, free, cells, states, targets):
+    transitions = product_transitions(arrays, letters, free)
+    everything = (transitions, free, arrays.accepting, cells, states, targets, jnp.float32(0.5))
+    active = find_active_cells(transitions)
+    return distance_table(*everything), portals_pay(transitions, active, cells, states), active.count
+
+
+def _labelled_map(rng, labelled):
+    """Free cells, and letters: on a few cells, or over areas that cover a good part of the map."""
+    free = rng.random(LARGE) > 0.25
+    letters = np.zeros(LARGE, np.int32)
+    if labelled == "points":
+        for row, column in rng.integers(0, LARGE, (5, 2)):
+            letters[row, column] = rng.integers(1, 4)
+    if labelled == "areas":
+        for row, column in rng.integers(-2, LARGE, (4, 2)):
+            letters[max(row, 0) : row + 7, max(column, 0) : column + 7] |= rng.integers(1, 4)
+    return free, np.where(free, letters, 0).astype(np.int32)
+
+
+@pytest.mark.parametrize("labelled", ["nothing", "points", "areas"])
+@pytest.mark.parametrize("text", sorted(tasks))
+def test_table_equals_a_heap_however_much_is_labelled(text, labelled):
+    task, arrays = tasks[text], tasks[text].padded(SIZES)
+    rng = np.random.default_rng([len(labelled), len(text)])
+    free, letters = _labelled_map(rng, labelled)
+    live = np.flatnonzero(~task.dfa.trap)
+    corners = rng.permutation(np.argwhere(free))[:4].astype(np.int32)
+    labels = rng.permutation(np.argwhere(letters > 0)).reshape(-1, 2)[:2].astype(np.int32)
+    places = np.concatenate([corners, labels, corners])[:6]
+    cells = np.repeat(places, SIZES.states, axis=0)
+    states = np.tile(np.where(np.isin(np.arange(SIZES.states), live), np.arange(SIZES.states), NO_STATE), 6)
+    (travel, finish), _, _ = _table(
+        arrays, jnp.asarray(letters), jnp.asarray(free), jnp.asarray(cells), jnp.asarray(states, jnp.int32), places
+    )
+    for index, (cell, state) in enumerate(zip(cells, states, strict=True)):
+        expected = np.full((len(places), SIZES.states), np.inf)
+        accepted = np.inf
+        if state != NO_STATE:
+            costs = dijkstra.product_distances(free, letters, task.dfa.transitions, task.dfa.trap, cell, state)
+            accepted = min((cost for (_, z), cost in costs.items() if task.dfa.accepting[z]), default=np.inf)
+            for place, (row, column) in enumerate(places):
+                for z in live:
+                    expected[place, z] = costs.get(((int(row), int(column)), int(z)), np.inf)
+        np.testing.assert_allclose(np.asarray(travel)[index], 0.5 * expected, rtol=1e-5)
+        np.testing.assert_allclose(np.asarray(finish)[index], 0.5 * accepted, rtol=1e-5)
+
+
+def test_portals_are_used_where_few_cells_are_labelled():
+    arrays = tasks["F a & F b"].padded(SIZES)
+    rng = np.random.default_rng(1)
+    chosen = {}
+    for labelled in ("points", "areas"):
+        free, letters = _labelled_map(rng, labelled)
+        places = np.argwhere(free)[::40][:6].astype(np.int32)
+        cells, states = np.repeat(places, SIZES.states, axis=0), np.tile(np.arange(SIZES.states), 6)
+        states = np.where(states < 4, states, NO_STATE).astype(np.int32)
+        _, pays, count = _table(arrays, jnp.asarray(letters), jnp.asarray(free), cells, states, places)
+        chosen[labelled] = bool(pays)
+        assert int(count) == np.sum(free & (letters > 0))
+    assert chosen == {"points": True, "areas": False}
+
+
+def test_more_active_cells_than_portals_hold_are_swept():
+    """A map whose every cell is labelled: nothing is dropped."""
+    task, arrays = tasks["F a & F b"], tasks["F a & F b"].padded(SIZES)
+    letters = np.random.default_rng(0).integers(1, 4, LARGE).astype(np.int32)
+    free = np.ones(LARGE, bool)
+    cells = np.zeros((48, 2), np.int32)
+    states = np.where(np.arange(48) == 0, 0, NO_STATE).astype(np.int32)
+    targets = np.array([[14, 19], [0, 1], [3, 3], [7, 7], [14, 0], [0, 0]], np.int32)
+    (travel, _), pays, count = _table(arrays, jnp.asarray(letters), jnp.asarray(free), cells, states, targets)
+    assert int(count) == free.size > CAPACITY
+    assert not bool(pays)
+    costs = dijkstra.product_distances(free, letters, task.dfa.transitions, task.dfa.trap, (0, 0), 0)
+    for target, row in zip(targets, np.asarray(travel)[0], strict=True):
+        expected = [costs.get((tuple(target.tolist()), z), np.inf) for z in range(task.dfa.transitions.shape[0])]
+        np.testing.assert_allclose(row[: len(expected)], 0.5 * np.asarray(expected), rtol=1e-5)
+
+
+@jax.jit
+def _any_table(arrays, letters, free, cells, states, targets):
+    transitions = product_transitions(arrays, letters, free)
+    return distance_table(transitions, free, arrays.accepting, cells, states, targets, jnp.float32(1))
+
+
+@pytest.mark.parametrize("labelled", ["points", "areas"])
+def test_padding_changes_no_bit(labelled):
+    """Padded states, padded sources and a wall of cells around: the same costs, to the last bit."""
+    task = tasks["F a & F b"]
+    rng = np.random.default_rng(11)
+    free, letters = _labelled_map(rng, labelled)
+    places = np.argwhere(free)[::35][:6].astype(np.int32)
+    cells, states = np.repeat(places, 4, axis=0), np.tile(np.arange(4), 6).astype(np.int32)
+    travel, finish = _any_table(task.arrays, letters, free, cells, states, places)
+    wider = ((0, 3), (0, 5))
+    wide, wide_finish = _any_table(
+        task.padded(SIZES),
+        np.pad(letters, wider),
+        np.pad(free, wider),
+        np.pad(cells, ((0, 8), (0, 0))),
+        np.pad(states, (0, 8), constant_values=NO_STATE),
+        places,
+    )
+    np.testing.assert_array_equal(np.asarray(wide)[:24, :, :4], np.asarray(travel))
+    np.testing.assert_array_equal(np.asarray(wide_finish)[:24], np.asarray(finish))
+    assert np.isinf(np.asarray(wide)[24:]).all()
+    assert np.isinf(np.asarray(wide)[:, :, 4:]).all()
+
+
+def test_a_batch_of_tables_equals_a_loop():
+    """Rows of which some go by portals and some by sweeps, each the same as alone, to the last bit."""
+    arrays = tasks["F a & F b"].arrays
+    rng = np.random.default_rng(13)
+    maps = [_labelled_map(rng, labelled) for labelled in ("points", "areas", "nothing")]
+    frees, letters = (jnp.asarray(np.stack(entries)) for entries in zip(*maps, strict=True))
+    cells = jnp.asarray(np.repeat(rng.integers(0, LARGE, (6, 2)), 4, axis=0), jnp.int32)
+    states = jnp.asarray(np.tile(np.arange(4), 6), jnp.int32)
+    places = cells[::4]
+    together = jax.vmap(lambda free, letter: _any_table(arrays, letter, free, cells, states, places))(frees, letters)
+    for row in range(len(maps)):
+        alone = _any_table(arrays, letters[row], frees[row], cells, states, places)
+        chex.assert_trees_all_equal(jax.tree.map(lambda array, row=row: array[row], together), alone)
 
 
 def test_corners_are_not_cut():

@@ -4,18 +4,22 @@ Product states are ``(cell, z)``. Grid moves are 8-connected, cost 1 and √2 ti
 a diagonal move needs both cells beside it free. Entering a cell in state ``z`` leads to ``transitions[cell, z]``.
 
 Distances are solved by frontal sweeps, one state of the automaton after the other: each line of the grid is updated
-from the previous one, in all four directions, until nothing changes; then the moves that leave the state are applied to
-the whole grid, and the states that they improve are swept again. At the common fixed point costs are shortest because
-every move costs something.
+from the previous one, in all four directions, until nothing changes; then the moves that leave the state are applied,
+on the lines where there are any, and the states that they improve are swept again. At the common fixed point costs are
+shortest because every move costs something. A table of costs between a few cells needs no sweep per state where few
+cells carry letters that matter: see ``portals``.
 """
 
+import functools
 import math
 
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Bool, Float32, Int32
 
+from potlp_jax.planning.portals import find_active_cells, portals_pay, table_by_portals
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_STATE
 
@@ -74,6 +78,13 @@ def product_distances(
     The source's own letter counts as read. ``free`` (True = no obstacle) decides about cutting corners only; what may
     be entered is in ``transitions``. A source whose state is ``NO_STATE`` reaches nothing.
     """
+    return _product_distances(transitions, free, source_cells, source_states, jnp.asarray(resolution), wildcard)
+
+
+# Under vmap the maps are solved one after the other: a batched loop goes on until its slowest row is done, and works on
+# arrays that no cache holds.
+@sequential_vmap
+def _product_distances(transitions, free, source_cells, source_states, resolution, wildcard):
     sweeper = _Sweeper(_layers_first(transitions), free, wildcard)
     solved = _map_sources(sweeper.solve, source_cells, source_states)
     return jnp.transpose(solved, (3, 1, 2, 0)) * resolution
@@ -90,8 +101,32 @@ def distance_table(
 ) -> tuple[Float32[Array, "Q T Z"], Float32[Array, " Q"]]:
     """Costs from each source to each target cell in each state, and to acceptance anywhere; ``inf`` unreachable.
 
-    The same distances as ``product_distances`` without keeping the grids of all sources.
+    The same distances as ``product_distances``, up to rounding, without its grids. Where few cells carry letters that
+    matter, they are found by way of those cells (``portals``), elsewhere by sweeps.
     """
+    return _distance_table(
+        transitions, free, accepting, source_cells, source_states, target_cells, jnp.asarray(resolution)
+    )
+
+
+@sequential_vmap
+def _distance_table(transitions, free, accepting, source_cells, source_states, target_cells, resolution):
+    active = find_active_cells(transitions)
+
+    def by_portals():
+        arrivals = functools.partial(_neutral_arrivals, active.neutral, free)
+        return table_by_portals(transitions, accepting, active, source_cells, source_states, target_cells, arrivals)
+
+    def by_sweeps():
+        return _table_by_sweeps(transitions, free, accepting, source_cells, source_states, target_cells)
+
+    pays = portals_pay(transitions, active, source_cells, source_states)
+    travel, finish = jax.lax.cond(pays, by_portals, by_sweeps)
+    return travel * resolution, finish * resolution
+
+
+def _table_by_sweeps(transitions, free, accepting, source_cells, source_states, target_cells):
+    """``distance_table`` in cells, from the grids of all sources."""
     sweeper = _Sweeper(_layers_first(transitions), free, None)
     rows, columns = target_cells[:, 0], target_cells[:, 1]
 
@@ -100,9 +135,32 @@ def distance_table(
         finish = jnp.min(jnp.where(accepting[:, None, None, None], cost, jnp.inf), axis=(0, 1, 2))
         return jnp.concatenate([cost[:, rows, columns].reshape(-1, cells.shape[0]), finish[None]])
 
-    table = _map_sources(solve, source_cells, source_states).T * resolution
+    table = _map_sources(solve, source_cells, source_states).T
     travel = table[:, :-1].reshape(-1, transitions.shape[2], target_cells.shape[0])
     return jnp.swapaxes(travel, 1, 2), table[:, -1]
+
+
+def _neutral_arrivals(
+    neutral: Bool[Array, "H W"],
+    free: Bool[Array, "H W"],
+    keys: Int32[Array, "K 2"],
+    count: Int32[Array, ""],
+    ends: Int32[Array, "N 2"],
+) -> Float32[Array, "K N"]:
+    """Cost in cells of entering each end from each of the first ``count`` keys over ``neutral`` cells, else ``inf``."""
+    sweeper = _Sweeper(jnp.where(neutral, 0, NO_STATE)[None, :, :, None], free, None)
+    lanes = min(LANES, keys.shape[0])
+    padded = jnp.pad(keys, ((0, -keys.shape[0] % lanes), (0, 0)))
+    states = jnp.where(jnp.arange(padded.shape[0]) < count, 0, NO_STATE).astype(jnp.int32)
+
+    def solve(chunk, arrivals):
+        first = chunk * lanes
+        cells = jax.lax.dynamic_slice_in_dim(padded, first, lanes)
+        grid = sweeper.solve(cells, jax.lax.dynamic_slice_in_dim(states, first, lanes))[0]
+        return jax.lax.dynamic_update_slice(arrivals, sweeper.links.arrival_at(grid, ends).T, (first, 0))
+
+    start = jnp.full((padded.shape[0], ends.shape[0]), jnp.inf, jnp.float32)
+    return jax.lax.fori_loop(0, -(-count // lanes), solve, start)[: keys.shape[0]]
 
 
 def distances_by_lane(
@@ -113,6 +171,11 @@ def distances_by_lane(
     resolution: Float32[Array, ""],
 ) -> Float32[Array, "Z H W Q"]:
     """As ``product_distances``, with transitions of its own for every source and the sources in the minor axis."""
+    return _distances_by_lane(transitions, free, source_cells, source_states, jnp.asarray(resolution))
+
+
+@sequential_vmap
+def _distances_by_lane(transitions, free, source_cells, source_states, resolution):
     return _Sweeper(transitions, free, None).solve(source_cells, source_states) * resolution
 
 
@@ -159,15 +222,15 @@ def _map_sources(solve, cells: Int32[Array, "Q 2"], states: Int32[Array, " Q"]) 
 class _Sweeper:
     """Solves distances on one map. Costs are [Z, H, W, Q]: sources lie in the minor axis, in lanes.
 
-    ``transitions`` may be shared by all lanes (last axis 1) or differ between them.
+    ``transitions`` may be shared by all lanes (last axis 1) or differ between them. Within a solution, grids have a
+    margin of unreachable cells, which stands in for what lies outside.
     """
 
     def __init__(
         self, transitions: Int32[Array, "Z H W lanes"], free: Bool[Array, "H W"], wildcard: Wildcard | None
     ) -> None:
-        states = transitions.shape[0]
-        own = jnp.arange(states)[:, None, None, None]
-        keeps = transitions == own
+        own = jnp.arange(transitions.shape[0], dtype=jnp.int32)
+        keeps = transitions == own[:, None, None, None]
         if wildcard is not None:
             keeps = keeps | wildcard.cells[None, :, :, None]
         self.transitions = transitions
@@ -176,36 +239,39 @@ class _Sweeper:
         # States from which no move exists (accepting and trap states, where the caller cut them) need no sweep.
         self.leads_on = jnp.any((transitions != NO_STATE) | keeps, axis=(1, 2, 3))
         self.links = _Links(free)
+        # [from state, to state, row]: lines of the grid where a move changes the state.
+        self.changing_rows = jax.lax.map(lambda state: jnp.any(self._leads(state, own), axis=(2, 3)), own)
 
     def solve(self, cells: Int32[Array, "Q 2"], states: Int32[Array, " Q"]) -> Float32[Array, "Z H W Q"]:
-        """Costs in cells from each source; all ``inf`` where its state is ``NO_STATE``.
+        """Costs in cells from each source; all ``inf`` where its state is ``NO_STATE``."""
+        return self._solve_padded(cells, states)[:, 1:-1, 1:-1]
+
+    def _solve_padded(self, cells, states):
+        """As ``solve``, with the margin.
 
         The lowest state whose costs have changed is swept first: states are numbered breadth-first from the initial
         one, so that in most automata each is swept once.
         """
-        count = self.transitions.shape[0]
+        count, height, width, _ = self.transitions.shape
         lane = jnp.arange(cells.shape[0])
         at_source = jnp.where(states == NO_STATE, jnp.inf, 0.0).astype(jnp.float32)
-        start = jnp.full((*self.transitions.shape[:3], cells.shape[0]), jnp.inf, jnp.float32)
-        start = start.at[states, cells[:, 0], cells[:, 1], lane].set(at_source)
+        start = jnp.full((count, height + 2, width + 2, cells.shape[0]), jnp.inf, jnp.float32)
+        start = start.at[states, cells[:, 0] + 1, cells[:, 1] + 1, lane].set(at_source)
         dirty = jnp.any(states[None, :] == jnp.arange(count)[:, None], axis=1) & self.leads_on
 
         def settle(carry):
             cost, dirty = carry
-            state = jnp.argmax(dirty)
+            state = jnp.argmax(dirty).astype(jnp.int32)
             layer = self._sweep_to_fixed_point(cost[state], self.enter[state])
-            cost = cost.at[state].set(layer)
-            after = self._leave(cost, layer, state)
-            improved = jnp.any(after < cost, axis=(1, 2, 3)) & self.leads_on
-            return after, dirty.at[state].set(False) | improved
+            cost, improved = self._leave(cost.at[state].set(layer), layer, state)
+            return cost, dirty.at[state].set(False) | (improved & self.leads_on)
 
         return jax.lax.while_loop(lambda carry: jnp.any(carry[1]), settle, (start, dirty))[0]
 
     def _sweep_to_fixed_point(
-        self, cost: Float32[Array, "H W Q"], enter: Float32[Array, "H W lanes"]
-    ) -> Float32[Array, "H W Q"]:
+        self, cost: Float32[Array, "H2 W2 Q"], enter: Float32[Array, "H W lanes"]
+    ) -> Float32[Array, "H2 W2 Q"]:
         """Apply the moves that keep one state of the automaton until they improve nothing."""
-        height, width, lanes = cost.shape
         rows = _Lines(enter, self.links.falling, self.links.rising)
         columns = _Lines(jnp.swapaxes(enter, 0, 1), self.links.falling.T, self.links.rising.T)
 
@@ -215,22 +281,61 @@ class _Sweeper:
             after = jnp.swapaxes(after, 0, 1)
             return after, jnp.any(after < before)
 
-        # A margin of unreachable cells stands in for what lies outside of the grid.
-        padded = jnp.full((height + 2, width + 2, lanes), jnp.inf, jnp.float32).at[1:-1, 1:-1].set(cost)
-        padded, _ = jax.lax.while_loop(lambda carry: carry[1], sweep_round, (padded, jnp.asarray(True)))
-        return padded[1:-1, 1:-1]
+        return jax.lax.while_loop(lambda carry: carry[1], sweep_round, (cost, jnp.asarray(True)))[0]
+
+    def _leads(
+        self, state: Int32[Array, ""], to_state: Int32[Array, " to"], row: Int32[Array, ""] | None = None
+    ) -> Bool[Array, "to *rows W lanes"]:
+        """Where a move out of ``state`` leads to each of the states, on the whole grid or on one row; never itself."""
+        following = self.transitions[state] if row is None else self.transitions[state, row]
+        to_state = to_state.reshape(-1, *(1,) * following.ndim)
+        leads = following[None] == to_state
+        if self.wildcard is not None:
+            cells = self.wildcard.cells if row is None else self.wildcard.cells[row]
+            leads = leads | (cells[None, ..., None] & self.wildcard.successors[state][to_state])
+        return leads & (to_state != state)
 
     def _leave(
-        self, cost: Float32[Array, "Z H W Q"], layer: Float32[Array, "H W Q"], state: Int32[Array, ""]
-    ) -> Float32[Array, "Z H W Q"]:
-        """Apply every move that leaves ``state``, whose costs are ``layer``, once."""
-        to_state = jnp.arange(cost.shape[0], dtype=jnp.int32)
-        leads = self.transitions[state][None] == to_state[:, None, None, None]
-        if self.wildcard is not None:
-            chosen = self.wildcard.successors[state][:, None, None, None]
-            leads = leads | (self.wildcard.cells[None, :, :, None] & chosen)
-        leads = leads & (to_state != state)[:, None, None, None]
-        return jnp.where(leads, jnp.minimum(cost, self.links.cheapest_arrival(layer)[None]), cost)
+        self, cost: Float32[Array, "Z H2 W2 Q"], layer: Float32[Array, "H2 W2 Q"], state: Int32[Array, ""]
+    ) -> tuple[Float32[Array, "Z H2 W2 Q"], Bool[Array, " Z"]]:
+        """Apply every move that leaves ``state``, whose costs are ``layer``, once; and which states that improved."""
+        many = 2 * jnp.sum(self.changing_rows[state]) > self.changing_rows.shape[2]
+        return jax.lax.cond(many, self._leave_everywhere, self._leave_by_line, cost, layer, state)
+
+    def _leave_everywhere(self, cost, layer, state):
+        """``_leave`` on the whole grid at once."""
+        own = jnp.arange(cost.shape[0], dtype=jnp.int32)
+        held = cost[:, 1:-1, 1:-1]
+        arrival = self.links.cheapest_arrival(layer[1:-1, 1:-1])
+        after = jnp.where(self._leads(state, own), _smaller(arrival[None], held), held)
+        return cost.at[:, 1:-1, 1:-1].set(after), jnp.any(after < held, axis=(1, 2, 3))
+
+    def _leave_by_line(self, cost, layer, state):
+        """``_leave`` on the lines where such moves exist, one after the other: the faster way where they are few."""
+        count, rows = self.changing_rows.shape[1:]
+        width, lanes = layer.shape[1] - 2, layer.shape[2]
+        (changing,) = jnp.nonzero(self.changing_rows[state].reshape(-1), size=count * rows, fill_value=0)
+        changing = changing.astype(jnp.int32)
+
+        def line(index):
+            to_state, row = changing[index] // rows, changing[index] % rows
+            leads = self._leads(state, to_state[None], row)[0]
+            return to_state, row, jnp.where(leads, self.links.arrival_in_row(layer, row), jnp.inf)
+
+        # Two passes, one that reads costs and one that writes them: XLA copies the costs where one does both.
+        def look(index, improved):
+            to_state, row, arrival = line(index)
+            held = jax.lax.dynamic_slice(cost, (to_state, row + 1, 1, 0), (1, 1, width, lanes))[0, 0]
+            return improved.at[to_state].set(improved[to_state] | jnp.any(arrival < held))
+
+        def write(index, cost):
+            to_state, row, arrival = line(index)
+            held = jax.lax.dynamic_slice(cost, (to_state, row + 1, 1, 0), (1, 1, width, lanes))
+            return jax.lax.dynamic_update_slice(cost, _smaller(arrival[None, None], held), (to_state, row + 1, 1, 0))
+
+        lines = jnp.sum(self.changing_rows[state])
+        improved = jax.lax.fori_loop(0, lines, look, jnp.zeros(count, bool))
+        return jax.lax.fori_loop(0, lines, write, cost), improved
 
 
 class _Links:
@@ -244,20 +349,43 @@ class _Links:
         blocked = ~free
         self.falling = _link(_shift(blocked, 1, 0, True) | _shift(blocked, 0, 1, True))
         self.rising = _link(_shift(blocked, 1, 1, True) | blocked)
+        # Lengths of the moves into each cell from its neighbours, in their order.
+        self.steps = jnp.stack([self._step(*offset) for offset in NEIGHBOURS])
 
     def cheapest_arrival(self, layer: Float32[Array, "H W Q"]) -> Float32[Array, "H W Q"]:
         """Cost of standing on each cell's best neighbour plus the move into the cell, in cells."""
         best = jnp.full(layer.shape, jnp.inf, jnp.float32)
-        for rows, columns in NEIGHBOURS:
-            best = jnp.minimum(best, _shift(layer, -rows, -columns, jnp.inf) + self._step(rows, columns))
+        for step, (rows, columns) in zip(self.steps, NEIGHBOURS, strict=True):
+            best = _smaller(_shift(layer, -rows, -columns, jnp.inf) + step[:, :, None], best)
         return best
 
-    def _step(self, rows: int, columns: int) -> Float32[Array, "H W 1"] | float:
+    def arrival_in_row(self, layer: Float32[Array, "H2 W2 Q"], row: Int32[Array, ""]) -> Float32[Array, "W Q"]:
+        """As ``cheapest_arrival`` for one row of the grid; ``layer`` has a margin."""
+        around = jax.lax.dynamic_slice_in_dim(layer, row, 3)
+        width = layer.shape[1] - 2
+        best = jnp.full((width, layer.shape[2]), jnp.inf, jnp.float32)
+        for step, (rows, columns) in zip(self.steps, NEIGHBOURS, strict=True):
+            best = _smaller(around[1 + rows, 1 + columns : 1 + columns + width] + step[row][:, None], best)
+        return best
+
+    def arrival_at(self, layer: Float32[Array, "H W Q"], cells: Int32[Array, "N 2"]) -> Float32[Array, "N Q"]:
+        """As ``cheapest_arrival`` for some cells."""
+        height, width, lanes = layer.shape
+        best = jnp.full((cells.shape[0], lanes), jnp.inf, jnp.float32)
+        for step, offset in zip(self.steps, NEIGHBOURS, strict=True):
+            beside = cells + jnp.asarray(offset, jnp.int32)[None, :]
+            # Off the grid there is nothing; a negative index would wrap round.
+            beside = jnp.where(beside < 0, max(height, width), beside)
+            from_there = layer.at[beside[:, 0], beside[:, 1]].get(mode="fill", fill_value=jnp.inf)
+            best = _smaller(from_there + step[cells[:, 0], cells[:, 1]][:, None], best)
+        return best
+
+    def _step(self, rows: int, columns: int) -> Float32[Array, "H W"]:
         """Length of the move into each cell from its neighbour at the offset (rows, columns)."""
         if rows == 0 or columns == 0:
-            return 1.0
+            return jnp.ones(self.falling.shape, jnp.float32)
         link = self.falling if rows == columns else self.rising
-        return _shift(link, -max(rows, 0), -max(columns, 0), jnp.inf)[:, :, None]
+        return _shift(link, -max(rows, 0), -max(columns, 0), jnp.inf)
 
 
 def _link(blocked: Bool[Array, "H W"]) -> Float32[Array, "H W"]:

@@ -1,0 +1,1 @@
+"""Benchmarks of the planner: regret over CPU time, throughput, distances."""
