@@ -24,6 +24,7 @@ from potlp_jax.planning.policies import DecisionConfig, Move, MoveKind, Policy, 
 from potlp_jax.planning.pouct import Plan, SearchConfig, Tree, search_tree
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.product import KnownPath
+from potlp_jax.planning.search_kernel import SearchMode
 from potlp_jax.records import NEVER_SEEN, ActionRecord, Decision, Outcome, Trial
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.types import NO_ACTION
@@ -348,7 +349,7 @@ def trial_config_from_dict(data: Mapping[str, Any]) -> TrialConfig:
                 **{
                     **decision,
                     "frontiers": FrontierConfig(**decision["frontiers"]),
-                    "search": SearchConfig(**decision["search"]),
+                    "search": SearchConfig(**{**decision["search"], "mode": SearchMode(decision["search"]["mode"])}),
                 }
             ),
         }

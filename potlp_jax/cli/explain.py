@@ -5,7 +5,7 @@ from pathlib import Path
 
 from potlp_jax.cli.output import console, fail, note, print_json
 from potlp_jax.cli.run import RECORD
-from potlp_jax.planning.pouct import tree_top
+from potlp_jax.planning.tree_top import tree_top
 from potlp_jax.records import Decision, Trial, load_trial
 from potlp_jax.trial import replay_decision
 from potlp_jax.view.decisions import action_table, decision_to_dict, describe_decision

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
 from potlp_jax.planning.estimates import Estimates, Estimator
 from potlp_jax.planning.history import ActionTerms, action_terms, initial_history
-from potlp_jax.planning.pouct import Plan, SearchConfig, plan_actions
+from potlp_jax.planning.pouct import Plan, plan_actions
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.product import (
     KnownPath,
@@ -32,6 +32,7 @@ from potlp_jax.planning.product import (
     product_transitions,
     shortest_path,
 )
+from potlp_jax.planning.search_kernel import SearchConfig
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_ACTION, NO_STATE, Status, status_array, status_if
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
@@ -170,7 +171,8 @@ def decide(
     if policy is Policy.ORACLE:
         if estimator is None:
             raise ValueError(f"policy {policy.value!r} needs an estimator")
-        return _search(situation, estimator, key, config)
+        estimates = estimator(belief, situation.subgoals, task)
+        return search_move(situation, estimates, key, config)
     return _finish_or_frontier(situation, config)
 
 
@@ -240,10 +242,13 @@ def _finish_or_frontier(situation: Situation, config: DecisionConfig) -> Move:
     return _move(situation, config, kind, target_cell, target_state, value)
 
 
-def _search(situation: Situation, estimator: Estimator, key: PRNGKeyArray, config: DecisionConfig) -> Move:
-    """PO-TLP: estimate, search, go toward the chosen action's subgoal; nearest frontier if no action is available."""
+def search_move(situation: Situation, estimates: Estimates, key: PRNGKeyArray, config: DecisionConfig) -> Move:
+    """PO-TLP (Bradley et al. 2021, Algorithm 1): search, and go toward the chosen action's subgoal.
+
+    ``estimates`` are those of the situation's subgoals. Where no action is available: the nearest frontier.
+    """
     task, subgoals = situation.task, situation.subgoals
-    problem = planning_problem(situation, estimator(situation.belief, subgoals, task), config)
+    problem = planning_problem(situation, estimates, config)
     plan = plan_actions(problem, key, config.search)
     search = Search(problem=problem, plan=plan, terms=action_terms(problem, initial_history(problem)))
 

@@ -1,4 +1,4 @@
-"""The top of a searched tree as a picture, from the nested values of ``potlp_jax.planning.pouct.tree_top``."""
+"""The top of a searched tree as a picture, from the nested values of ``potlp_jax.planning.tree_top.tree_top``."""
 
 import dataclasses
 import math
@@ -40,7 +40,7 @@ class _Box:
 def draw_tree(tree: Mapping[str, Any], title: str | None = None, *, breadth: int = 3) -> Figure:
     """The tree from left to right: up to ``breadth`` actions of a node, each with its outcomes, the best followed.
 
-    The width of a line follows the share of simulations that it stands for.
+    The width of a line follows the probability of getting there times the share of simulations of its action.
     """
     text = f"robot in state {tree['state']}\nV {_number(tree['value'])}  n {tree['visits']}"
     root = _Box(text, best=True, children=_children(tree, breadth, tree["visits"]))

@@ -224,3 +224,46 @@ def dictionary_pouct(problem, simulations, exploration, seed=0):
     for _ in range(simulations):
         simulate([])
     return q_values[()], visits[()]
+
+
+def authors_pouct(problem, simulations, exploration, uniform):
+    """PO-UCT as in the authors' code: visits and mean cost of each action at the root.
+
+    Every new history ends a simulation and is worth nothing beyond the cost so far. ``uniform(simulation, level)`` are
+    the random numbers.
+    """
+    known, counts, means = {()}, {}, {}
+    for simulation in range(simulations):
+        history, steps = [], []
+        while True:
+            key, actions = tuple(history), problem.actions(history)
+            if problem.situation(history)[1] in problem.accepting:
+                value = 0.0
+                break
+            if not actions or key not in known:
+                value = 0.0 if actions else problem.dead_end_cost
+                known.add(key)
+                break
+            count = counts.setdefault(key, dict.fromkeys(actions, 0))
+            mean = means.setdefault(key, dict.fromkeys(actions, 0.0))
+            untried = [a for a in actions if not count[a]]
+            log = math.log(sum(count.values()) + 1)
+            action = untried[0] if untried else min(actions, key=lambda a: _ucb(mean[a], count[a], log, exploration))
+            cost = problem.distance(history, action)
+            if action == FINISH:
+                steps.append((key, action, cost))
+                value = 0.0
+                break
+            chance, r_s, r_f = problem.estimate(history, action)
+            outcome = uniform(simulation, len(history)) < chance
+            steps.append((key, action, cost + (r_s if outcome else r_f)))
+            history = [*history, (action, outcome)]
+        for key, action, cost in reversed(steps):
+            value += cost
+            counts[key][action] += 1
+            means[key][action] += (value - means[key][action]) / counts[key][action]
+    return counts[()], means[()]
+
+
+def _ucb(mean, count, log, exploration):
+    return mean - exploration * math.sqrt(log / count)

@@ -1,0 +1,288 @@
+"""Benchmark problems for planners: eight families of tasks on random maps, as many instances as wanted.
+
+An instance is a map about 100 cells on a side, with the robot, S subgoals and sometimes a few labelled spots on it.
+Places are joined by ways of octile length times a random detour, closed under shortest paths, so travel is a metric.
+Travel and finish costs are shortest paths in the product of the places and the task's automaton: the way between two
+places reads empty letters, arriving reads the place's own letter, which is empty at most subgoals. Estimates look like
+those of a trained estimator: a share of them, which differs from map to map, is confident, mostly of failure.
+
+Everything follows from (family, S, split, index); tuning and test instances are drawn from different seeds, and in
+the random family from different tasks. All problems of one family and S have arrays of the same shapes.
+"""
+
+import dataclasses
+import zlib
+from collections.abc import Mapping
+from functools import cache
+from types import MappingProxyType
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Float64, Int32
+
+from potlp_jax.environments.firefighting import Firefighting
+from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.task.task import Task, TaskArrays, TaskSizes
+
+Split = Literal["tuning", "test"]
+
+SUBGOAL_COUNTS: tuple[int, ...] = (1, 2, 4, 6, 8)
+"""Numbers of subgoals that the benchmark reports."""
+
+DEAD_END_COST: float = 500.0
+
+_SIDE = 100.0
+_LARGEST_DETOUR = 1.8
+_MOST_SPOTS = 2
+_FARTHEST_SPOT = 100.0
+
+_SEVERAL_CUBES = (
+    "F(a & (b | c))",
+    "F((a | b) & X(b | c))",
+    "(!c U (a | b)) & F(b | (c & a))",
+    "F(a | b) & F c",
+    "F((a & b) | (b & c) | (a & c))",
+    "F(a & !b & F(b | c))",
+    "(!a U (b | c)) & F a",
+)
+
+# Drawn at random, the first six of each number of states from 2 to 8 that ask the robot to look for something.
+_RANDOM = (
+    "F((((b) | (c))) & F(((b) M (b))))",
+    "((F(a)) & (F((a) & F(c))))",
+    "F((((a) U (c))) & F(((!a) U (a))))",
+    "F(F((F((b) & F(a))) & F(F((b) & F(!b)))))",
+    "((F((F(b)) & F(X(a)))) | (X(((a) & (!b)))))",
+    "F((F((c) & F(!b))) & F(X(b)))",
+    "((((c) M (!b))) U (X(a)))",
+    "F(((a) M (b)))",
+    "((F(a)) U (F((a) & F(b))))",
+    "((F((b) & F(!c))) | (a))",
+    "((X(a)) M (((b) U (!b))))",
+    "F((F(c)) & F(F((a) & F(!a))))",
+    "X(F((F((!a) & F(a))) & F(F((a) & F(!a)))))",
+    "((((b) M (!a))) M (X(!c)))",
+    "F(c)",
+    "F((((!b) | (a))) & F(F((a) & F(!a))))",
+    "F(F((((!a) U (b))) & F(X(b))))",
+    "F(((X(!c)) M (((c) M (b)))))",
+    "F(((F(a)) M (F((!c) & F(X(b))))))",
+    "((((X(!b)) M (F(c)))) & (((!c) | (X(c)))))",
+    "((((!c) M (b))) M (X(!a)))",
+    "F(((a) M (a)))",
+    "F(F((c) & F(a)))",
+    "((((b) U (!a))) & (F((!a) & F(c))))",
+    "((F(X(!b))) & (F(F(c))))",
+    "((!c) & (((F((c) & F(b))) M (X(!a)))))",
+    "F((F(F((c) & F(b)))) & F(X(((b) U (!b)))))",
+    "((X(F(a))) M (((F((a) & F(c))) | (X(!b)))))",
+    "F((((!a) & (b))) & F(F(!a)))",
+    "F((((a) & (c))) & F(X(!b)))",
+    "F((a) & F(((c) | (F((!b) & F(b))))))",
+    "F((((b) M (!c))) & F(F((a) & F(!b))))",
+    "((F((!c) & F(c))) U (a))",
+    "F((X(F(!a))) & F(F(F((a) & F(b)))))",
+    "X(F((X(!b)) & F(F((!a) & F(b)))))",
+    "F(((b) M (((((c) M (b))) & (((a) U (c)))))))",
+    "F((((!b) & (c))) & F(((b) U (!c))))",
+    "F((F(b)) & F(!b))",
+    "X(F((F(b)) & F(((!b) U (!c)))))",
+    "((((X(!c)) M (F(a)))) U (a))",
+    "((X(F(!c))) M (F((((a) | (a))) & F(c))))",
+    "F(F((X(X(b))) & F(F(((a) U (c))))))",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Family:
+    """Tasks that are benchmarked together.
+
+    Attributes:
+        name: key in ``FAMILIES``.
+        formulas: the tasks. Instance ``index`` of a split has task ``index`` of the split's own, round robin; a family
+            of one task uses it in both splits.
+        propositions: Sigma of every task.
+        sizes: array sizes of every task.
+        max_positive_literals: as in ``Task.from_formula``.
+        disjoint_tasks: whether every second task is kept for the test split.
+    """
+
+    name: str
+    formulas: tuple[str, ...]
+    propositions: tuple[str, ...]
+    sizes: TaskSizes
+    max_positive_literals: int | None = None
+    disjoint_tasks: bool = False
+
+    def formula(self, split: Split, index: int) -> str:
+        """The task of an instance."""
+        own = self.formulas[get_args(Split).index(split) :: 2] if self.disjoint_tasks else self.formulas
+        return own[index % len(own)]
+
+
+_FIREFIGHTING = Firefighting.tasks["1"]
+
+FAMILIES: Mapping[str, Family] = MappingProxyType(
+    {
+        family.name: family
+        for family in (
+            Family("find", ("F g",), ("g",), TaskSizes(2, 1, 1, 1, 0, 1)),
+            Family("three-single", ("F a & F b & F c",), ("a", "b", "c"), TaskSizes(8, 3, 12, 12, 0, 1), 1),
+            Family("three-joint", ("F a & F b & F c",), ("a", "b", "c"), TaskSizes(8, 3, 19, 19, 0, 1)),
+            Family("two", ("F a & F b",), ("a", "b"), TaskSizes(4, 2, 5, 5, 0, 1)),
+            Family("firefighting", (_FIREFIGHTING,), Firefighting.propositions, TaskSizes(4, 4, 3, 5, 2, 2)),
+            Family("reuse", ("F(a & F(b & F a))",), ("a", "b"), TaskSizes(4, 2, 5, 5, 0, 1)),
+            Family("random", _RANDOM, ("a", "b", "c"), TaskSizes(8, 3, 9, 9, 1, 2), disjoint_tasks=True),
+            Family("cubes", _SEVERAL_CUBES, ("a", "b", "c"), TaskSizes(4, 3, 5, 8, 3, 3)),
+        )
+    }
+)
+"""The benchmark families by name.
+
+* find, two, three-single, three-joint: look for one, two, three things; -joint: two or three at one cell count as well
+* firefighting: task 1 of the fire-fighting building (Bradley et al. 2021, section V-A)
+* reuse: what was found once is needed again
+* random: co-safe formulas whose automata have 2 to 8 states
+* cubes: transitions that come about in several ways
+"""
+
+
+def family_problem(family: str, subgoals: int, split: Split, index: int) -> PlanningProblem:
+    """One benchmark instance, unbatched and checked; equal arguments give equal problems.
+
+    Args:
+        family: a key of ``FAMILIES``.
+        subgoals: S, at least 1.
+        split: "tuning" or "test".
+        index: number of the instance, from 0.
+
+    Raises:
+        ValueError: no such family or split, no subgoal, or a negative index.
+    """
+    if family not in FAMILIES:
+        raise ValueError(f"there is no family {family!r}; there are: {', '.join(FAMILIES)}")
+    if split not in get_args(Split):
+        raise ValueError(f"there is no split {split!r}; there are: {', '.join(get_args(Split))}")
+    if subgoals < 1 or index < 0:
+        raise ValueError(f"subgoals is {subgoals} and index {index}: they must be at least 1 and 0")
+    spec = FAMILIES[family]
+    task, arrays = _compile(spec, spec.formula(split, index))
+    rng = np.random.default_rng([zlib.crc32(f"{family}/{split}".encode()), subgoals, index])
+    problem = PlanningProblem.from_arrays(
+        arrays,
+        **_geometry(task, spec.sizes, subgoals, rng),
+        **_estimates(task, spec.sizes, subgoals, rng),
+        dfa_state=_start_state(task, rng),
+        subgoal_mask=np.ones(subgoals, bool),
+        dead_end_cost=DEAD_END_COST,
+    )
+    problem.check()
+    return problem
+
+
+def random_metric(places: int, rng: np.random.Generator) -> Float64[np.ndarray, "N N"]:
+    """Shortest ways between random places of the map: symmetric, 0 on the diagonal only, triangle inequality."""
+    points = rng.uniform(0.0, _SIDE, (places, 2))
+    offset = np.abs(points[:, None] - points[None])
+    octile = offset.max(axis=-1) + (np.sqrt(2.0) - 1.0) * offset.min(axis=-1)
+    detour = np.triu(rng.uniform(1.0, _LARGEST_DETOUR, octile.shape), 1)
+    return _shortest(np.maximum(octile, 1.0) * (detour + detour.T))
+
+
+@cache
+def _compile(family: Family, formula: str) -> tuple[Task, TaskArrays]:
+    task = Task.from_formula(formula, family.propositions, family.max_positive_literals)
+    return task, task.padded(family.sizes)
+
+
+def _start_state(task: Task, rng: np.random.Generator) -> int:
+    """The automaton's state after empty letters; now and then another one from which something can be tried."""
+    first = int(_after_empty_letters(task)[task.dfa.initial])
+    others = np.setdiff1d(task.edges[:, 0], [first])
+    return int(rng.choice(others)) if rng.random() < 0.2 and len(others) else first
+
+
+def _after_empty_letters(task: Task) -> Int32[np.ndarray, " Z"]:
+    """State after as many empty letters as there are states: a way through free space is longer than that."""
+    state = np.arange(task.dfa.num_states, dtype=np.int32)
+    for _ in range(task.dfa.num_states):
+        state = task.dfa.transitions[state, 0]
+    return state
+
+
+def _geometry(task: Task, sizes: TaskSizes, subgoals: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """``travel`` and ``finish``: shortest paths in the product of places and automaton.
+
+    Nodes are subgoals, robot, labelled spots. A spot lies off the map's middle, at the end of a way of its own.
+    """
+    dfa, states, robot = task.dfa, task.dfa.num_states, subgoals
+    spots = int(rng.integers(1, _MOST_SPOTS + 1)) if rng.random() < 0.3 else 0
+    way = random_metric(subgoals + 1 + spots, rng)
+    aside = np.concatenate([np.zeros(subgoals + 1), rng.uniform(0.0, _FARTHEST_SPOT, spots)])
+    way = np.where(np.eye(len(way), dtype=bool), 0.0, way + aside[:, None] + aside[None, :])
+    letters = _place_letters(task, subgoals, spots, rng)
+    arrive = dfa.transitions[_after_empty_letters(task)][:, letters].T
+    cost = _shortest(_product_moves(way, arrive, dfa.trap))
+
+    entered = dfa.transitions[:, letters].T
+    start = np.where(np.arange(len(way))[:, None] == robot, np.arange(states)[None, :], entered)[: subgoals + 1]
+    begins = cost.reshape(len(way), states, len(way), states)[np.arange(subgoals + 1)[:, None], start]
+    begins[dfa.trap[start]] = np.inf
+    travel = np.full((subgoals + 1, sizes.states, subgoals, sizes.states), np.inf)
+    travel[:, :states, :, :states] = begins[:, :, :subgoals]
+    finish = np.full((subgoals + 1, sizes.states), np.inf)
+    finish[:, :states] = np.where(dfa.accepting, begins, np.inf).min(axis=(2, 3))
+    return {"travel": travel, "finish": finish}
+
+
+def _place_letters(task: Task, subgoals: int, spots: int, rng: np.random.Generator) -> Int32[np.ndarray, " N"]:
+    """One proposition at each spot; in every fourth problem one at a subgoal, unless that alone satisfies the task."""
+    letters = 1 << rng.integers(0, len(task.propositions), subgoals + 1 + spots, dtype=np.int32)
+    chosen = int(rng.integers(0, subgoals)) if rng.random() < 0.25 else subgoals
+    satisfies = task.dfa.accepting[task.dfa.transitions[:, letters[chosen]]] & ~task.dfa.accepting
+    place = np.arange(len(letters))
+    labelled = (place > subgoals) | ((place == chosen) & (chosen < subgoals) & ~satisfies.any())
+    return np.where(labelled, letters, 0).astype(np.int32)
+
+
+def _product_moves(
+    way: Float64[np.ndarray, "N N"], arrive: Int32[np.ndarray, "N Z"], trap: np.ndarray
+) -> Float64[np.ndarray, "NZ NZ"]:
+    """Cost of going straight from one (place, state) to another; ``arrive[v, z]`` is the state in which v is reached
+    from state z. No way leads into a trap."""
+    places, states = arrive.shape
+    moves = np.full((places, states, places, states), np.inf)
+    for to, state in np.ndindex(places, states):
+        if not trap[state] and not trap[arrive[to, state]]:
+            moves[:, state, to, arrive[to, state]] = np.where(np.arange(places) == to, np.inf, way[:, to])
+    return moves.reshape(places * states, places * states)
+
+
+def _shortest(cost: Float64[np.ndarray, "N N"]) -> Float64[np.ndarray, "N N"]:
+    """All shortest paths (Floyd and Warshall), staying where one is included."""
+    cost = np.where(np.eye(len(cost), dtype=bool), 0.0, cost)
+    for via in range(len(cost)):
+        cost = np.minimum(cost, cost[:, [via]] + cost[[via], :])
+    return cost
+
+
+def _estimates(task: Task, sizes: TaskSizes, subgoals: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """P_S, R_S and R_F. What implies more is less likely and lies farther away."""
+    shape = (subgoals, task.sizes.classes)
+    confident = rng.random(shape) < rng.uniform(0.0, 0.7)
+    extreme = np.where(rng.random(shape) < 0.15, rng.uniform(0.9, 0.995, shape), rng.uniform(0.005, 0.1, shape))
+    probability = np.where(confident, extreme, rng.uniform(0.05, 0.75, shape))
+    probability[rng.random(shape) < 0.05] = 0.0
+    success = rng.uniform(3.0, 60.0, shape)
+    failure = rng.uniform(5.0, 80.0, shape)
+    implies = task.outcomes.implies[: shape[1], : shape[1]]
+    probability = np.where(implies, probability[:, None, :], np.inf).min(axis=2)
+    success = np.where(implies, success[:, None, :], 0.0).max(axis=2)
+    return {
+        name: np.pad(values, [(0, 0), (0, sizes.classes - shape[1])], constant_values=fill)
+        for name, values, fill in (
+            ("success_probability", probability, 0.0),
+            ("success_cost", success, 1.0),
+            ("failure_cost", failure, 0.0),
+        )
+    }
