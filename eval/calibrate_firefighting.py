@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.firefighting import Firefighting, FirefightingConfig
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.planning.product import product_distances, product_transitions
@@ -90,6 +91,7 @@ def _figures(values: list[float], paper: float, drawn: int) -> dict:
 
 def main() -> None:
     """Command line."""
+    enable_compilation_cache()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", type=int, default=100, help="possible worlds per task")
     parser.add_argument(

@@ -2,7 +2,7 @@
 
 Suites:
   firefighting  155 worlds × 4 tasks in full-size fire-fighting buildings
-  rooms         160 floors of 48 to 128 cells a side with as many formulas (next, cycles, several cubes)
+  rooms         180 floors of 48 to 128 cells a side with as many formulas (next, cycles, several cubes)
   maps          real ROS maps of POTLP_EXTERNAL_DATA with places drawn at random, 52 trials
   revealed      125 fire-fighting worlds × 4 tasks, every policy on a fully revealed map: exactly the known-map cost
 
@@ -29,6 +29,7 @@ import numpy as np
 
 from eval.audit import problems_of
 from eval.formulas import random_tasks, traits
+from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.map_server import load_map
 from potlp_jax.environments.places import Disc, Places
@@ -44,7 +45,7 @@ from potlp_jax.world.sensing import SensorConfig
 
 POLICIES = tuple(policy.value for policy in Policy)
 WORLDS = {"firefighting": 155, "revealed": 125}
-FORMULAS = 160
+FORMULAS = 180
 """A few of the random formulas ask for something in the first steps, which no floor offers."""
 ROOMS_SIZES = TaskSizes(states=8, propositions=3, edges=16, classes=16, compound=5, cubes=3)
 MAPS = {
@@ -231,6 +232,7 @@ def _line(policy: str, rows: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Command line."""
+    enable_compilation_cache()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("suites", nargs="*", metavar="SUITE", help="firefighting, rooms, maps or revealed")
     parser.add_argument("--out", type=Path, default=Path("docs/results/trials"))

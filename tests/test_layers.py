@@ -7,7 +7,21 @@ import pytest
 
 import potlp_jax
 
-ORDER = ("types", "task", "world", "environments", "planning", "learning", "records", "trial", "sweep", "view", "cli")
+ORDER = (
+    "types",
+    "task",
+    "world",
+    "environments",
+    "planning",
+    "learning",
+    "records",
+    "trial",
+    "sweep",
+    "view",
+    "bench",
+    "cache",
+    "cli",
+)
 PACKAGE = Path(potlp_jax.__file__).parent
 
 

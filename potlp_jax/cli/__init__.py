@@ -4,12 +4,16 @@ Here are the commands' options and help texts; what a command does is in the fil
 when a command runs, so that help is quick.
 """
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.cli.output import clear_errors, package_version
+
+NO_CACHE = "--no-cache"
 
 app = typer.Typer(
     name="potlp",
@@ -73,8 +77,15 @@ def potlp(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and leave.")
     ] = False,
+    no_cache: Annotated[
+        bool,
+        typer.Option(
+            NO_CACHE,
+            help="Do not keep compiled programs in your cache folder for the next start (nor with POTLP_NO_CACHE=1).",
+        ),
+    ] = False,
 ) -> None:
-    """The options of ``potlp`` itself."""
+    """The options of ``potlp`` itself; ``main`` heeds ``no_cache``."""
 
 
 @app.command(
@@ -211,6 +222,87 @@ def explain_command(
     explain_decision(decision, out, depth, json)
 
 
+@app.command(
+    "export",
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp export "!fire U exit" --out planner[/cyan] - the search, for distances of your own
+
+[cyan]potlp export "F a & F b" --height 64 --width 64 --subgoals 8 --batch any --out planner[/cyan]
+
+[dim]planner/manifest.json names every input and output; docs/planner.md shows how to call the programs.[/dim]
+""",
+)
+@clear_errors
+def export_command(
+    formula: Annotated[
+        str,
+        typer.Argument(
+            metavar="FORMULA", help="A co-safe formula in Spot's syntax, the name of a shipped task, or a .hoa file."
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the programs and manifest.json.")],
+    propositions: Annotated[
+        str | None, typer.Option("--propositions", "-p", help="All propositions, in the order of a letter's bits: a,b.")
+    ] = None,
+    height: Annotated[int | None, typer.Option(min=1, help="Rows of the map, for the whole decision.")] = None,
+    width: Annotated[int | None, typer.Option(min=1, help="Columns of the map, for the whole decision.")] = None,
+    subgoals: Annotated[int, typer.Option(min=1, help="Length of the array of subgoals.")] = 12,
+    simulations: Simulations = None,
+    batch: Annotated[
+        str | None, typer.Option(help="Problems per call: a number, or 'any'. Default: one, without a batch axis.")
+    ] = None,
+    platforms: Annotated[str, typer.Option(help="cpu, cuda, rocm, tpu; joined by commas.")] = "cpu,cuda",
+    json: Json = False,
+) -> None:
+    """Export the planner as programs of plain arrays that run with jax alone."""
+    from potlp_jax.cli.export import export_task
+
+    export_task(formula, propositions, height, width, subgoals, simulations, batch, platforms, out, json)
+
+
+@app.command(
+    "bench",
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp bench[/cyan] - search, distances and the whole decision
+
+[cyan]potlp bench --parts search --family firefighting --batches 1,64,256 --core 0[/cyan]
+
+[cyan]potlp bench --parts decision --environment firefighting --json[/cyan]
+
+[dim]Compiled anew for every measurement: the cache of compiled programs is left out.[/dim]
+""",
+)
+@clear_errors
+def bench_command(
+    parts: Annotated[
+        str, typer.Option("--parts", help="search, distances, decision; joined by commas.")
+    ] = "search,distances,decision",
+    family: Annotated[str, typer.Option(help="Family of benchmark problems for the search.")] = "three-single",
+    subgoals: Annotated[int, typer.Option(min=1, help="Subgoals of the problems for the search.")] = 8,
+    batches: Annotated[str, typer.Option(help="Problems searched at once; joined by commas.")] = "1,16,64",
+    simulations: Simulations = None,
+    environment: Annotated[
+        str, typer.Option("--environment", "-e", help="Where distances and decisions are made.")
+    ] = "rooms",
+    task: TaskName = "1",
+    size: Annotated[int, typer.Option(min=21, help="Cells a side of a floor of rooms.")] = 64,
+    sources: Annotated[int, typer.Option(min=1, help="Places from which to measure distances.")] = 16,
+    repeats: Annotated[int, typer.Option(min=1, help="Timed runs, of which the median is shown.")] = 5,
+    core: Annotated[int | None, typer.Option(min=0, help="Stay on this core, with one thread.")] = None,
+    json: Json = False,
+) -> None:
+    """Measure the planner on this machine: times of compiling and running, throughput, memory."""
+    from potlp_jax.cli.bench import run_bench
+
+    run_bench(parts, family, subgoals, batches, simulations, environment, task, size, sources, repeats, core, json)
+
+
 def main() -> None:
-    """Entry point of the ``potlp`` script."""
+    """Entry point of the ``potlp`` script. Only here is the cache turned on: ``app`` may run within other programs."""
+    if NO_CACHE not in sys.argv[1:]:
+        enable_compilation_cache()
     app()

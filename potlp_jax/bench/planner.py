@@ -1,0 +1,277 @@
+"""The planner's parts measured one by one: search, distances, and the whole decision by phase."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, ArrayLike, Bool, Int32
+
+from potlp_jax.bench.memory import tree_memory
+from potlp_jax.bench.timing import Timing, compile_call
+from potlp_jax.environments import make
+from potlp_jax.environments.rooms import Rooms, RoomsConfig
+from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.learning.labels import TrueMapEstimator
+from potlp_jax.planning.estimates import Estimator
+from potlp_jax.planning.families import family_problem
+from potlp_jax.planning.policies import DecisionConfig, Move, Policy, Situation, assess, decide, planning_problem
+from potlp_jax.planning.pouct import SearchConfig, plan_actions, search
+from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.product import grid_distances, product_distances, product_transitions, shortest_path
+from potlp_jax.task.task import Task, TaskArrays
+from potlp_jax.types import NO_STATE
+from potlp_jax.world.grid import BeliefMap, World
+from potlp_jax.world.sensing import SensorConfig, observe
+
+LOOKS: int = 3
+"""Places from which a scene has been observed: enough for several frontiers, few enough to leave most unknown."""
+
+
+@struct.dataclass(kw_only=True)
+class Scene:
+    """A robot in the middle of a task: what it knows, and the answers to what it does not.
+
+    Attributes:
+      belief: what has been observed so far.
+      cell: the robot's cell.
+      state: the automaton's state, the letter of the robot's cell read.
+      task: arrays of the task.
+      estimator: the true map's.
+    """
+
+    belief: BeliefMap
+    cell: Int32[Array, "*batch 2"]
+    state: Int32[Array, "*batch"]
+    task: TaskArrays
+    estimator: Estimator
+
+
+def make_scene(world: World, task: Task, sensor: SensorConfig = SensorConfig(), looks: int = LOOKS) -> Scene:
+    """A scene in a world: observed from the start, then each time from the farthest cell that known space reaches."""
+    belief, cell = observe(BeliefMap.unobserved(world), world, world.start, sensor), world.start
+    for _ in range(looks - 1):
+        way = np.asarray(grid_distances(belief.free, cell, belief.resolution))
+        farthest = np.unravel_index(np.argmax(np.where(np.isfinite(way), way, -1.0)), way.shape)
+        cell = jnp.asarray(farthest, jnp.int32)
+        belief = observe(belief, world, cell, sensor)
+    letter = int(belief.letters[cell[0], cell[1]])
+    return Scene(
+        belief=belief,
+        cell=cell,
+        state=jnp.int32(task.dfa.transitions[task.dfa.initial, letter]),
+        task=task.arrays,
+        estimator=TrueMapEstimator(world=world),
+    )
+
+
+def make_world(environment: str, size: int, index: int = 0) -> World:
+    """World ``index`` of the validation split; ``size`` is the side of a floor of ``rooms`` and ignored elsewhere."""
+    generator = Rooms(RoomsConfig(smallest=size, largest=size)) if environment == "rooms" else make(environment)
+    return generator.generate(world_key(Split.VALIDATION, index, generator.name))
+
+
+def family_batch(family: str, subgoals: int, count: int) -> PlanningProblem:
+    """The first tuning problems of a benchmark family, stacked along a leading axis."""
+    problems = [family_problem(family, subgoals, "tuning", index) for index in range(count)]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems)
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchRow:
+    """A batch of searches.
+
+    ``simulations`` were asked for per search, ``simulations_run`` were run in all (a search may end early);
+    ``mean_depth`` is the number of actions that a simulation takes, on average, None where the tree does not count.
+    """
+
+    family: str
+    subgoals: int
+    actions: int
+    states: int
+    batch: int
+    simulations: int
+    simulations_run: int
+    tree_bytes: int
+    batch_tree_bytes: int
+    mean_depth: float | None
+    simulations_per_s: float
+    searches_per_s: float
+    timing: Timing
+
+
+def measure_search(family: str, subgoals: int, batch: int, config: SearchConfig, repeats: int) -> SearchRow:
+    """Search the first ``batch`` tuning problems of a family in lockstep."""
+    problems, keys = family_batch(family, subgoals, batch), jax.random.split(jax.random.key(0), batch)
+    tree_bytes = tree_memory(family_problem(family, subgoals, "tuning", 0), config).total
+    call = compile_call(search, problems, keys, config, static_argnums=2)
+    timing = call.timing(repeats)
+    _, tree = call.run()
+    simulations = int(np.asarray(tree.simulations).sum())
+    return SearchRow(
+        family=family,
+        subgoals=subgoals,
+        actions=problems.action_count,
+        states=problems.task.transitions.shape[-2],
+        batch=batch,
+        simulations=config.simulations,
+        simulations_run=simulations,
+        tree_bytes=tree_bytes,
+        batch_tree_bytes=batch * tree_bytes,
+        mean_depth=mean_depth(getattr(tree, "steps", None), tree.simulations),
+        simulations_per_s=simulations / timing.run_s,
+        searches_per_s=batch / timing.run_s,
+        timing=timing,
+    )
+
+
+def mean_depth(steps: ArrayLike | None, simulations: ArrayLike) -> float | None:
+    """Actions per simulation, over all trees: one ends at acceptance, at a dead end or at a new node.
+
+    ``steps`` are the actions that a tree's simulations took in all, None where it does not count them.
+    """
+    return None if steps is None else float(np.asarray(steps).sum() / max(np.asarray(simulations).sum(), 1))
+
+
+@dataclasses.dataclass(frozen=True)
+class DistanceRow:
+    """Shortest ways from ``sources`` product states to every cell in every state."""
+
+    height: int
+    width: int
+    states: int
+    sources: int
+    reached: float
+    ms_per_source: float
+    timing: Timing
+
+
+def measure_distances(scene: Scene, sources: int, repeats: int) -> DistanceRow:
+    """Distances on the true map of the scene, from the robot and cells drawn at random, in its state.
+
+    ``reached`` is the share of product states that the average source reaches.
+    """
+    world = _world_of(scene)
+    known = BeliefMap.revealed(world)
+    moves = product_transitions(scene.task, known.letters, known.free)
+    # As in a decision: nothing is left to do after acceptance.
+    transitions = jnp.where(scene.task.accepting[None, None, :], NO_STATE, moves)
+    reachable = np.isfinite(np.asarray(grid_distances(known.free, scene.cell, known.resolution)))
+    cells = _spread(reachable, np.asarray(scene.cell), sources)
+    states = jnp.broadcast_to(scene.state, (sources,))
+    arguments = (transitions, known.free, jnp.asarray(cells, jnp.int32), states, known.resolution)
+    call = compile_call(product_distances, *arguments)
+    timing = call.timing(repeats)
+    height, width, count = transitions.shape
+    return DistanceRow(
+        height=height,
+        width=width,
+        states=count,
+        sources=sources,
+        reached=float(np.isfinite(np.asarray(call.run())).mean()),
+        ms_per_source=1e3 * timing.run_s / sources,
+        timing=timing,
+    )
+
+
+def _spread(mask: Bool[np.ndarray, "H W"], first: Int32[np.ndarray, "2"], count: int) -> Int32[np.ndarray, "count 2"]:
+    """``first`` and cells drawn evenly, always the same, from those where the mask is True."""
+    cells = np.argwhere(mask)
+    drawn = np.random.default_rng(0).integers(len(cells), size=count - 1)
+    return np.concatenate([first[None], cells[drawn]]).astype(np.int32)
+
+
+def _world_of(scene: Scene) -> World:
+    if not isinstance(scene.estimator, TrueMapEstimator):
+        raise ValueError("the scene's estimator is not the true map's: there is no world to measure distances in")
+    return scene.estimator.world
+
+
+@dataclasses.dataclass(frozen=True)
+class PhaseRow:
+    """One phase of a decision, or all of it (``whole``), each compiled as a program of its own."""
+
+    phase: str
+    per_s: float
+    timing: Timing
+
+
+def measure_decision(scene: Scene, config: DecisionConfig, repeats: int) -> list[PhaseRow]:
+    """The phases of PO-TLP's decision in their order, each fed with the results of those before, then the whole.
+
+    * assess: distances from the robot, frontiers, subgoals
+    * estimates: the true map's answers for every subgoal and outcome class
+    * travel: distances between subgoals, as a planning problem
+    * search: PO-UCT
+    * path: the way to the target
+    """
+    key = jax.random.key(0)
+    rows: list[PhaseRow] = []
+
+    def phase(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        call = compile_call(function, *arguments)
+        timing = call.timing(repeats)
+        rows.append(PhaseRow(phase=name, per_s=1.0 / timing.run_s, timing=timing))
+        return call.run()
+
+    situation = phase(
+        "assess",
+        lambda belief, cell, state, task: assess(belief, cell, state, task, config.frontiers),
+        scene.belief,
+        scene.cell,
+        scene.state,
+        scene.task,
+    )
+    estimates = phase(
+        "estimates",
+        lambda estimator, belief, subgoals, task: estimator(belief, subgoals, task),
+        scene.estimator,
+        scene.belief,
+        situation.subgoals,
+        scene.task,
+    )
+    problem = phase(
+        "travel", lambda situation, estimates: planning_problem(situation, estimates, config), situation, estimates
+    )
+    phase("search", lambda problem, key: plan_actions(problem, key, config.search), problem, key)
+
+    def whole(scene: Scene, key: Array) -> Move:
+        return decide(
+            scene.belief,
+            scene.cell,
+            scene.state,
+            scene.task,
+            scene.estimator,
+            key,
+            policy=Policy.ORACLE,
+            config=config,
+        )
+
+    call = compile_call(whole, scene, key)
+    timing, move = call.timing(repeats), call.run()
+    phase("path", lambda situation, move: _path(situation, move, config), situation, move)
+    rows.append(PhaseRow(phase="whole", per_s=1.0 / timing.run_s, timing=timing))
+    return rows
+
+
+def _path(situation: Situation, move: Move, config: DecisionConfig) -> Any:
+    return shortest_path(
+        situation.distances,
+        situation.transitions,
+        situation.belief.free,
+        situation.cell,
+        situation.state,
+        move.target_cell,
+        move.target_state,
+        horizon=config.horizon(*situation.belief.cells.shape),
+        resolution=situation.belief.resolution,
+    )
+
+
+def as_dict(row: SearchRow | DistanceRow | PhaseRow) -> dict[str, Any]:
+    """A row, JSON-able, its timing flattened into it."""
+    fields = {field.name: getattr(row, field.name) for field in dataclasses.fields(row) if field.name != "timing"}
+    return {**fields, **row.timing.as_dict()}

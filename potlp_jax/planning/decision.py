@@ -1,0 +1,91 @@
+"""A decision from estimates that are already there: for callers who bring their own estimator, or their own map.
+
+``policies.decide`` asks an estimator in the middle of a decision. Here the decision is cut in two pure functions, so
+that whatever happens in between is the caller's: ``frontier_subgoals`` says where estimates are wanted, and
+``decide_from_estimates`` takes them. Both run under jit, vmap and scan.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int32, PRNGKeyArray
+
+from potlp_jax.planning.estimates import Estimates
+from potlp_jax.planning.policies import DecisionConfig, Move, assess, search_move
+from potlp_jax.task.task import TaskArrays
+from potlp_jax.types import NO_SUBGOAL, UNREACHABLE, status_array
+from potlp_jax.world.frontiers import Subgoals
+from potlp_jax.world.grid import BeliefMap
+
+
+def frontier_subgoals(
+    belief: BeliefMap,
+    cell: Int32[Array, "2"],
+    state: Int32[Array, ""],
+    task: TaskArrays,
+    config: DecisionConfig = DecisionConfig(),
+) -> Subgoals:
+    """The subgoals of a belief, nearest first by product distance from the robot (MODEL.md section 6).
+
+    Args:
+      belief: what is known of the map.
+      cell: the robot's cell.
+      state: the automaton's state, the letter of the robot's cell read.
+      task: arrays of the task.
+      config: ``config.frontiers`` is what matters here.
+    """
+    return assess(belief, cell, state, task, config.frontiers).subgoals
+
+
+def subgoals_at(cells: Int32[Array, "S 2"], mask: Bool[Array, " S"], height: int, width: int) -> Subgoals:
+    """Subgoals of the caller's own, on a map of this size: known free cells where the robot may leave known space.
+
+    What only the library's own search for frontiers knows (sizes, distances, components) is left empty.
+    """
+    count = mask.shape[0]
+    return Subgoals(
+        cells=cells,
+        mask=mask,
+        size=mask.astype(jnp.int32),
+        distance=jnp.full(count, UNREACHABLE, jnp.float32),
+        component=jnp.full((height, width), NO_SUBGOAL, jnp.int32),
+        frontier=jnp.zeros((height, width), bool),
+        status=status_array(),
+    )
+
+
+def decide_from_estimates(
+    belief: BeliefMap,
+    subgoals: Subgoals,
+    estimates: Estimates,
+    task: TaskArrays,
+    cell: Int32[Array, "2"],
+    state: Int32[Array, ""],
+    key: PRNGKeyArray,
+    config: DecisionConfig = DecisionConfig(),
+) -> Move:
+    """The next move of PO-TLP (Bradley et al. 2021, Algorithm 1): choice and path target.
+
+    Pure; jit with ``config`` static. With the subgoals of ``frontier_subgoals`` and the estimates of an estimator the
+    move is that of ``policies.decide`` with the same estimator and key.
+
+    Args:
+      belief: what is known of the map.
+      subgoals: where the robot may leave known space: ``cells`` and ``mask`` matter. ``frontier_subgoals`` finds
+        them, or they are the caller's own, by ``subgoals_at``.
+      estimates: P_S, R_S and R_F for these subgoals, in their order.
+      task: arrays of the task.
+      cell: the robot's cell.
+      state: the automaton's state, the letter of the robot's cell read.
+      key: drives the search.
+      config: settings; ``config.frontiers`` counts where no action is available and the robot falls back on the
+        nearest frontier.
+    """
+    situation = assess(belief, cell, state, task, config.frontiers)
+    given = dataclasses.replace(situation.subgoals, cells=subgoals.cells, mask=subgoals.mask)
+    return search_move(dataclasses.replace(situation, subgoals=given), estimates, key, config)
+
+
+decide_from_estimates_jit = jax.jit(decide_from_estimates, static_argnames="config")
+"""``decide_from_estimates`` compiled: one compilation per configuration and array shapes."""

@@ -1,0 +1,244 @@
+"""Measuring, memory known in advance, the cache of compiled programs, and `potlp bench` and `potlp export`."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from potlp_jax.bench.memory import tree_memory
+from potlp_jax.bench.planner import as_dict, make_scene, mean_depth, measure_decision, measure_distances
+from potlp_jax.bench.timing import Timing, compile_call, environment, measure, timed_runs
+from potlp_jax.cache import SWITCH, cache_folder, enable_compilation_cache, machine_fingerprint
+from potlp_jax.cli import app
+from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.environments.toy import Toy
+from potlp_jax.planning.families import family_problem
+from potlp_jax.planning.policies import DecisionConfig
+from potlp_jax.planning.pouct import SearchConfig, search_tree
+from potlp_jax.task.task import Task
+from potlp_jax.world.frontiers import FrontierConfig
+
+QUICK = SearchConfig(simulations=12)
+
+
+def _potlp(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def _run(program, **variables):
+    """A fresh process on one core's worth of imports; returns what it printed as JSON."""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, env={**os.environ, **variables}
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout), done.stderr
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return family_problem("find", 2, "tuning", 0)
+
+
+@pytest.fixture(scope="module")
+def tree(problem):
+    return jax.jit(search_tree, static_argnums=2)(problem, jax.random.key(0), QUICK)[1]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    toy = Toy()
+    task = Task.from_formula(toy.tasks["1"], toy.propositions)
+    return make_scene(toy.generate(world_key(Split.VALIDATION, 0, toy.name)), task, looks=1)
+
+
+def test_a_measurement_runs_the_function_and_keeps_phases_apart():
+    calls = []
+
+    def traced(values, power):
+        calls.append(power)
+        return values**power
+
+    timing = measure(traced, jnp.arange(4.0), 3, repeats=4, static_argnums=1)
+    assert calls == [3]
+    assert len(timing.runs_s) == 4
+    assert timing.compile_s > 0
+    assert timing.trace_s > 0
+    assert min(timing.runs_s) > 0
+
+
+def test_a_compiled_call_computes_what_the_function_computes():
+    call = compile_call(
+        lambda first, factor, second: first * factor + second["x"], jnp.ones(3), 2, {"x": jnp.ones(3)}, static_argnums=1
+    )
+    np.testing.assert_array_equal(call.run(), 3 * np.ones(3))
+
+
+def test_the_same_function_is_compiled_anew_for_each_measurement():
+    calls = []
+
+    def traced(values):
+        calls.append(1)
+        return values + 1.0
+
+    for _ in range(2):
+        compile_call(traced, jnp.zeros(2))
+    assert len(calls) == 2
+
+
+def test_a_run_ends_when_its_results_are_ready():
+    slow = timed_runs(lambda: time.sleep(0.02), 3)
+    assert len(slow) == 3
+    assert min(slow) >= 0.02
+
+
+def test_a_timing_reports_the_median_and_the_spread():
+    timing = Timing(trace_s=1.0, compile_s=2.0, runs_s=(5.0, 1.0, 3.0), memory=None)
+    assert timing.run_s == 3.0
+    told = timing.as_dict()
+    assert (told["run_s"], told["run_min_s"], told["run_max_s"], told["repeats"]) == (3.0, 1.0, 5.0, 3)
+    with pytest.raises(ValueError, match="repeats is 0"):
+        measure(lambda: jnp.zeros(1), repeats=0)
+
+
+def test_memory_of_a_tree_from_shapes_is_what_a_search_allocates(problem, tree):
+    told = tree_memory(problem, QUICK)
+    assert told.total == sum(leaf.nbytes for leaf in jax.tree.leaves(tree))
+    assert told.nodes == QUICK.capacity
+    assert told.arrays["q_values"] == tree.q_values.nbytes
+
+
+def test_memory_of_a_tree_too_large_to_allocate_is_told(problem):
+    small = tree_memory(problem, dataclasses.replace(QUICK, tree_capacity=2**10))
+    large = tree_memory(problem, dataclasses.replace(QUICK, tree_capacity=2**24))
+    assert large.total == pytest.approx(2**14 * small.total, rel=0.01)
+
+
+def test_mean_depth_is_actions_per_simulation():
+    assert mean_depth(np.array([30, 10]), np.array([10, 10])) == 2.0
+    assert mean_depth(None, np.array([10, 10])) is None
+
+
+def test_phases_of_a_decision_and_distances(scene):
+    config = DecisionConfig(frontiers=FrontierConfig(max_subgoals=2), search=QUICK)
+    rows = measure_decision(scene, config, repeats=1)
+    assert [row.phase for row in rows] == ["assess", "estimates", "travel", "search", "path", "whole"]
+    distances = measure_distances(scene, sources=2, repeats=1)
+    assert distances.sources == 2
+    assert 0 < distances.reached <= 1
+    for row in (*rows, distances):
+        assert json.loads(json.dumps(as_dict(row), allow_nan=False))["run_s"] > 0
+
+
+def test_environment_says_where_it_was_measured():
+    told = environment()
+    assert told["jax"] == jax.__version__
+    assert told["platform"] == jax.devices()[0].platform
+    assert 1 <= told["usable_cores"] <= told["cores"]
+    assert told["threads"] == ("one" if told["usable_cores"] == 1 else "default")
+
+
+def test_bench_prints_json(problem):
+    told = _potlp(
+        *("bench", "--parts", "search", "--family", "find", "--subgoals", 2, "--batches", "2"),
+        *("--simulations", 12, "--repeats", 1, "--json"),
+    )
+    assert told.exit_code == 0, told.stderr
+    (row,) = json.loads(told.stdout)["rows"]["search"]
+    assert (row["batch"], row["actions"], row["simulations"]) == (2, problem.action_count, 12)
+    assert row["tree_bytes"] == tree_memory(problem, dataclasses.replace(DecisionConfig().search, simulations=12)).total
+    assert row["batch_tree_bytes"] == 2 * row["tree_bytes"]
+    assert 0 < row["simulations_run"] <= 2 * 12
+    assert row["simulations_per_s"] == pytest.approx(row["simulations_run"] / row["run_s"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("bench", "--parts", "everything"), "everything"),
+        (("bench", "--batches", "1,x"), "1,x"),
+        (("bench", "--family", "none"), "three-single"),
+        (("export", "F a", "--height", "5", "--out", "out"), "--width"),
+        (("export", "F a", "--batch", "some", "--out", "out"), "some"),
+        (("export", "F a", "--platforms", "abacus", "--out", "out"), "abacus"),
+    ],
+)
+def test_wrong_input_is_named(arguments, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    told = _potlp(*arguments)
+    assert told.exit_code == 2
+    assert message in told.stderr
+
+
+def test_export_writes_the_search(tmp_path):
+    pytest.importorskip("flatbuffers", reason="jax writes exported programs with flatbuffers")
+    told = _potlp(
+        *("export", "F a", "--subgoals", 1, "--simulations", 4, "--platforms", "cpu", "--out", tmp_path, "--json")
+    )
+    assert told.exit_code == 0, told.stderr
+    manifest = json.loads(told.stdout)["manifest"]
+    assert list(manifest["functions"]) == ["plan"]
+    assert manifest["config"]["decision"]["search"]["simulations"] == 4
+    assert {path.name for path in tmp_path.iterdir()} == {"plan.jaxexport", "task.hoa", "manifest.json"}
+
+
+def test_importing_the_package_leaves_the_cache_off(tmp_path):
+    told, _ = _run(
+        "import json, jax, potlp_jax, potlp_jax.cli\nprint(json.dumps(jax.config.values['jax_compilation_cache_dir']))",
+        XDG_CACHE_HOME=str(tmp_path),
+    )
+    assert told is None
+
+
+CACHED = """
+import json, jax
+from potlp_jax.cache import enable_compilation_cache
+hits = []
+jax.monitoring.register_event_listener(lambda event, **_: hits.append(event.endswith("/cache_hits")))
+folder = enable_compilation_cache()
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+from potlp_jax.planning.families import family_problem
+from potlp_jax.planning.pouct import SearchConfig, plan_actions
+problem = family_problem("find", 2, "tuning", 0)
+plan = jax.jit(plan_actions, static_argnums=2)(problem, jax.random.key(0), SearchConfig(simulations=12))
+print(json.dumps({"folder": str(folder), "hits": sum(hits), "q": repr(plan.q_values.tolist())}))
+"""
+
+
+def test_a_second_process_finds_what_the_first_compiled(tmp_path):
+    first, _ = _run(CACHED, XDG_CACHE_HOME=str(tmp_path))
+    second, said = _run(CACHED, XDG_CACHE_HOME=str(tmp_path))
+    assert first["folder"].startswith(str(tmp_path))
+    assert second["hits"] > first["hits"]
+    assert second["q"] == first["q"]
+    assert "prefer-no-" not in said
+
+
+def test_the_switch_turns_the_cache_off(tmp_path, monkeypatch):
+    monkeypatch.setenv(SWITCH, "1")
+    assert enable_compilation_cache(tmp_path) is None
+
+
+def test_a_folder_that_others_may_write_to_is_not_used(tmp_path, monkeypatch):
+    monkeypatch.delenv(SWITCH, raising=False)
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    tmp_path.chmod(0o777)
+    assert enable_compilation_cache(tmp_path) is None
+    file = tmp_path / "file"
+    file.touch()
+    assert enable_compilation_cache(file / "below") is None
+
+
+def test_each_kind_of_machine_has_its_own_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    here = machine_fingerprint()
+    assert cache_folder() == tmp_path / "potlp-jax" / here
+    monkeypatch.setattr("platform.machine", lambda: "another")
+    assert machine_fingerprint() != here
