@@ -1,0 +1,455 @@
+"""How far from the optimum are planners, by the CPU time they take?
+
+    python -m eval.bench.regret --families find two --subgoals 4 8 --instances 12
+    python -m eval.bench.regret --quick
+
+The truth - Q of every root action by Eq. 3 - is computed once and kept. Where the exact solution does not fit into the
+time allowed, V* is bounded by a certified interval, and regrets are measured against the best that is known: our own
+search with full optimism and BEST_KNOWN simulations; such instances are counted apart. The regret of a choice is its Q
+less the least Q, absolute and in % of V* less its dead-end part: what a dead end costs is a parameter, and would hide
+everything else where it is likely.
+
+Rows of earlier runs into the same folder are kept where the new run does not repeat them.
+
+CPU time is that of the whole process per decision, compilation and the preparation on the host apart: batched
+planners' time is divided by the rows. Writes ``regret.json``, ``regret.md`` and ``regret-S<S>.png``.
+"""
+
+import argparse
+import functools
+import hashlib
+import importlib.util
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+
+from potlp_jax.planning.exact import ProblemTooLargeError, bound_exact, solve_exact
+from potlp_jax.planning.families import FAMILIES, SUBGOAL_COUNTS, Split, family_problem
+from potlp_jax.planning.pouct import plan_actions
+from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.search_kernel import (
+    Context,
+    SearchConfig,
+    SearchMode,
+    Tree,
+    choose,
+    is_open,
+    new_search,
+    simulate,
+)
+from potlp_jax.types import NO_ACTION
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+
+GOAL_PERCENT = 1.0
+
+BEST_KNOWN = 10_000
+"""Simulations with full optimism that stand in for the exact solution where that is out of reach."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the root actions of an instance cost.
+
+    Attributes:
+      q_values: ``[A]``, Q, inf where the action is not available; the best that is known where not ``exact``.
+      lower, upper: certified bounds of V*, equal where ``exact``.
+      dead_end_part: how much of V* comes from dead ends; from below where the truth is not exact.
+      exact: whether Q is known.
+    """
+
+    q_values: np.ndarray
+    lower: float
+    upper: float
+    dead_end_part: float
+    exact: bool
+
+    def regret(self, action: int) -> float:
+        """Absolute regret of an action; inf for none."""
+        return float("inf") if action == NO_ACTION else float(self.q_values[action] - self.q_values.min())
+
+    @property
+    def scale(self) -> float:
+        """V* without its dead-end part."""
+        return float(self.q_values.min()) - self.dead_end_part
+
+
+@dataclass(frozen=True)
+class Row:
+    """One planner at one budget on one family and S. ``percent`` and ``absolute`` are per instance; ``exact`` tells
+    where the truth is exact, ``interval_percent`` how wide the certified interval of V* is where not."""
+
+    split: str
+    family: str
+    subgoals: int
+    planner: str
+    budget: int
+    cpu_ms: float
+    instances: list[int]
+    percent: list[float]
+    absolute: list[float]
+    exact: list[bool]
+    interval_percent: list[float]
+
+    @property
+    def mean_percent(self) -> float:
+        """Mean regret in %."""
+        return float(np.mean(self.percent))
+
+
+Answer = tuple[str, int, float, list[int]]
+"""Planner, budget, CPU seconds per decision, chosen action of each instance."""
+
+
+def truth_of(problem: PlanningProblem, cache: Path, seconds: float) -> Truth:
+    """The truth of an instance, from the cache where that belongs to this very problem and took as long as allowed."""
+    digest = _fingerprint(problem)
+    if cache.exists():
+        with np.load(cache) as kept:
+            lower, upper, dead_end_part = (float(kept[name]) for name in ("lower", "upper", "dead_end_part"))
+            truth = Truth(kept["q_values"], lower, upper, dead_end_part, bool(kept["exact"]))
+            if str(kept["digest"]) == digest and (truth.exact or float(kept["seconds"]) >= seconds):
+                return truth
+    try:
+        solution = solve_exact(problem, seconds=seconds)
+        truth = Truth(solution.q_values, solution.value, solution.value, solution.dead_end_part, True)
+    except ProblemTooLargeError:
+        bounds = bound_exact(problem, seconds=seconds)
+        found = _long_search(problem, jax.random.key(0))
+        truth = Truth(np.asarray(found, np.float64), bounds.lower, bounds.upper, bounds.dead_end_part, False)
+    cache.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(cache, digest=digest, seconds=seconds, **asdict(truth))
+    return truth
+
+
+def _fingerprint(problem: PlanningProblem) -> str:
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(problem):
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()
+
+
+@jax.jit
+def _long_search(problem: PlanningProblem, key: Any) -> Any:
+    config = SearchConfig(simulations=BEST_KNOWN, optimism=1.0, max_depth=48)
+    return plan_actions(problem, key, config).q_values
+
+
+def ours(name: str, **settings: Any) -> Callable[..., Iterator[Answer]]:
+    """Our search on all instances in one batch; every budget goes on from the one before."""
+
+    def run(problems: Sequence[PlanningProblem], budgets: Sequence[int]) -> Iterator[Answer]:
+        config = SearchConfig(simulations=max(budgets), **settings)
+        leaves, structure = jax.tree.flatten(_stack(problems))
+        seeds = jax.vmap(lambda key: jax.random.bits(key, (2,), jnp.uint32))(
+            jax.random.split(jax.random.key(0), len(problems))
+        )
+        begin = jax.jit(lambda leaves, seeds: new_search(structure, leaves, seeds, config))
+
+        def unfinished(context: Context, carry: tuple[Any, Tree]) -> Any:
+            return (carry[0] > 0) & jnp.any(is_open(context, carry[1], config))
+
+        @jax.jit
+        def advance(context: Context, tree: Tree, count: Any) -> tuple[Tree, Any]:
+            def step(carry: tuple[Any, Tree]) -> tuple[Any, Tree]:
+                return carry[0] - 1, simulate(context, carry[1], config)
+
+            tree = jax.lax.while_loop(functools.partial(unfinished, context), step, (count, tree))[1]
+            return tree, choose(context, tree, config).action
+
+        jax.block_until_ready(advance(*begin(leaves, seeds), jnp.int32(1)))
+        start = time.process_time()
+        context, tree = jax.block_until_ready(begin(leaves, seeds))
+        spent, before = time.process_time() - start, 0
+        for budget in budgets:
+            start = time.process_time()
+            tree, action = jax.block_until_ready(advance(context, tree, jnp.int32(budget - before)))
+            spent, before = spent + time.process_time() - start, budget
+            yield name, budget, spent / len(problems), np.asarray(action).tolist()
+
+    return run
+
+
+def numba_pouct(problems: Sequence[PlanningProblem], budgets: Sequence[int]) -> Iterator[Answer]:
+    """The published algorithm in Numba; by its most visited action, and by the one of least mean cost."""
+    from eval.bench.opponents.pouct_numba import NumbaSearch
+
+    NumbaSearch(problems[0]).run(10)
+    yield from _one_by_one("numba", NumbaSearch, problems, budgets, {"": "most_visited", ", least mean": "least_mean"})
+
+
+def pomdp_py(problems: Sequence[PlanningProblem], budgets: Sequence[int]) -> Iterator[Answer]:
+    """pomdp-py's POUCT; its own answer is the action of the best mean."""
+    from eval.bench.opponents.pomdp_py_search import PomdpPySearch
+
+    PomdpPySearch(problems[0]).run(10)
+    yield from _one_by_one("pomdp-py", PomdpPySearch, problems, budgets, {"": "least_mean"})
+
+
+def mctx(problems: Sequence[PlanningProblem], budgets: Sequence[int]) -> Iterator[Answer]:
+    """mctx's stochastic MuZero search, twice as many of its simulations, 16 rows at a time."""
+    from eval.bench.opponents.mctx_search import mctx_plan
+
+    rows, key = min(16, len(problems)), jax.random.key(0)
+    for budget in budgets:
+        compiled = mctx_plan.lower(_stack(problems[:rows]), key, simulations=2 * budget).compile()
+        yield (
+            "mctx",
+            budget,
+            *_in_batches(
+                lambda batch, _, compiled=compiled: compiled(batch, key).action,
+                problems,
+                np.arange(len(problems)),
+                rows,
+            ),
+        )
+
+
+def _in_batches(
+    run: Callable[[PlanningProblem, Any], Any], problems: Sequence[PlanningProblem], keys: Any, rows: int
+) -> tuple[float, list[int]]:
+    """Run so many rows at once; returns CPU seconds per row and the action of every problem."""
+    seconds, actions = 0.0, []
+    for first in range(0, len(problems), rows):
+        # The last rows are filled up from the front, so that every call has the compiled shape.
+        first = min(first, len(problems) - rows)
+        batch = _stack(problems[first : first + rows])
+        start = time.process_time()
+        answers = np.asarray(run(batch, keys[first : first + rows]))
+        seconds += time.process_time() - start
+        actions[first:] = answers.tolist()
+    return seconds / (-(-len(problems) // rows) * rows), actions
+
+
+PLANNERS: dict[str, Callable[..., Iterator[Answer]]] = {
+    "ours": ours("ours"),
+    "authors_code": ours("ours, authors_code", mode=SearchMode.AUTHORS_CODE, exploration=50.0),
+    "numba": numba_pouct,
+    "pomdp-py": pomdp_py,
+    "mctx": mctx,
+}
+NEEDS = {"numba": ["numba"], "pomdp-py": ["numba", "pomdp_py"], "mctx": ["mctx"]}
+FEW = {"pomdp-py": 6}
+"""Instances of a planner too slow for all."""
+LARGEST = {"ours": 1000, "authors_code": 1000, "pomdp-py": 1000, "mctx": 1000}
+"""Budgets beyond which a planner is not asked: it gains no more, or takes too long."""
+
+
+def _one_by_one(
+    name: str, search: Any, problems: Sequence[PlanningProblem], budgets: Sequence[int], choices: dict[str, str]
+) -> Iterator[Answer]:
+    """A search of one problem that can be continued: every budget goes on from the one before."""
+    seconds = np.zeros((len(budgets), len(problems)))
+    found: dict[str, list[list[int]]] = {suffix: [[] for _ in budgets] for suffix in choices}
+    for column, problem in enumerate(problems):
+        one, before, spent = search(problem, seed=column), 0, 0.0
+        for level, budget in enumerate(budgets):
+            start = time.process_time()
+            one.run(budget - before)
+            spent, before = spent + time.process_time() - start, budget
+            seconds[level, column] = spent
+            statistics = one.statistics()
+            for suffix, choice in choices.items():
+                found[suffix][level].append(getattr(statistics, choice))
+    for suffix, levels in found.items():
+        for level, budget in enumerate(budgets):
+            yield name + suffix, budget, float(seconds[level].mean()), levels[level]
+
+
+def _stack(problems: Sequence[PlanningProblem]) -> PlanningProblem:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems)
+
+
+def benchmark(arguments: argparse.Namespace) -> Iterator[Row]:
+    """Every family, S, planner and budget in turn."""
+    for family in arguments.families:
+        for subgoals in arguments.subgoals:
+            chosen = list(_instances(arguments, family, subgoals))
+            print(
+                f"{family} S={subgoals}: {len(chosen)} of {arguments.instances} instances have a choice to make",
+                flush=True,
+            )
+            for name in arguments.planners if chosen else ():
+                few = chosen[: FEW.get(name, len(chosen))]
+                budgets = [budget for budget in arguments.budgets if budget <= LARGEST.get(name, budget)]
+                yield from _rows(arguments.split, (family, subgoals), few, PLANNERS[name], budgets)
+
+
+Instance = tuple[int, PlanningProblem, Truth]
+
+
+def _instances(arguments: argparse.Namespace, family: str, subgoals: int) -> Iterator[Instance]:
+    """Instances with something to do."""
+    for index in range(arguments.instances):
+        problem = family_problem(family, subgoals, arguments.split, index)
+        cache = Path(arguments.out) / "truth" / f"{family}-{subgoals}-{arguments.split}-{index}.npz"
+        truth = truth_of(problem, cache, arguments.seconds)
+        if np.isfinite(truth.q_values).any():
+            yield index, problem, truth
+
+
+def _rows(
+    split: str,
+    case: tuple[str, int],
+    chosen: Sequence[Instance],
+    planner: Callable[..., Iterator[Answer]],
+    budgets: list[int],
+) -> Iterator[Row]:
+    truths = [truth for _, _, truth in chosen]
+    for name, budget, seconds, actions in planner([problem for _, problem, _ in chosen], budgets):
+        absolute = [truth.regret(action) for truth, action in zip(truths, actions, strict=True)]
+        yield Row(
+            split=split,
+            family=case[0],
+            subgoals=case[1],
+            planner=name,
+            budget=budget,
+            cpu_ms=1e3 * seconds,
+            instances=[index for index, _, _ in chosen],
+            percent=[100.0 * regret / truth.scale for regret, truth in zip(absolute, truths, strict=True)],
+            absolute=absolute,
+            exact=[truth.exact for truth in truths],
+            interval_percent=[100.0 * (truth.upper - truth.lower) / truth.scale for truth in truths],
+        )
+
+
+def time_to_goal(rows: Sequence[Row]) -> float:
+    """CPU ms of the least budget from which on the mean regret stays within the goal; inf where it does not."""
+    reached = float("inf")
+    for row in sorted(rows, key=lambda row: -row.budget):
+        if row.mean_percent > GOAL_PERCENT:
+            break
+        reached = row.cpu_ms
+    return reached
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Markdown: CPU time to the goal, then everything."""
+    planners = list(dict.fromkeys(row.planner for row in rows))
+    cases = list(dict.fromkeys((row.family, row.subgoals) for row in rows))
+    lines = [f"CPU ms per decision to a mean regret of at most {GOAL_PERCENT:g} % (– where no budget gets there).", ""]
+    lines += ["| family | S | instances | " + " | ".join(planners) + " |", "|---|---|---|" + "---|" * len(planners)]
+    for family, subgoals in cases:
+        own = [row for row in rows if (row.family, row.subgoals) == (family, subgoals)]
+        times = [time_to_goal([row for row in own if row.planner == name]) for name in planners]
+        shown = [f"{t:.3g}" if np.isfinite(t) else "–" for t in times]
+        lines.append(f"| {family} | {subgoals} | {len(own[0].instances)} | " + " | ".join(shown) + " |")
+    lines += [
+        "",
+        "| family | S | planner | budget | CPU ms | mean % | worst % | mean | worst | not exact |",
+        "|---" * 10 + "|",
+    ]
+    for row in rows:
+        figures = (row.cpu_ms, row.mean_percent, max(row.percent), float(np.mean(row.absolute)), max(row.absolute))
+        lines.append(
+            f"| {row.family} | {row.subgoals} | {row.planner} | {row.budget} | "
+            + " | ".join(f"{figure:.3g}" for figure in figures)
+            + f" | {len(row.exact) - sum(row.exact)} of {len(row.exact)} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def plot(rows: Sequence[Row], subgoals: int, path: Path) -> None:
+    """Mean regret over CPU time, a panel a family."""
+    families = list(dict.fromkeys(row.family for row in rows))
+    planners = list(dict.fromkeys(row.planner for row in rows))
+    columns = min(4, len(families))
+    lines = -(-len(families) // columns)
+    figure, axes = plt.subplots(
+        lines,
+        columns,
+        figsize=(max(8.0, 4.0 * columns), 3.2 * lines + 0.8),
+        sharex=True,
+        sharey=True,
+        squeeze=False,
+        layout="constrained",
+    )
+    for axis, family in zip(axes.flat, families, strict=False):
+        for number, planner in enumerate(planners):
+            own = [row for row in rows if (row.family, row.planner) == (family, planner)]
+            times, regrets = [row.cpu_ms for row in own], [max(row.mean_percent, 1e-3) for row in own]
+            axis.plot(times, regrets, "osv^Dx*P"[number % 8] + "-", label=planner, color=f"C{number}", markersize=4)
+        axis.axhline(GOAL_PERCENT, color="0.6", linewidth=0.8, linestyle="--")
+        axis.set(xscale="log", yscale="log", title=family)
+        axis.grid(alpha=0.25)
+    for axis in axes.flat[len(families) :]:
+        axis.set_visible(False)
+    figure.supxlabel(f"CPU ms per decision, S = {subgoals} (drawn at 0.001 %: less than that)")
+    figure.supylabel("mean regret, %")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(6, len(labels)), frameon=False)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    splits = Split.__args__
+    parser.add_argument("--families", nargs="+", choices=list(FAMILIES), default=list(FAMILIES), metavar="NAME")
+    parser.add_argument("--subgoals", nargs="+", type=int, default=list(SUBGOAL_COUNTS), metavar="S")
+    parser.add_argument("--instances", type=int, default=24)
+    parser.add_argument("--split", choices=splits, default="test", help="tune on 'tuning' only")
+    parser.add_argument("--budgets", nargs="+", type=int, default=[10, 30, 100, 300, 1000, 10_000, 100_000])
+    parser.add_argument("--planners", nargs="+", choices=list(PLANNERS), default=list(PLANNERS), metavar="NAME")
+    parser.add_argument("--seconds", type=float, default=60.0, help="for the truth of one instance")
+    parser.add_argument("--quick", action="store_true", help="one family, S = 4, 6 tuning instances, two budgets")
+    parser.add_argument("--out", default="out/bench/regret")
+    parsed = parser.parse_args(arguments)
+    if parsed.quick:
+        parsed.families, parsed.subgoals, parsed.instances = ["two"], [4], 6
+        parsed.budgets, parsed.split = [30, 300], "tuning"
+    parsed.budgets = sorted(parsed.budgets)
+    for name in list(parsed.planners):
+        missing = [module for module in NEEDS.get(name, ()) if importlib.util.find_spec(module) is None]
+        if missing:
+            print(f"{name} is left out: {', '.join(missing)} is not installed (extra 'bench')")
+            parsed.planners.remove(name)
+    return parsed
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run, and write what was found after every row."""
+    parsed = parse(arguments)
+    out = Path(parsed.out)
+    out.mkdir(parents=True, exist_ok=True)
+    rows = _earlier(out / "regret.json", parsed.split)
+    for row in benchmark(parsed):
+        rows[row.family, row.subgoals, row.planner, row.budget] = row
+        print(
+            f"{row.family} S={row.subgoals} {row.planner} {row.budget}: {row.mean_percent:.3g} % mean, "
+            f"{max(row.percent):.3g} % worst, {row.cpu_ms:.3g} CPU ms",
+            flush=True,
+        )
+        content = {"arguments": vars(parsed), "rows": [asdict(row) for row in rows.values()]}
+        (out / "regret.json").write_text(json.dumps(content, indent=1))
+    ordered = sorted(rows.values(), key=lambda row: (list(FAMILIES).index(row.family), row.subgoals))
+    report(ordered, out)
+
+
+def report(rows: Sequence[Row], out: Path) -> None:
+    """Table and plots."""
+    (out / "regret.md").write_text(table(rows))
+    for subgoals in sorted({row.subgoals for row in rows}):
+        plot([row for row in rows if row.subgoals == subgoals], subgoals, out / f"regret-S{subgoals}.png")
+
+
+def _earlier(path: Path, split: str) -> dict[tuple[str, int, str, int], Row]:
+    """Rows of an earlier run on the same split."""
+    if not path.exists():
+        return {}
+    rows = [Row(**row) for row in json.loads(path.read_text())["rows"]]
+    return {(row.family, row.subgoals, row.planner, row.budget): row for row in rows if row.split == split}
+
+
+if __name__ == "__main__":
+    main()
