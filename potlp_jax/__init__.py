@@ -6,13 +6,14 @@ The public names, from a formula to a trial:
 * a world and what is known of it: ``World``, ``make_world``, ``BeliefMap``, ``SensorConfig``, ``observe``,
   ``Subgoals``, ``FrontierConfig``, ``find_subgoals``
 * planning: ``product_transitions``, ``product_distances``, ``Estimates``, ``PlanningProblem``, ``enumerate_actions``,
-  ``SearchConfig``, ``Plan``, ``plan_actions``, ``solve_exact``, ``DecisionConfig``, ``Policy``, ``decide``
+  ``SearchConfig``, ``Plan``, ``plan_actions``, ``solve_exact``, ``bound_exact``, ``Bounds``, ``ProblemTooLargeError``,
+  ``DecisionConfig``, ``Policy``, ``decide``
 * a whole trial: ``TrialConfig``, ``run_trial``, ``Trial``, ``Outcome``, ``load_trial``
 * sentinels and flags: ``NO_ACTION``, ``Status``
 """
 
 from potlp_jax.planning.estimates import Estimates
-from potlp_jax.planning.exact import solve_exact
+from potlp_jax.planning.exact import Bounds, ProblemTooLargeError, bound_exact, solve_exact
 from potlp_jax.planning.policies import DecisionConfig, Policy, decide
 from potlp_jax.planning.pouct import Plan, SearchConfig, plan_actions
 from potlp_jax.planning.problem import PlanningProblem, enumerate_actions
@@ -29,6 +30,7 @@ from potlp_jax.world.sensing import SensorConfig, observe
 __all__ = [
     "NO_ACTION",
     "BeliefMap",
+    "Bounds",
     "DecisionConfig",
     "Estimates",
     "FrontierConfig",
@@ -36,6 +38,7 @@ __all__ = [
     "Plan",
     "PlanningProblem",
     "Policy",
+    "ProblemTooLargeError",
     "SearchConfig",
     "SensorConfig",
     "Status",
@@ -47,6 +50,7 @@ __all__ = [
     "Trial",
     "TrialConfig",
     "World",
+    "bound_exact",
     "decide",
     "enumerate_actions",
     "find_subgoals",

@@ -5,7 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from potlp_jax.planning.exact import ProblemTooLarge, solve_exact
+from potlp_jax.planning import exact_search
+from potlp_jax.planning.exact import ProblemTooLargeError, bound_exact, solve_exact
+from potlp_jax.planning.families import FAMILIES, family_problem
 from potlp_jax.types import NO_ACTION, Status
 from tests.reference.planning import Recursion, ReferenceProblem
 from tests.reference.problems import FORMULAS, problem_of, random_fields, random_problem, task_of
@@ -145,8 +147,69 @@ def test_dead_ends_are_never_better_than_success(seed, formula):
 
 
 def test_too_large():
-    with pytest.raises(ProblemTooLarge, match="more than 5 states with 2 subgoals"):
-        solve_exact(random_problem("F a & F b", 2, 1, unreachable=0.0), max_states=5)
+    with pytest.raises(ProblemTooLargeError, match="more than 5 states or 60 s with 3 subgoals"):
+        solve_exact(random_problem("F a & F b", 3, 1, unreachable=0.0), max_states=5)
+
+
+def choose_from_the_start(monkeypatch):
+    """Let no problem be so small that it is searched breadth first."""
+    monkeypatch.setattr(exact_search, "_BREADTH", 1)
+    monkeypatch.setattr(exact_search, "_BATCH", 1)
+
+
+@given(formula=st.sampled_from(FORMULAS), subgoals=st.integers(1, 2), seed=st.integers(0, 10**6))
+@settings(max_examples=20, deadline=None)
+def test_best_first_search_equals_breadth_first_search(formula, subgoals, seed):
+    problem = random_problem(formula, subgoals, seed, unreachable=0.2, backward=bool(seed % 2))
+    expected = solve_exact(problem)
+    with pytest.MonkeyPatch.context() as patch:
+        choose_from_the_start(patch)
+        found = solve_exact(problem)
+    np.testing.assert_allclose(found.q_values, expected.q_values, rtol=1e-9)
+    np.testing.assert_allclose(found.dead_end_part, expected.dead_end_part, rtol=1e-6, atol=1e-9)
+
+
+@given(
+    formula=st.sampled_from(FORMULAS),
+    subgoals=st.integers(0, 3),
+    seed=st.integers(0, 10**6),
+    max_states=st.sampled_from([1, 20, 100]),
+)
+@settings(max_examples=40, deadline=None)
+def test_bounds_hold_the_optimum(formula, subgoals, seed, max_states):
+    problem = random_problem(formula, subgoals, seed, unreachable=0.3, backward=bool(seed % 2))
+    expected = solve_exact(problem)
+    with pytest.MonkeyPatch.context() as patch:
+        choose_from_the_start(patch)
+        bounds = bound_exact(problem, max_states=max_states, tolerance=0.0)
+    slack = 1e-9 * (1.0 + expected.value)
+    assert bounds.lower - slack <= expected.value <= bounds.upper + slack
+    finite = np.isfinite(expected.q_values)
+    np.testing.assert_array_equal(np.isfinite(bounds.q_lower), finite)
+    assert (bounds.q_lower[finite] <= expected.q_values[finite] * (1 + 1e-9)).all()
+    assert (bounds.q_upper[finite] >= expected.q_values[finite] * (1 - 1e-9)).all()
+    if bounds.exact:
+        np.testing.assert_allclose([bounds.lower, bounds.upper], expected.value, rtol=1e-9)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_bounds_meet_within_the_tolerance(family):
+    problem = family_problem(family, 2, "tuning", 1)
+    bounds, loose = bound_exact(problem, tolerance=0.0), bound_exact(problem, tolerance=0.05)
+    assert bounds.exact
+    assert bounds.gap == pytest.approx(0.0, abs=1e-12)
+    assert loose.gap <= 0.05
+    assert loose.lower <= bounds.lower * (1 + 1e-9) <= loose.upper * (1 + 2e-9)
+
+
+@pytest.mark.parametrize("formula", FORMULAS)
+def test_the_dead_end_part_is_the_slope_in_the_dead_end_cost(formula):
+    """As long as the best policy stays the same, the value grows with the cost of dead ends as often as one is met."""
+    task = task_of(formula)
+    fields = random_fields(task, 2, 3)
+    solutions = [solve_exact(problem_of(task, fields | {"dead_end_cost": cost})) for cost in (300.0, 300.125)]
+    slope = (solutions[1].value - solutions[0].value) / 0.125
+    assert solutions[0].dead_end_part / 300.0 == pytest.approx(slope, abs=1e-6)
 
 
 def test_no_conditions():

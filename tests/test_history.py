@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from potlp_jax.planning.exact import Rollouts
 from potlp_jax.planning.history import action_terms, initial_history, pack_bits, step, unpack_bits
+from potlp_jax.planning.rollouts import Rollouts
 from tests.reference.planning import FINISH, ReferenceProblem
 from tests.reference.problems import FORMULAS, SIZES, padded_problem, problem_of, random_fields, task_of
 
@@ -119,7 +119,7 @@ def test_several_cubes_leave_the_last_one():
     fields["success_probability"] = np.full((1, 2), 0.5)
     problem = problem_of(task, fields)
     rollouts = Rollouts(problem)
-    closure = rollouts._closure
+    closure = rollouts.closure
     settled = closure.settle(rollouts.root().knowledge[0], 2, True)
     assert settled.holds == 0b100
     assert closure.settle(settled, 0, False) == (0b110, 0b001)

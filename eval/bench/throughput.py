@@ -30,11 +30,10 @@ import jax
 import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Array, Float32
 
 from potlp_jax.planning.pouct import plan_actions, search
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.search_kernel import SearchConfig, SearchMode, Tree
+from potlp_jax.planning.search_kernel import SearchConfig, SearchMode
 from potlp_jax.task.task import Task
 
 mpl.use("Agg")
@@ -125,19 +124,13 @@ def problem_batch(goals: int, subgoals: int, batch: int) -> PlanningProblem:
     )
 
 
-def actions_per_simulation(tree: Tree) -> Float32[Array, "B"]:
-    """Mean depth: every node knows, in the last of its values, how many descents went on from it."""
-    used = jnp.arange(tree.values.shape[1]) < tree.size[:, None]
-    return jnp.sum(jnp.where(used, tree.values[..., -1], 0.0), axis=1) / tree.simulations
-
-
 def kernel(problems: PlanningProblem, simulations: int, **settings: Any) -> Prepared:
     """The batched kernel."""
     config = SearchConfig(simulations=simulations, **settings)
 
     def run(problems, keys):
         plan, tree = search(problems, keys, config)
-        return plan.action, actions_per_simulation(tree), tree.simulations
+        return plan.action, tree.steps / tree.simulations, tree.simulations
 
     return _compiled(run, problems)
 

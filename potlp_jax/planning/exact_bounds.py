@@ -1,0 +1,107 @@
+"""Bounds of expanded nodes from those of their children, backed up through the graph of the exact solver.
+
+The way back that is owed is settled here: an action either leaves the unknown region, and pays what is owed whatever it
+is, or goes on inside and pays nothing, so the value of a history is ``min(owed + leave, stay)``.
+
+References:
+  Bradley et al., Learning and Planning for Temporally Extended Tasks in Unknown Environments, ICRA 2021, Eq. 3.
+  Martelli and Montanari, Optimizing decision trees through heuristically guided search, CACM 1978 (AO*).
+"""
+
+import numpy as np
+
+from potlp_jax.planning.exact_graph import CHUNK, Graph
+from potlp_jax.planning.exact_knowledge import NOWHERE
+
+FINISH = -1
+"""State in ``best_way`` where the way goes to acceptance."""
+
+
+class GraphBounds:
+    """Keeps the bounds in a graph's ``nodes`` and the best choices in its ``expansions``."""
+
+    def __init__(self, graph: Graph) -> None:
+        self._graph, self._tables = graph, graph.tables
+        self._nodes, self._expansions = graph.nodes, graph.expansions
+        self._dead_end = graph.tables.rollouts.dead_end_cost
+
+    def back_up(self, expansions: np.ndarray) -> None:
+        """Bounds of expanded nodes from those of their children, last nodes first."""
+        for group in self._graph.groups(expansions)[::-1]:
+            for start in range(0, len(group), CHUNK):
+                self._back_up_attempts(group[start : start + CHUNK])
+            for start in range(0, len(group), CHUNK):
+                self._back_up_ways(group[start : start + CHUNK])
+
+    def of_actions(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds on the Q of every action."""
+        t, z = self._tables, int(self._nodes["state"][0])
+        lower = np.full(t.rollouts.finish_action + 1, np.inf)
+        lower[-1] = t.finish[-1, z]
+        upper = lower.copy()
+        for action, s, k, expansion, way in self._graph.root_actions():
+            below, above = self.attempts(np.array([expansion]))
+            lower[action], upper[action] = way + below[0, s, k], way + above[0, s, k]
+        return lower, upper
+
+    def attempts(self, expansions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds on the cost of every attempt from its subgoal on, ``[N, S, K]``; inf where it is not available."""
+        t, nodes = self._tables, self._expansions["node"][expansions]
+        q, state = self._nodes["q"][nodes], self._nodes["state"][nodes]
+        here = np.arange(q.shape[1])[None]
+        chance, won = t.probability[here, q], t.success_cost[here, q]
+        lost = t.failure_cost[here, state[:, None]]
+        success, failure = self._expansions["success"][expansions], self._expansions["failure"][expansions]
+        possible = success != NOWHERE
+        bounds = []
+        for after_success, after_failure in zip(
+            self._arrive(success, won), self._arrive(failure, np.broadcast_to(lost, success.shape)), strict=True
+        ):
+            cost = chance * (won + after_success) + (1.0 - chance) * (lost + after_failure)
+            bounds.append(np.where(possible, cost, np.inf))
+        return bounds[0], bounds[1]
+
+    def _arrive(self, children: np.ndarray, owed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds on the value of histories ``[N, S, K]`` that end at node ``children`` beyond subgoal s."""
+        n, s = np.maximum(children, 0), np.arange(children.shape[1])[None, :, None]
+        lower = np.minimum(owed + self._nodes["leave_lower"][n, s], self._nodes["attempt_lower"][n, s])
+        upper = np.minimum(owed + self._nodes["leave_upper"][n, s], self._nodes["attempt_upper"][n, s])
+        upper = np.minimum(upper, self._nodes["ceiling"][n])
+        nothing = np.isinf(lower)
+        lower = np.where(nothing | (self._nodes["may_be_dead"][n] & (lower > self._dead_end)), self._dead_end, lower)
+        upper = np.where(nothing, self._dead_end, upper)
+        real = children >= 0
+        return np.where(real, lower, 0.0), np.where(real, upper, 0.0)
+
+    def _back_up_attempts(self, expansions: np.ndarray) -> None:
+        nodes = self._expansions["node"][expansions]
+        lower, upper = self.attempts(expansions)
+        self._expansions["best_edge"][expansions] = lower.argmin(axis=2)
+        self._nodes["attempt_lower"][nodes] = lower.min(axis=2)
+        self._nodes["attempt_upper"][nodes] = upper.min(axis=2)
+
+    def _back_up_ways(self, expansions: np.ndarray) -> None:
+        states = self._nodes["state"][self._expansions["node"][expansions]]
+        for z in np.unique(states):
+            self._back_up_ways_from(int(z), expansions[states == z])
+
+    def _back_up_ways_from(self, z: int, expansions: np.ndarray) -> None:
+        t, nodes = self._tables, self._expansions["node"][expansions]
+        subgoals = len(t.subgoals)
+        lower = np.broadcast_to(t.finish[:subgoals, z], (len(nodes), subgoals)).copy()
+        upper = lower.copy()
+        best = np.full((len(nodes), subgoals, 2), FINISH)
+        for other in t.travels_to[z] if subgoals else ():
+            way = t.travel[:subgoals, z, :, other]
+            if other == z:
+                way = np.where(np.eye(subgoals, dtype=bool), np.inf, way)
+            link = self._expansions["link"][expansions, other]
+            costs = way[None] + self._nodes["attempt_lower"][link][:, None, :]
+            least = costs.min(axis=2)
+            better = least < lower
+            lower = np.where(better, least, lower)
+            choice = np.stack([np.full(least.shape, other), costs.argmin(axis=2)], axis=-1)
+            best = np.where(better[..., None], choice, best)
+            upper = np.minimum(upper, (way[None] + self._nodes["attempt_upper"][link][:, None, :]).min(axis=2))
+        self._nodes["leave_lower"][nodes], self._nodes["leave_upper"][nodes] = lower, upper
+        self._expansions["best_way"][expansions] = best
