@@ -73,6 +73,10 @@ class Plan:
 def plan_actions(problem: PlanningProblem, key: PRNGKeyArray, config: SearchConfig = SearchConfig()) -> Plan:
     """Search one problem for the action of least expected cost (paper section III-C).
 
+    One method serves problems of every size: a small one ends by itself once nothing is left to look at, a large one
+    after ``config.simulations``; ``Plan.gap`` tells which. The exact solution (``exact``) runs on the host and is the
+    yardstick of both.
+
     Pure; jit with ``config`` static. ``jax.vmap`` over ``problem``, ``key`` or both runs the rows in lockstep. The
     result depends on the problem and the configuration alone (in the mode ``AUTHORS_CODE`` on the key too), not on
     padding or on other rows of a batch. Ties go to the lowest index. A root without available action, or satisfied,
