@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from potlp_jax.planning.exact import solve_exact
+from potlp_jax.planning.exact import ProblemTooLargeError, solve_exact
 from potlp_jax.planning.history import action_terms, initial_history, step, unpack_bits
 from potlp_jax.types import NO_ACTION
 from tests.reference.problems import FORMULAS, SIZES, padded_problem, random_fields, random_problem, task_of
@@ -154,15 +154,27 @@ def test_mctx_finds_the_best_action():
     assert np.mean(regrets) < 0.05
 
 
-def test_regret_is_the_largest_that_the_bounds_admit():
+def test_regret_is_the_excess_over_the_least_q():
     from eval.bench.regret import Truth
 
-    exact = Truth(np.array([3.0, 5.0, np.inf]), np.array([3.0, 5.0, np.inf]), 1.0, True)
-    assert (exact.regret(0), exact.regret(1), exact.regret(NO_ACTION)) == (0.0, 2.0, np.inf)
-    assert exact.scale == 2.0
-    bounded = Truth(np.array([3.0, 4.0, 9.0]), np.array([5.0, 6.0, 9.5]), 1.0, False)
-    # Action 0 may cost 5 where action 1 costs 4; action 1 may cost 6 where action 0 costs 3.
-    assert (bounded.regret(0), bounded.regret(1), bounded.regret(2)) == (1.0, 3.0, 6.5)
+    truth = Truth(np.array([3.0, 5.0, np.inf]), 3.0, 3.0, 1.0, True)
+    assert (truth.regret(0), truth.regret(1), truth.regret(NO_ACTION)) == (0.0, 2.0, np.inf)
+    assert truth.scale == 2.0
+
+
+def test_truth_out_of_reach_is_an_interval_around_the_best_known(tmp_path, monkeypatch):
+    from eval.bench import regret
+
+    def too_large(problem, seconds):
+        raise ProblemTooLargeError("too large")
+
+    problem = random_problem("F a & F b", 2, 1)
+    monkeypatch.setattr(regret, "solve_exact", too_large)
+    truth, exact = regret.truth_of(problem, tmp_path / "truth.npz", 10.0), solve_exact(problem)
+    assert not truth.exact
+    assert truth.lower <= exact.value * (1 + 1e-9)
+    assert exact.value <= truth.upper * (1 + 1e-9)
+    np.testing.assert_allclose(truth.q_values.min(), exact.value, rtol=1e-5)
 
 
 def test_the_truth_is_kept_for_the_same_problem_only(tmp_path):
@@ -172,14 +184,14 @@ def test_the_truth_is_kept_for_the_same_problem_only(tmp_path):
     path = tmp_path / "truth.npz"
     for problem in (first, first, second):
         truth = truth_of(problem, path, 10.0)
-        np.testing.assert_allclose(truth.high, solve_exact(problem).q_values)
+        np.testing.assert_allclose(truth.q_values, solve_exact(problem).q_values)
 
 
 def test_the_goal_counts_from_where_it_is_kept():
     from eval.bench.regret import Row, time_to_goal
 
     def row(budget, percent):
-        return Row("test", "find", 1, "ours", budget, float(budget), [0], [percent], [percent], [True])
+        return Row("test", "find", 1, "ours", budget, float(budget), [0], [percent], [percent], [True], [0.0])
 
     assert time_to_goal([row(1, 0.5), row(10, 3.0), row(100, 0.9), row(1000, 0.1)]) == 100.0
     assert time_to_goal([row(1, 0.5), row(10, 3.0)]) == np.inf
