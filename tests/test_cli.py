@@ -95,7 +95,7 @@ def test_max_positive_literals_reaches_the_task():
         (("task", "F b", "--propositions", "a"), "unknown proposition"),
         (("task", "missing.hoa"), "missing.hoa"),
         (("task", "F a", "--svg", "picture.docx"), "docx"),
-        (("run", "castle"), "toy, firefighting, map:FILE.yaml"),
+        (("run", "castle"), "toy, firefighting, rooms, map:FILE.yaml"),
         (("run", "map:missing.yaml"), "missing.yaml"),
         (("run", "toy", "--task", "9"), "1 (F goal)"),
         (("run", "toy", "--task", "F dragon"), "dragon"),
