@@ -13,7 +13,7 @@ import platform
 import re
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -91,16 +91,14 @@ def _hide_tuning_messages() -> None:
     except ImportError:  # not part of jax's public interface: without it the messages merely show
         return
     load = getattr(cache, "get_executable_and_time", None)
-    if load is None or getattr(load, "quiet", False):
+    if load is None or load.__name__ == "load_quietly":
         return
 
     def load_quietly(*arguments: Any, **options: Any) -> Any:
         with _without_tuning_messages():
             return load(*arguments, **options)
 
-    quiet: Callable[..., Any] = load_quietly
-    setattr(quiet, "quiet", True)  # noqa: B010
-    cache.get_executable_and_time = quiet
+    cache.get_executable_and_time = load_quietly
 
 
 @contextlib.contextmanager

@@ -21,10 +21,10 @@ from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.history import ActionTerms
 from potlp_jax.planning.policies import DecisionConfig, Move, MoveKind, Policy, assess, decide, planning_problem
-from potlp_jax.planning.pouct import Plan, SearchConfig, Tree, search_tree
+from potlp_jax.planning.pouct import Plan, search_tree
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.product import KnownPath
-from potlp_jax.planning.search_kernel import SearchMode
+from potlp_jax.planning.search_graph import SearchConfig, SearchMode, Tree
 from potlp_jax.records import NEVER_SEEN, ActionRecord, Decision, Outcome, Trial
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.types import NO_ACTION

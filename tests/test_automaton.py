@@ -149,7 +149,7 @@ def test_the_semantics_of_each_operator_on_a_lasso():
         "G(a|b|c)",
         "a W b",
         "c R (a|b|c)",
-        "XXX G c",
+        "X X X G c",
         "a -> a",
         "b -> c",
         "!b",

@@ -16,8 +16,7 @@ from tests.reference.problems import FORMULAS, SIZES, padded_problem, random_fie
 
 MISSING = "the optional extra 'bench' is not installed (pip install -e '.[bench]')"
 pytest.importorskip("numba", reason=MISSING)
-
-from eval.bench.opponents import pouct_numba as numba_search  # noqa: E402
+numba_search = pytest.importorskip("eval.bench.opponents.pouct_numba")
 
 SUBGOALS = 3
 TERMS, STEP = jax.jit(action_terms), jax.jit(step)

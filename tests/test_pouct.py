@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from potlp_jax.planning.exact import solve_exact
 from potlp_jax.planning.pouct import plan_actions, plan_within, search, search_tree
-from potlp_jax.planning.search_kernel import SearchConfig, SearchMode, Tree, _uniform
+from potlp_jax.planning.search_arrays import uniform
+from potlp_jax.planning.search_graph import SearchConfig, SearchMode, Tree
 from potlp_jax.planning.tree_top import tree_top
 from potlp_jax.task.task import TaskSizes
 from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL, Status
@@ -142,7 +143,7 @@ def test_authors_mode_equals_a_literal_version(formula, seed):
     seeds = jax.random.bits(key, (1, 2), jnp.uint32)
     numbers = np.asarray(
         [
-            [float(_uniform(seeds, jnp.full((1,), k, jnp.int32), jnp.int32(level))[0]) for level in range(12)]
+            [float(uniform(seeds, jnp.full((1,), k, jnp.int32), jnp.int32(level))[0]) for level in range(12)]
             for k in range(AUTHORS.simulations)
         ]
     )

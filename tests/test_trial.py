@@ -14,7 +14,7 @@ from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.planning import policies
 from potlp_jax.planning.policies import DecisionConfig, MoveKind, Policy, decide
-from potlp_jax.planning.pouct import SearchConfig
+from potlp_jax.planning.search_graph import SearchConfig
 from potlp_jax.records import Outcome, RecordError, load_trial
 from potlp_jax.task.task import Task, TaskSizes
 from potlp_jax.trial import TrialConfig, replay_decision, run_trial, trial_config_from_dict

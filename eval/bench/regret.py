@@ -35,16 +35,8 @@ from potlp_jax.planning.exact import ProblemTooLargeError, bound_exact, solve_ex
 from potlp_jax.planning.families import FAMILIES, SUBGOAL_COUNTS, Split, family_problem
 from potlp_jax.planning.pouct import plan_actions
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.search_kernel import (
-    Context,
-    SearchConfig,
-    SearchMode,
-    Tree,
-    choose,
-    is_open,
-    new_search,
-    simulate,
-)
+from potlp_jax.planning.search_graph import Context, SearchConfig, SearchMode, Tree, new_search
+from potlp_jax.planning.search_kernel import choose, is_open, simulate
 from potlp_jax.types import NO_ACTION
 
 mpl.use("Agg")

@@ -33,7 +33,7 @@ import numpy as np
 
 from potlp_jax.planning.pouct import plan_actions, search
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.search_kernel import SearchConfig, SearchMode
+from potlp_jax.planning.search_graph import SearchConfig, SearchMode
 from potlp_jax.task.task import Task
 
 mpl.use("Agg")

@@ -5,8 +5,9 @@ import math
 
 import jax
 
-from potlp_jax.planning.pouct import SearchConfig, search_tree
+from potlp_jax.planning.pouct import search_tree
 from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.search_graph import SearchConfig
 
 
 @dataclasses.dataclass(frozen=True)

@@ -32,7 +32,7 @@ from potlp_jax.planning.product import (
     product_transitions,
     shortest_path,
 )
-from potlp_jax.planning.search_kernel import SearchConfig
+from potlp_jax.planning.search_graph import SearchConfig
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_ACTION, NO_STATE, Status, status_array, status_if
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals

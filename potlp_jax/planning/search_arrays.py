@@ -1,0 +1,74 @@
+"""Operations on batches of rows that the search needs, in the forms that XLA compiles well on CPU."""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float32, Int32, Shaped, UInt32
+
+from potlp_jax.types import Status, status_if
+
+_PerAction = TypeVar("_PerAction")
+
+
+def pack_rows(rows: Any) -> UInt32[Array, "A n"]:
+    """All that a pytree of per-action arrays says of an action, as one row of bits: one lookup instead of many."""
+    columns = []
+    for leaf in jax.tree.leaves(rows):
+        values = leaf.astype(jnp.uint32) if leaf.dtype == jnp.bool_ else leaf
+        columns.append(jax.lax.bitcast_convert_type(values, jnp.uint32).reshape(leaf.shape[0], -1))
+    return jnp.concatenate(columns, axis=1)
+
+
+def unpack_rows(packed: UInt32[Array, "B n"], like: _PerAction) -> _PerAction:
+    """Inverse of ``pack_rows`` for one action per batch entry; ``like`` is the batch of what was packed."""
+    leaves, structure = jax.tree.flatten(like)
+    rows, start = [], 0
+    for leaf in leaves:
+        shape = leaf.shape[2:]
+        size = math.prod(shape)
+        bits = packed[:, start : start + size].reshape(-1, *shape)
+        rows.append(bits != 0 if leaf.dtype == jnp.bool_ else jax.lax.bitcast_convert_type(bits, leaf.dtype))
+        start += size
+    return jax.tree.unflatten(structure, rows)
+
+
+def uniform(seeds: UInt32[Array, "B 2"], simulation: Int32[Array, "B"], level: Int32[Array, ""]) -> Float32[Array, "B"]:
+    """Uniform numbers in [0, 1) from a counter: 24 bits of a twice mixed hash of (seed, simulation, level)."""
+    counter = simulation.astype(jnp.uint32) * jnp.uint32(0x9E3779B9) + level.astype(jnp.uint32) * jnp.uint32(0x85EBCA77)
+    bits = mix(mix(seeds[:, 0] ^ counter) + seeds[:, 1])
+    return (bits >> 8).astype(jnp.float32) * jnp.float32(2.0**-24)
+
+
+def mix(bits: UInt32[Array, "*N"]) -> UInt32[Array, "*N"]:
+    """Finaliser of MurmurHash3: every input bit affects every output bit."""
+    bits = (bits ^ (bits >> 16)) * jnp.uint32(0x85EBCA6B)
+    bits = (bits ^ (bits >> 13)) * jnp.uint32(0xC2B2AE35)
+    return bits ^ (bits >> 16)
+
+
+def status_of_rows(flags: Bool[Array, "B"], status: Status) -> UInt32[Array, "B"]:
+    return jax.vmap(lambda flag: status_if(flag, status))(flags)
+
+
+def least_of_each(values: Shaped[Array, "B A"], worst: int | float) -> Shaped[Array, "B"]:
+    """Minimum over actions; ``worst`` is not less than any value."""
+    return jnp.min(_combine(jnp.minimum, values, worst), axis=1)
+
+
+def _combine(
+    operation: Callable[[Array, Array], Array], values: Shaped[Array, "B A"], neutral: int | float
+) -> Shaped[Array, "B w"]:
+    """Reduce over actions up to a few columns, slice by slice: on CPU XLA vectorises that, but not whole rows."""
+    width = 8 * max(1, -(-values.shape[1] // 128))
+    count = -(-values.shape[1] // width)
+    padded = jnp.pad(values, ((0, 0), (0, count * width - values.shape[1])), constant_values=neutral)
+    return functools.reduce(operation, [padded[:, i * width : (i + 1) * width] for i in range(count)])
+
+
+def align(flags: Bool[Array, "B"], like: Array) -> Bool[Array, "B ..."]:
+    """Give flags the rank of ``like``."""
+    return flags.reshape(flags.shape + (1,) * (like.ndim - 1))

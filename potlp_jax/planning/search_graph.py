@@ -1,0 +1,371 @@
+"""What a search has found: the graph of histories, its new nodes, and how to find a history in it.
+
+The way back that is owed never enters a node: an action either leaves the unknown region, and pays what is owed
+whatever it is, or goes on inside and pays nothing. A node keeps the least cost of both kinds apart from what is owed,
+so histories that know the same at the same place are one node, in whatever order they came to know it.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float32, Int32, UInt32
+
+from potlp_jax.planning.heuristic import Guess, guess_values
+from potlp_jax.planning.history import (
+    ActionTables,
+    ActionTerms,
+    History,
+    action_tables,
+    initial_history,
+    terms_of_all,
+)
+from potlp_jax.planning.search_arrays import least_of_each, mix, pack_rows
+
+WINDOW: int = 8
+"""Slots of the table of nodes that a history may be found in. Where all are taken the node is not entered: it is then
+not shared between orders, which costs simulations but no correctness."""
+
+UNTRIED: float = 1e18
+"""Spread of an action that must be tried before others are tried again; finite, so that an action that is not
+available (Q = inf) never becomes NaN."""
+
+
+class SearchMode(StrEnum):
+    """How the search values what it has seen.
+
+    ``EXPECTATION`` uses what the model knows in closed form: values of new nodes from a guess, expectations over both
+    outcomes, minima over actions, one node for all orders of the same events. ``AUTHORS_CODE`` is PO-UCT as in the
+    code of Bradley et al.: a new node is worth nothing beyond the cost so far, Q is the mean of the sampled costs,
+    each action is tried once before any is tried twice, the most visited one is chosen.
+    """
+
+    EXPECTATION = "expectation"
+    AUTHORS_CODE = "authors_code"
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchConfig:
+    """Settings of the search.
+
+    Attributes:
+      simulations: descents per search; each adds at most one node. The search ends earlier where nothing is left to
+        look at.
+      optimism: fraction by which guesses may be too high: the descent takes the action that would be best if they all
+        were. 1 looks at everything that the guesses cannot rule out, so that a search that ends by itself is exact.
+      max_depth: actions per descent; one that gets there is cut, valued by what is known of its last node, and
+        flagged.
+      tree_capacity: nodes per tree, at least 1; None for one more than simulations. A full tree is flagged.
+      guess_failures: failures per automaton state that the guess at untried outcomes tells apart.
+      mode: how values are made, see ``SearchMode``.
+      exploration: weight of the exploration term in the mode ``AUTHORS_CODE``, a cost: the descent takes the least
+        ``Q - exploration * sqrt(log(n) / n_a)``; the authors use 50.
+    """
+
+    simulations: int = 300
+    optimism: float = 0.3
+    max_depth: int = 32
+    tree_capacity: int | None = None
+    guess_failures: int = 16
+    mode: SearchMode = SearchMode.EXPECTATION
+    exploration: float = 50.0
+
+    def __post_init__(self) -> None:
+        for name in ("simulations", "max_depth", "tree_capacity", "guess_failures"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"SearchConfig.{name} is {value}, must be at least 1")
+        if not 0 <= self.optimism <= 1:
+            raise ValueError(f"SearchConfig.optimism is {self.optimism}, must lie in [0, 1]")
+        if not self.exploration >= 0:
+            raise ValueError(f"SearchConfig.exploration is {self.exploration}, must not be negative")
+
+    @property
+    def capacity(self) -> int:
+        """Nodes per tree."""
+        return self.simulations + 1 if self.tree_capacity is None else self.tree_capacity
+
+    @property
+    def slots(self) -> int:
+        """Places where a window of the table of nodes may begin: a power of two, at most half of them taken."""
+        return 1 << max(self.capacity * 2 - 1, 1).bit_length()
+
+
+@struct.dataclass(kw_only=True)
+class Tree:
+    """Searched histories, a graph; node 0 is the root.
+
+    A node is what is known at a place in a state, in whatever order it came to be known. What is owed there is left out
+    of all its numbers.
+
+    Attributes:
+      q_values: expected cost of each action at each node, inf where it is not available.
+      bounds: what the descent compares: the same with optimistic guesses. In the mode ``AUTHORS_CODE``
+        ``1 / sqrt(n_a)``, n_a the descents that took the action.
+      chances, success_costs: P_S and R_S of each action, given what is known at the node.
+      lost, won: guessed values after each action's failure and success.
+      children: node reached by each action after failure and after success, or ``UNVISITED``. Outcomes that satisfy
+        the task have no node: their value is 0.
+      values: per node the least Q of the actions that leave the unknown region, of those that stay inside, the least
+        bound of both kinds, and the descents that went on from here.
+      place, state, holds, fails, visited: the node's history, as in ``history.History``.
+      table: per slot the key of a history and its node, -1 where the slot is empty.
+      root_visits: descents that began with each action.
+      size: nodes in use.
+      simulations: descents so far.
+      steps: actions taken by all of them.
+      status: bits of ``types.Status``.
+    """
+
+    q_values: Float32[Array, "*B N A"]
+    bounds: Float32[Array, "*B N A"]
+    chances: Float32[Array, "*B N A"]
+    success_costs: Float32[Array, "*B N A"]
+    lost: Float32[Array, "*B N A"]
+    won: Float32[Array, "*B N A"]
+    children: Int32[Array, "*B N A 2"]
+    values: Float32[Array, "*B N 5"]
+    place: Int32[Array, "*B N"]
+    state: Int32[Array, "*B N"]
+    holds: UInt32[Array, "*B N S W"]
+    fails: UInt32[Array, "*B N S W"]
+    visited: UInt32[Array, "*B N S1 V"]
+    table: Int32[Array, "*B slots 3"]
+    root_visits: Int32[Array, "*B A"]
+    size: Int32[Array, "*B"]
+    simulations: Int32[Array, "*B"]
+    steps: Int32[Array, "*B"]
+    status: UInt32[Array, "*B"]
+
+    ROOT = 0
+    UNVISITED = -1
+
+    def history(self, node: Int32[Array, "*B"], owed: Float32[Array, "*B"]) -> History:
+        """The history of one node of each row, with what is owed there."""
+        at = (jnp.arange(self.size.shape[0], dtype=jnp.int32), node) if self.size.ndim else node
+        return History(
+            place=self.place[at],
+            state=self.state[at],
+            owed=owed,
+            holds=self.holds[at],
+            fails=self.fails[at],
+            visited=self.visited[at],
+        )
+
+
+@struct.dataclass(kw_only=True)
+class Context:
+    """What stays the same during a search.
+
+    ``hopeful`` marks the attempts that may succeed at the root; ``packed`` holds all of an action's row of the tables
+    (``pack_rows``); ``facts`` holds per action the number of the (subgoal, z') where it is attempted and whether its
+    success satisfies the task; ``relevant`` masks per state the conditions that later choices can depend on.
+    """
+
+    tables: ActionTables
+    guess: Guess
+    hopeful: Bool[Array, "*B S E"]
+    packed: UInt32[Array, "*B A n"]
+    facts: Int32[Array, "*B A 2"]
+    relevant: UInt32[Array, "*B Z W"]
+    root: History
+    dead_end_cost: Float32[Array, "*B"]
+    seeds: UInt32[Array, "*B 2"]
+
+
+def new_search(
+    structure: Any, leaves: Sequence[Array], seeds: UInt32[Array, "B 2"], config: SearchConfig
+) -> tuple[Context, Tree]:
+    """Tables of a batch of problems, and graphs of the roots alone."""
+    context = prepare(structure, leaves, seeds, config)
+    root = jax.vmap(functools.partial(new_node, config=config))(context, context.root)
+    values = least_values(context, root.q_values, root.bounds, context.root.place, context.root.state)
+    batch, actions = root.q_values.shape
+
+    def first(values: Array, fill: float = 0) -> Array:
+        shape = (batch, config.capacity + 1, *values.shape[1:])
+        return jnp.full(shape, fill, values.dtype).at[:, Tree.ROOT].set(values)
+
+    tree = Tree(
+        q_values=first(root.q_values, jnp.inf),
+        bounds=first(root.bounds, jnp.inf),
+        chances=first(root.chances),
+        success_costs=first(root.success_costs),
+        lost=first(root.lost),
+        won=first(root.won),
+        children=jnp.full((batch, config.capacity + 1, actions, 2), Tree.UNVISITED, jnp.int32),
+        values=first(values),
+        place=first(context.root.place),
+        state=first(context.root.state),
+        holds=first(context.root.holds),
+        fails=first(context.root.fails),
+        visited=first(context.root.visited),
+        table=jnp.full((batch, config.slots + WINDOW, 3), Tree.UNVISITED, jnp.int32),
+        root_visits=jnp.zeros((batch, actions), jnp.int32),
+        size=jnp.ones((batch,), jnp.int32),
+        simulations=jnp.zeros((batch,), jnp.int32),
+        steps=jnp.zeros((batch,), jnp.int32),
+        status=jnp.zeros((batch,), jnp.uint32),
+    )
+    return context, tree
+
+
+def prepare(structure: Any, leaves: Sequence[Array], seeds: UInt32[Array, "B 2"], config: SearchConfig) -> Context:
+    """What a search of a batch of problems needs to know beside its graph; ``leaves`` are those of a problem."""
+    return jax.vmap(functools.partial(_prepare_one, structure, failures=config.guess_failures))(leaves, seeds)
+
+
+def _prepare_one(structure: Any, leaves: Sequence[Array], seed: UInt32[Array, "2"], failures: int) -> Context:
+    problem = jax.tree.unflatten(structure, leaves)
+    tables, root = action_tables(problem), initial_history(problem)
+    terms = terms_of_all(tables, root)
+    guess = guess_values(problem, tables, terms.success_probability, terms.success_cost, failures)
+    rows, states = tables.actions, tables.accepting.shape[0]
+    where = rows.subgoal * states + rows.from_state
+    return Context(
+        tables=tables,
+        guess=guess,
+        hopeful=_by_subgoal(terms.success_probability, problem.subgoal_count) > 0,
+        packed=pack_rows(rows),
+        facts=jnp.stack([where, rows.accepts.astype(jnp.int32)], axis=-1),
+        relevant=_relevant_conditions(tables),
+        root=root,
+        dead_end_cost=problem.dead_end_cost,
+        seeds=seed,
+    )
+
+
+def _by_subgoal(values: Float32[Array, "A"], subgoals: int) -> Float32[Array, "S E"]:
+    """Values of all actions but finish, by subgoal and edge."""
+    return values[:-1].reshape(subgoals, (values.shape[0] - 1) // max(subgoals, 1))
+
+
+def _relevant_conditions(tables: ActionTables) -> UInt32[Array, "Z W"]:
+    """Per state, the conditions of actions that can still be attempted.
+
+    All of them where conditions of several cubes exist: what is known of one may then settle another.
+    """
+    rows, states = tables.actions, tables.accepting.shape[0]
+    own = jnp.arange(states, dtype=jnp.int32)
+    attempts = rows.from_state[:, None] == own[None, :]
+    travels = jnp.any(jnp.any(jnp.isfinite(tables.distance), axis=0)[:, :, None] & attempts[None, :, :], axis=1)
+    succeeds = jnp.any(attempts[:, :, None] & (rows.to_state[:, None] == own[None, :])[:, None, :], axis=0)
+    reach = travels | succeeds | (own[:, None] == own[None, :])
+    for _ in range(max(states - 1, 1).bit_length()):
+        reach = jnp.any(reach[:, :, None] & reach[None, :, :], axis=1)
+    useful = jnp.any(reach[:, None, :] & attempts[None, :, :], axis=2)
+    bits = jnp.where(useful[:, :, None], rows.condition_bits[None], jnp.uint32(0))
+    combined = jax.lax.reduce(bits, jnp.uint32(0), jax.lax.bitwise_or, (1,))
+    return jnp.where(jnp.any(tables.compound_mask), jnp.uint32(0xFFFFFFFF), combined)
+
+
+@struct.dataclass(kw_only=True)
+class Node:
+    """Numbers of a new node, as in ``Tree``."""
+
+    q_values: Float32[Array, "*B A"]
+    bounds: Float32[Array, "*B A"]
+    chances: Float32[Array, "*B A"]
+    success_costs: Float32[Array, "*B A"]
+    lost: Float32[Array, "*B A"]
+    won: Float32[Array, "*B A"]
+
+
+def new_node(context: Context, history: History, config: SearchConfig) -> Node:
+    """The numbers of one node when nothing below it has been seen."""
+    terms = terms_of_all(context.tables, dataclasses.replace(history, owed=jnp.float32(0.0)))
+    chance, available = terms.success_probability, terms.available
+    lost, won = _guesses(context, terms)
+    if config.mode is SearchMode.AUTHORS_CODE:
+        q_values = jnp.where(available, 0.0, jnp.inf).astype(jnp.float32)
+        bounds = jnp.where(available, UNTRIED, 1.0).astype(jnp.float32)
+    else:
+        known = terms.distance + chance * terms.success_cost + (1.0 - chance) * terms.failure_cost
+        guessed = chance * won + (1.0 - chance) * lost
+        q_values = jnp.where(available, known + guessed, jnp.inf)
+        bounds = jnp.where(available, known + (1.0 - config.optimism) * guessed, jnp.inf)
+    return Node(q_values=q_values, bounds=bounds, chances=chance, success_costs=terms.success_cost, lost=lost, won=won)
+
+
+def least_values(
+    context: Context,
+    q_values: Float32[Array, "B A"],
+    bounds: Float32[Array, "B A"],
+    place: Int32[Array, "B"],
+    state: Int32[Array, "B"],
+) -> Float32[Array, "B 5"]:
+    """``Tree.values`` of new nodes."""
+    inside = context.facts[:, :, 0] == (place * context.tables.accepting.shape[1] + state)[:, None]
+    least = [
+        least_of_each(jnp.where(kind, row, jnp.inf), jnp.inf)
+        for row in (q_values, bounds)
+        for kind in (~inside, inside)
+    ]
+    return jnp.stack([*least, jnp.zeros(place.shape, jnp.float32)], axis=-1)
+
+
+def _guesses(context: Context, terms: ActionTerms) -> tuple[Float32[Array, "A"], Float32[Array, "A"]]:
+    """Guessed values after failure and after success of every action of one node; 0 after finish."""
+    subgoals = context.hopeful.shape[0]
+
+    def by_subgoal(values: Array) -> Array:
+        return _by_subgoal(values, subgoals)
+
+    def by_action(values: Float32[Array, "S E"]) -> Float32[Array, "A"]:
+        return jnp.append(values.reshape(-1), jnp.float32(0.0))
+
+    failed = context.hopeful & (by_subgoal(terms.success_probability) == 0)
+    failures = context.guess.count_by_state(jnp.sum(failed, axis=0, dtype=jnp.int32))
+    lost = context.guess.after_failure(failures, by_subgoal(terms.failure_cost))
+    won = context.guess.after_success(failures, by_subgoal(terms.success_cost))
+    return by_action(lost), by_action(won)
+
+
+def arrival(
+    values: Float32[Array, "*B 5"], owed: Float32[Array, "*B"], dead_end_cost: Float32[Array, "*B"]
+) -> tuple[Float32[Array, "*B"], Float32[Array, "*B"]]:
+    """Value and bound of a node at which ``owed`` is owed."""
+
+    def least(leave: Array, stay: Array) -> Array:
+        best = jnp.minimum(owed + leave, stay)
+        return jnp.where(jnp.isinf(best), dead_end_cost, best)
+
+    return least(values[..., 0], values[..., 1]), least(values[..., 2], values[..., 3])
+
+
+def find(
+    context: Context, tree: Tree, history: History
+) -> tuple[Int32[Array, "B"], Int32[Array, "B 2"], Int32[Array, "B"]]:
+    """Node of a history or ``UNVISITED``, its key, and a free slot of the table (beyond its end where none is)."""
+    key = _key(context, history)
+    slots = tree.table.shape[1] - WINDOW
+    first = key[:, 0] & (slots - 1)
+    window = jax.vmap(lambda table, start: jax.lax.dynamic_slice(table, (start, 0), (WINDOW, 3)))(tree.table, first)
+    nodes, keys = window[:, :, 2], window[:, :, :2]
+    same = jnp.all(keys == key[:, None, :], axis=2) & (nodes != Tree.UNVISITED)
+    node = jnp.max(jnp.where(same, nodes, Tree.UNVISITED), axis=1)
+    offsets = jnp.arange(WINDOW, dtype=jnp.int32)[None, :]
+    empty = jnp.min(jnp.where(nodes == Tree.UNVISITED, offsets, slots + WINDOW), axis=1)
+    return node, key, first + empty
+
+
+def _key(context: Context, history: History) -> Int32[Array, "B 2"]:
+    """64 bits that tell histories with different futures apart; what is owed is not part of it."""
+    rows = jnp.arange(history.place.shape[0], dtype=jnp.int32)
+    relevant = context.relevant[rows, history.state][:, None, :]
+    holds, fails = history.holds & relevant, history.fails & relevant
+    number = jnp.arange(holds.shape[1] * holds.shape[2], dtype=jnp.uint32).reshape(1, *holds.shape[1:])
+    where = jnp.arange(history.visited.shape[1] * history.visited.shape[2], dtype=jnp.uint32)
+    visited = mix(history.visited ^ mix(where.reshape(1, *history.visited.shape[1:]) + jnp.uint32(0x51ED270B)))
+    place = mix((history.place * 64 + history.state).astype(jnp.uint32) + jnp.uint32(0x2545F491))
+    words = []
+    for salt in (0x9E3779B9, 0xC2B2AE3D):
+        mixed = mix(mix(holds + number * jnp.uint32(salt)) ^ (fails * jnp.uint32(0x85EBCA77) + jnp.uint32(salt)))
+        total = jnp.sum(mixed, axis=(1, 2), dtype=jnp.uint32) + jnp.sum(visited, axis=(1, 2), dtype=jnp.uint32)
+        words.append(mix((total ^ place) * jnp.uint32(salt | 1) + place))
+    return jax.lax.bitcast_convert_type(jnp.stack(words, axis=1), jnp.int32)
