@@ -2,7 +2,7 @@
 
 Two queues, both single-threaded and in float32, with the graph left implicit: nodes are ``z * H * W + cell``, the moves
 of a cell are eight bits prepared once per map, and a move's state is looked up on the way. Nothing is allocated while
-a source is solved. numba is a tool of the benchmark, not of the library: ``pip install numba``.
+a source is solved. numba is a tool of the benchmark, not of the library: ``pip install potlp-jax[bench]``.
 
 References:
   E. W. Dijkstra, A note on two problems in connexion with graphs, Numerische Mathematik 1, 1959.
@@ -10,13 +10,17 @@ References:
 """
 
 import dataclasses
+import importlib
 import math
+from typing import Any
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, UInt8
 
 from potlp_jax.planning.product import NEIGHBOURS
+
+numba: Any = importlib.import_module("numba")
+"""By name: an optional package."""
 
 _STEPS = np.array([1.0 if 0 in offset else math.sqrt(2.0) for offset in NEIGHBOURS], np.float32)
 
