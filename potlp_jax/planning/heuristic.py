@@ -1,144 +1,248 @@
-"""What an action's outcome will cost, guessed from how often the rollout has failed: what guides the search.
+"""What lies beyond an outcome, guessed by following a simple rule: what guides the search.
 
-Which attempts have failed is forgotten, how many is not. Attempts of the same automaton state are ranked by what they
-cost per chance of success; after ``t`` failures the first ``t`` of that order count as spent, but for ``SLACK``,
-because rollouts do not keep to the order exactly. Values are tables over (state, failures, subgoal), solved backward in
-the number of failures until only the dead end is left; a success begins a count of its own. Ways are those of the map.
+The rule takes the action of least cost per chance of success. While attempts fail, one history follows another and no
+branch opens, so that the expected cost of the rule is a sum along a single chain, with exact knowledge of what has
+failed, exact ways, and a dead end where the chain has nothing left; each success along it is worth what the rule costs
+from there on with nothing known. Ordering by cost per chance is optimal for independent tests without ways in between
+(Mitten 1960); with ways it is a policy like any other, so that a guess is seldom too low.
+
+Everything here has a leading axis of lanes, written out by hand: a chain is a loop of a few operations on all lanes.
+
+References:
+  L. G. Mitten, An analytic solution to the least cost testing sequence problem, J. of Industrial Engineering, 1960.
 """
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float32, Int32
+from jaxtyping import Array, Bool, Float32, Int32
 
 from potlp_jax.planning.history import ActionTables
-from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.search_arrays import least_of_each
 from potlp_jax.types import NO_STATE
 
-SLACK: int = 1
-"""Attempts that count as not yet spent although enough have failed. Without any, actions out of order look up to twice
-as costly as they are; with two, values come out 10 to 20 % too low."""
+NEGLIGIBLE: float = 1e-3
+"""Probability of getting that far below which a chain is cut; what is left counts as a dead end."""
 
-ROUNDS: int = 8
-"""Successes in a row that the guess looks ahead: enough for most automata, a bound where they have cycles."""
+PASSES: int = 4
+"""Times that the successes are valued where the automaton has cycles; without, each is valued once, the last first."""
 
 
 @struct.dataclass(kw_only=True)
-class Guess:
-    """Expected cost from beyond a subgoal on, apart from the way back that is then owed.
+class Rule:
+    """The rule in a batch of problems.
 
-    ``leave`` is the best that goes elsewhere (the way back is paid), ``stay`` the best that goes on beyond the same
-    subgoal (it is not), ``again`` the same just after an attempt has failed, which is not repeated; inf where there is
-    nothing left. ``sources`` and ``targets`` are z' and z'' of the edges.
+    ``ways[r, p, a]`` is the way to action ``a`` from the spot ``p = place * Z + state``; ``spots`` where each action is
+    attempted. ``spends[r, a, b]``: if ``a`` fails, so does ``b``. ``after_success`` is what is guessed to be left
+    after each action's success, with what is then owed; 0 where that satisfies the task, and after finish.
     """
 
-    leave: Float32[Array, "*B Z T S"]
-    stay: Float32[Array, "*B Z T S"]
-    again: Float32[Array, "*B E T S"]
-    sources: Int32[Array, "*B E"]
-    targets: Int32[Array, "*B E"]
-    dead_end_cost: Float32[Array, "*B"]
-
-    def count_by_state(self, failed: Int32[Array, "E"]) -> Int32[Array, "Z"]:
-        """Failures per state from failures per edge."""
-        states = jnp.arange(self.leave.shape[0], dtype=jnp.int32)
-        own = self.sources[None, :] == states[:, None]
-        return jnp.sum(jnp.where(own, failed[None, :], 0), axis=1, dtype=jnp.int32)
-
-    def after_success(self, failures: Int32[Array, "Z"], owed: Float32[Array, "S E"]) -> Float32[Array, "S E"]:
-        """Guessed cost once each attempt has succeeded; ``failures`` are counted per state."""
-        targets = jnp.maximum(self.targets, 0)
-        count = self._clip(failures[targets])
-        return self._value(self.leave[targets, count].T, self.stay[targets, count].T, owed)
-
-    def after_failure(self, failures: Int32[Array, "Z"], owed: Float32[Array, "S E"]) -> Float32[Array, "S E"]:
-        """Guessed cost once each attempt has failed; ``failures`` do not count it yet."""
-        sources = jnp.maximum(self.sources, 0)
-        count = self._clip(failures[sources] + 1)
-        edges = jnp.arange(sources.shape[0], dtype=jnp.int32)
-        return self._value(self.leave[sources, count].T, self.again[edges, count].T, owed)
-
-    def _clip(self, count: Int32[Array, "E"]) -> Int32[Array, "E"]:
-        return jnp.minimum(count, self.leave.shape[-2] - 1)
-
-    def _value(
-        self, leave: Float32[Array, "S E"], stay: Float32[Array, "S E"], owed: Float32[Array, "S E"]
-    ) -> Float32[Array, "S E"]:
-        best = jnp.minimum(owed + leave, stay)
-        return jnp.where(jnp.isinf(best), self.dead_end_cost, best)
+    ways: Float32[Array, "*R P A"]
+    spots: Int32[Array, "*R A"]
+    failure_cost: Float32[Array, "*R A"]
+    spends: Bool[Array, "*R A A"]
+    after_success: Float32[Array, "*R A"]
+    dead_end_cost: Float32[Array, "*R"]
 
 
-def guess_values(
-    problem: PlanningProblem,
+@struct.dataclass(kw_only=True)
+class _Chain:
+    """Actions in the order in which the rule tries them as long as they fail, per level and lane.
+
+    ``action`` is A where a lane has ended; ``cost`` is the expected cost of an attempt, what is left after its success
+    included, ``chance`` its P_S, ``rest`` the expected cost from this level on, given that all before have failed.
+    """
+
+    action: Int32[Array, "L N"]
+    cost: Float32[Array, "L N"]
+    chance: Float32[Array, "L N"]
+    rest: Float32[Array, "L1 N"]
+
+
+def make_rule(
     tables: ActionTables,
-    success_probability: Float32[Array, "A"],
-    success_cost: Float32[Array, "A"],
-    failures: int,
-) -> Guess:
-    """Guess for one problem; ``success_probability`` and ``success_cost`` are those of the root.
+    spots: Int32[Array, "R A"],
+    chance: Float32[Array, "R A"],
+    success_cost: Float32[Array, "R A"],
+    reach: Bool[Array, "R Z Z"],
+    dead_end_cost: Float32[Array, "R"],
+    length: int,
+    solve: bool = True,
+) -> Rule:
+    """The rule with the values of all successes (without them where ``solve`` is False).
 
-    ``failures`` bounds those that are told apart; beyond, only the dead end is left.
+    Args:
+      tables: of a batch of problems.
+      spots: ``place * Z + state`` of each action's attempt.
+      chance, success_cost: P_S and R_S with nothing known.
+      reach: ``[r, z, z']``: from z the rollout can get to z'.
+      dead_end_cost: of each problem.
+      length: failures in a row that are followed.
     """
-    nodes, states, actions = tables.distance.shape
-    subgoals, edges = nodes - 1, (actions - 1) // max(nodes - 1, 1)
-
-    def by_subgoal(values: Array) -> Array:
-        return values[:-1].reshape(subgoals, edges)
-
     rows = tables.actions
-    success_probability = jnp.where(rows.from_state == NO_STATE, 0.0, success_probability)
-    probability, won, lost = map(by_subgoal, (success_probability, success_cost, rows.failure_cost))
-    source, target = (jnp.max(by_subgoal(ends), axis=0, initial=-1) for ends in (rows.from_state, rows.to_state))
-    starts = source[None, :] == jnp.arange(states, dtype=jnp.int32)[:, None]
-    # A way that begins where it ends is no way: the robot goes on inside.
-    count = subgoals * states
-    real = (problem.subgoal_mask[:, None] & problem.task.state_mask[None, :]).reshape(count)
-    is_way = real[:, None] & real[None, :] & ~jnp.eye(count, dtype=jnp.bool_)
-    way = jnp.where(is_way, problem.travel[:-1].reshape(count, count), jnp.inf)
-    other = ~jnp.eye(edges, dtype=jnp.bool_) & (source[:, None] == source[None, :])
-    nearest = jnp.min(way, axis=0, initial=jnp.inf).reshape(subgoals, states)[:, jnp.maximum(source, 0)]
-    nearest = jnp.where(jnp.isinf(nearest), 0.0, nearest)
-    price = (nearest + probability * won + (1.0 - probability) * lost) / probability
-    rank = _rank(jnp.where(probability > 0, price, jnp.inf), source)
-    finish, accepting = problem.finish[:-1].T, tables.accepting[:, None]
-    dead_end_cost = problem.dead_end_cost
-
-    def solve(success: Float32[Array, "S E"]) -> tuple[Array, Array, Array]:
-        """Tables by the number of failures, given the value of every success."""
-
-        def fail_less(after, failed):
-            leave, again = after
-            best = jnp.minimum(lost + leave[jnp.maximum(source, 0)].T, again.T)
-            failure = jnp.where(jnp.isinf(best), dead_end_cost, best)
-            cost = probability * (won + success) + (1.0 - probability) * (lost + failure)
-            cost = jnp.where((probability > 0) & (rank >= failed - SLACK), cost, jnp.inf)
-            stay = jnp.min(jnp.where(starts[:, None, :], cost[None], jnp.inf), axis=2, initial=jnp.inf)
-            elsewhere = jnp.min(way + stay.T.reshape(-1)[None, :], axis=1, initial=jnp.inf).reshape(subgoals, states).T
-            leave = jnp.where(accepting, 0.0, jnp.minimum(elsewhere, finish))
-            stay = jnp.where(accepting, 0.0, stay)
-            again = jnp.min(jnp.where(other[:, None, :], cost[None], jnp.inf), axis=2, initial=jnp.inf)
-            return (leave, again), (leave, stay, again)
-
-        nothing = jnp.where(accepting, 0.0, finish), jnp.full((edges, subgoals), jnp.inf, jnp.float32)
-        return jax.lax.scan(fail_less, nothing, jnp.arange(failures, dtype=jnp.int32), reverse=True)[1]
-
-    def improve(carry):
-        count, success, _ = carry
-        leave, stay, _ = solve(success)
-        best = jnp.minimum(won + leave[0, jnp.maximum(target, 0)].T, stay[0, jnp.maximum(target, 0)].T)
-        after = jnp.where(jnp.isinf(best), dead_end_cost, best)
-        return count + 1, after, jnp.any(after != success)
-
-    start = (jnp.int32(0), jnp.full((subgoals, edges), dead_end_cost, jnp.float32), jnp.asarray(True))
-    _, success, _ = jax.lax.while_loop(lambda carry: carry[2] & (carry[0] < ROUNDS), improve, start)
-    leave, stay, again = (jnp.moveaxis(table, 0, 1) for table in solve(success))
-    return Guess(leave=leave, stay=stay, again=again, sources=source, targets=target, dead_end_cost=dead_end_cost)
+    count, actions = spots.shape
+    spends = jnp.any(rows.backward[:, :, None, :] & rows.condition_bits[:, None, :, :] != 0, axis=-1)
+    spends &= rows.subgoal[:, :, None] == rows.subgoal[:, None, :]
+    rule = Rule(
+        ways=tables.distance.reshape(count, -1, actions),
+        spots=spots,
+        failure_cost=rows.failure_cost,
+        spends=spends,
+        after_success=jnp.where(rows.accepts, 0.0, dead_end_cost[:, None]).at[:, -1].set(0.0),
+        dead_end_cost=dead_end_cost,
+    )
+    if not solve:
+        return rule
+    real = (rows.from_state != NO_STATE).at[:, -1].set(True)
+    return _value_successes(rule, tables, jnp.where(real, chance, 0.0), success_cost, reach, length)
 
 
-def _rank(price: Float32[Array, "S E"], source: Int32[Array, "E"]) -> Int32[Array, "S E"]:
-    """How many attempts in the same state come before each: those of a lower price, ties by index."""
-    flat, state = price.reshape(-1), jnp.broadcast_to(source[None, :], price.shape).reshape(-1)
-    index = jnp.arange(flat.shape[0], dtype=jnp.int32)
-    lower = (flat[:, None] < flat[None, :]) | ((flat[:, None] == flat[None, :]) & (index[:, None] < index[None, :]))
-    before = lower & (state[:, None] == state[None, :])
-    return jnp.sum(before, axis=0, dtype=jnp.int32).reshape(price.shape)
+def guess_outcomes(
+    rule: Rule,
+    spot: Int32[Array, "R"],
+    owed: Float32[Array, "R"],
+    available: Bool[Array, "R A"],
+    chance: Float32[Array, "R A"],
+    success_cost: Float32[Array, "R A"],
+    length: int,
+) -> tuple[Float32[Array, "R A"], Float32[Array, "R A"]]:
+    """What is guessed to be left after the failure and after the success of every action of one history per problem.
+
+    After the failure of the rule's first action that is the rest of its chain. After that of another action the chain
+    begins there and does without it. What does not depend on the history is owed to ``rule``.
+    """
+    lanes = jnp.arange(spot.shape[0], dtype=jnp.int32)
+    gain = _gain(rule, lanes, chance, success_cost)
+    chain = _follow(rule, lanes, spot, owed, available, chance, gain, length)
+    first, levels, actions = chain.action[0], chain.action.shape[0], available.shape[1]
+    index = jnp.arange(actions, dtype=jnp.int32)[None, :]
+
+    def skip(carry, level):
+        spent, reached = carry
+        left_out = spent + reached * chain.rest[level + 1]
+        return (spent + reached * chain.cost[level], reached * (1.0 - chain.chance[level])), left_out
+
+    nothing = jnp.zeros_like(owed), jnp.ones_like(owed)
+    _, left_out = jax.lax.scan(skip, nothing, jnp.arange(levels, dtype=jnp.int32))
+    whole = jnp.broadcast_to(chain.rest[0][:, None], available.shape)
+    without = whole.at[lanes[None, :], chain.action].set(left_out, mode="drop", unique_indices=True)
+
+    # The chain without an action begins where that action has failed instead of here.
+    start = jnp.minimum(first, actions - 1)
+    way_here = chain.cost[0] - gain[lanes, start]
+    spots = jnp.minimum(rule.spots, rule.ways.shape[1] - 1)
+    way_there = rule.ways[lanes[:, None], spots, start[:, None]] + rule.failure_cost
+    way_there = jnp.where(rule.spots == rule.spots[lanes, start][:, None], 0.0, way_there)
+    way_there = jnp.where(jnp.isinf(way_there), way_here[:, None], way_there)
+    moved = jnp.where(index == first[:, None], 0.0, way_there - way_here[:, None])
+    return without + moved, rule.after_success
+
+
+def _value_successes(
+    rule: Rule,
+    tables: ActionTables,
+    chance: Float32[Array, "R A"],
+    success_cost: Float32[Array, "R A"],
+    reach: Bool[Array, "R Z Z"],
+    length: int,
+) -> Rule:
+    """Fill in ``after_success``, edges that end nearest to acceptance first."""
+    count, actions = rule.spots.shape
+    states, subgoals = reach.shape[1], tables.distance.shape[1] - 1
+    edges = (actions - 1) // max(subgoals, 1)
+    if edges == 0:
+        return rule
+    targets = jnp.max(tables.actions.to_state[:, :-1].reshape(count, subgoals, edges), axis=1)
+    ends = jnp.all(tables.actions.accepts[:, :-1].reshape(count, subgoals, edges), axis=1) | (targets < 0)
+    depth = jnp.sum(reach, axis=2, dtype=jnp.int32)
+    late = jnp.where(ends, states + 1, jnp.take_along_axis(depth, jnp.maximum(targets, 0), axis=1))
+    order = jnp.argsort(late, axis=1, stable=True).astype(jnp.int32)
+    todo = jnp.max(jnp.sum(~ends, axis=1, dtype=jnp.int32))
+    others = ~jnp.eye(states, dtype=jnp.bool_)
+    cyclic = jnp.any(reach & jnp.swapaxes(reach, 1, 2) & others[None], axis=(1, 2))
+    lanes = jnp.repeat(jnp.arange(count, dtype=jnp.int32), subgoals)
+    subgoal = jnp.tile(jnp.arange(subgoals, dtype=jnp.int32), count)
+    chances, costs, tried = chance[lanes], success_cost[lanes], chance[lanes] > 0
+
+    def value(step, after_success):
+        edge = order[lanes, step % jnp.maximum(todo, 1)]
+        action = subgoal * edges + edge
+        now = dataclasses.replace(rule, after_success=after_success)
+        spot = subgoal * states + jnp.maximum(targets[lanes, edge], 0)
+        owed = success_cost[lanes, action]
+        gain = _gain(now, lanes, chances, costs)
+        chain = _follow(now, lanes, spot, owed, tried, chances, gain, length)
+        # A problem without cycles is not valued again because another of the batch has them.
+        stays = ends[lanes, edge] | ((step >= todo) & ~cyclic[lanes])
+        left = jnp.where(stays, after_success[lanes, action], chain.rest[0])
+        return after_success.at[lanes, action].set(left, unique_indices=True)
+
+    steps = todo * jnp.where(jnp.any(cyclic), PASSES, 1)
+    return dataclasses.replace(rule, after_success=jax.lax.fori_loop(0, steps, value, rule.after_success))
+
+
+def _gain(
+    rule: Rule, lanes: Int32[Array, "N"], chance: Float32[Array, "N A"], success_cost: Float32[Array, "N A"]
+) -> Float32[Array, "N A"]:
+    """Expected cost of each attempt without the way to it, what is left after success included, after failure not."""
+    return chance * (success_cost + rule.after_success[lanes]) + (1.0 - chance) * rule.failure_cost[lanes]
+
+
+def _follow(
+    rule: Rule,
+    lanes: Int32[Array, "N"],
+    spot: Int32[Array, "N"],
+    owed: Float32[Array, "N"],
+    available: Bool[Array, "N A"],
+    chance: Float32[Array, "N A"],
+    gain: Float32[Array, "N A"],
+    length: int,
+) -> _Chain:
+    """The chain of the rule from a spot of each lane; ``lanes`` are the lanes' problems."""
+    count, actions = available.shape
+    index = jnp.arange(actions, dtype=jnp.int32)[None, :]
+    number = jnp.arange(count, dtype=jnp.int32)
+    spots, inverse = rule.spots[lanes], jnp.where(available, 1.0 / chance, jnp.inf)
+    none = jnp.full((length, count), actions, jnp.int32)
+    zeros = jnp.zeros((length, count), jnp.float32)
+
+    def goes_on(carry):
+        return (carry[0] < length) & jnp.any(carry[4])
+
+    def advance(carry):
+        level, spot, owed, inverse, active, reached, records = carry
+        way = rule.ways[lanes, spot]
+        distance = jnp.where(spots == spot[:, None], 0.0, way + owed[:, None])
+        score = jax.lax.optimization_barrier(jnp.where(jnp.isinf(inverse), jnp.inf, (distance + gain) * inverse))
+        least = least_of_each(score, jnp.inf)
+        action = least_of_each(jnp.where(score <= least[:, None], index, actions - 1), actions - 1)
+        moves = active & ~jnp.isinf(least)
+        odds = chance[number, action]
+        new = (jnp.where(moves, action, actions), jnp.where(moves, least * odds, 0.0), jnp.where(moves, odds, 0.0))
+        records = tuple(
+            jax.lax.dynamic_update_index_in_dim(old, entry, level, 0) for old, entry in zip(records, new, strict=True)
+        )
+        inverse = jnp.where(rule.spends[lanes, action], jnp.inf, inverse)
+        reached = reached * (1.0 - odds)
+        return (
+            level + 1,
+            jnp.where(moves, spots[number, action], spot),
+            jnp.where(moves, rule.failure_cost[lanes, action], owed),
+            inverse,
+            moves & (reached > NEGLIGIBLE),
+            reached,
+            records,
+        )
+
+    start = (jnp.int32(0), spot, owed, inverse, jnp.ones_like(spot, bool), jnp.ones_like(owed), (none, zeros, zeros))
+    action, cost, odds = jax.lax.while_loop(goes_on, advance, start)[-1]
+
+    def add(rest, level):
+        rest = cost[level] + (1.0 - odds[level]) * rest
+        return rest, rest
+
+    end = rule.dead_end_cost[lanes]
+    _, rest = jax.lax.scan(add, end, jnp.arange(length, dtype=jnp.int32), reverse=True)
+    return _Chain(action=action, cost=cost, chance=odds, rest=jnp.concatenate([rest, end[None]]))

@@ -6,7 +6,6 @@ so histories that know the same at the same place are one node, in whatever orde
 """
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 from enum import StrEnum
 from typing import Any
@@ -16,10 +15,9 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
-from potlp_jax.planning.heuristic import Guess, guess_values
+from potlp_jax.planning.heuristic import Rule, guess_outcomes, make_rule
 from potlp_jax.planning.history import (
     ActionTables,
-    ActionTerms,
     History,
     action_tables,
     initial_history,
@@ -61,7 +59,7 @@ class SearchConfig:
       max_depth: actions per descent; one that gets there is cut, valued by what is known of its last node, and
         flagged.
       tree_capacity: nodes per tree, at least 1; None for one more than simulations. A full tree is flagged.
-      guess_failures: failures per automaton state that the guess at untried outcomes tells apart.
+      guess_failures: failures in a row that the guess at untried outcomes follows; a dead end counts after them.
       mode: how values are made, see ``SearchMode``.
       exploration: weight of the exploration term in the mode ``AUTHORS_CODE``, a cost: the descent takes the least
         ``Q - exploration * sqrt(log(n) / n_a)``; the authors use 50.
@@ -71,7 +69,7 @@ class SearchConfig:
     optimism: float = 0.3
     max_depth: int = 32
     tree_capacity: int | None = None
-    guess_failures: int = 16
+    guess_failures: int = 24
     mode: SearchMode = SearchMode.EXPECTATION
     exploration: float = 50.0
 
@@ -162,14 +160,13 @@ class Tree:
 class Context:
     """What stays the same during a search.
 
-    ``hopeful`` marks the attempts that may succeed at the root; ``packed`` holds all of an action's row of the tables
-    (``pack_rows``); ``facts`` holds per action the number of the (subgoal, z') where it is attempted and whether its
-    success satisfies the task; ``relevant`` masks per state the conditions that later choices can depend on.
+    ``rule`` guesses; ``packed`` holds all of an action's row of the tables (``pack_rows``); ``facts`` holds per action
+    the number of the (subgoal, z') where it is attempted and whether its success satisfies the task; ``relevant``
+    masks per state the conditions that later choices can depend on.
     """
 
     tables: ActionTables
-    guess: Guess
-    hopeful: Bool[Array, "*B S E"]
+    rule: Rule
     packed: UInt32[Array, "*B A n"]
     facts: Int32[Array, "*B A 2"]
     relevant: UInt32[Array, "*B Z W"]
@@ -183,7 +180,7 @@ def new_search(
 ) -> tuple[Context, Tree]:
     """Tables of a batch of problems, and graphs of the roots alone."""
     context = prepare(structure, leaves, seeds, config)
-    root = jax.vmap(functools.partial(new_node, config=config))(context, context.root)
+    root = new_node(context, context.root, config)
     values = least_values(context, root.q_values, root.bounds, context.root.place, context.root.state)
     batch, actions = root.q_values.shape
 
@@ -217,39 +214,36 @@ def new_search(
 
 def prepare(structure: Any, leaves: Sequence[Array], seeds: UInt32[Array, "B 2"], config: SearchConfig) -> Context:
     """What a search of a batch of problems needs to know beside its graph; ``leaves`` are those of a problem."""
-    return jax.vmap(functools.partial(_prepare_one, structure, failures=config.guess_failures))(leaves, seeds)
-
-
-def _prepare_one(structure: Any, leaves: Sequence[Array], seed: UInt32[Array, "2"], failures: int) -> Context:
-    problem = jax.tree.unflatten(structure, leaves)
-    tables, root = action_tables(problem), initial_history(problem)
-    terms = terms_of_all(tables, root)
-    guess = guess_values(problem, tables, terms.success_probability, terms.success_cost, failures)
-    rows, states = tables.actions, tables.accepting.shape[0]
+    problems = jax.tree.unflatten(structure, leaves)
+    tables, root = jax.vmap(action_tables)(problems), jax.vmap(initial_history)(problems)
+    rows, states = tables.actions, tables.accepting.shape[1]
     where = rows.subgoal * states + rows.from_state
+    reach = jax.vmap(_reachable)(tables)
+    terms = jax.vmap(terms_of_all)(tables, root)
+    rule = make_rule(
+        tables,
+        where,
+        terms.success_probability,
+        terms.success_cost,
+        reach,
+        problems.dead_end_cost,
+        config.guess_failures,
+        solve=config.mode is not SearchMode.AUTHORS_CODE,
+    )
     return Context(
         tables=tables,
-        guess=guess,
-        hopeful=_by_subgoal(terms.success_probability, problem.subgoal_count) > 0,
-        packed=pack_rows(rows),
+        rule=rule,
+        packed=jax.vmap(pack_rows)(rows),
         facts=jnp.stack([where, rows.accepts.astype(jnp.int32)], axis=-1),
-        relevant=_relevant_conditions(tables),
+        relevant=jax.vmap(_relevant_conditions)(tables, reach),
         root=root,
-        dead_end_cost=problem.dead_end_cost,
-        seeds=seed,
+        dead_end_cost=problems.dead_end_cost,
+        seeds=seeds,
     )
 
 
-def _by_subgoal(values: Float32[Array, "A"], subgoals: int) -> Float32[Array, "S E"]:
-    """Values of all actions but finish, by subgoal and edge."""
-    return values[:-1].reshape(subgoals, (values.shape[0] - 1) // max(subgoals, 1))
-
-
-def _relevant_conditions(tables: ActionTables) -> UInt32[Array, "Z W"]:
-    """Per state, the conditions of actions that can still be attempted.
-
-    All of them where conditions of several cubes exist: what is known of one may then settle another.
-    """
+def _reachable(tables: ActionTables) -> Bool[Array, "Z Z"]:
+    """``[z, z']``: ways and attempts can lead from z to z'."""
     rows, states = tables.actions, tables.accepting.shape[0]
     own = jnp.arange(states, dtype=jnp.int32)
     attempts = rows.from_state[:, None] == own[None, :]
@@ -258,6 +252,16 @@ def _relevant_conditions(tables: ActionTables) -> UInt32[Array, "Z W"]:
     reach = travels | succeeds | (own[:, None] == own[None, :])
     for _ in range(max(states - 1, 1).bit_length()):
         reach = jnp.any(reach[:, :, None] & reach[None, :, :], axis=1)
+    return reach
+
+
+def _relevant_conditions(tables: ActionTables, reach: Bool[Array, "Z Z"]) -> UInt32[Array, "Z W"]:
+    """Per state, the conditions of actions that can still be attempted.
+
+    All of them where conditions of several cubes exist: what is known of one may then settle another.
+    """
+    rows = tables.actions
+    attempts = rows.from_state[:, None] == jnp.arange(reach.shape[0], dtype=jnp.int32)[None, :]
     useful = jnp.any(reach[:, None, :] & attempts[None, :, :], axis=2)
     bits = jnp.where(useful[:, :, None], rows.condition_bits[None], jnp.uint32(0))
     combined = jax.lax.reduce(bits, jnp.uint32(0), jax.lax.bitwise_or, (1,))
@@ -277,14 +281,19 @@ class Node:
 
 
 def new_node(context: Context, history: History, config: SearchConfig) -> Node:
-    """The numbers of one node when nothing below it has been seen."""
-    terms = terms_of_all(context.tables, dataclasses.replace(history, owed=jnp.float32(0.0)))
+    """The numbers of one node per row when nothing below it has been seen."""
+    inner = dataclasses.replace(history, owed=jnp.zeros_like(history.owed))
+    terms = jax.vmap(terms_of_all)(context.tables, inner)
     chance, available = terms.success_probability, terms.available
-    lost, won = _guesses(context, terms)
     if config.mode is SearchMode.AUTHORS_CODE:
+        lost = won = jnp.zeros_like(chance)
         q_values = jnp.where(available, 0.0, jnp.inf).astype(jnp.float32)
         bounds = jnp.where(available, UNTRIED, 1.0).astype(jnp.float32)
     else:
+        spot = history.place * context.tables.accepting.shape[1] + history.state
+        lost, won = guess_outcomes(
+            context.rule, spot, history.owed, available, chance, terms.success_cost, config.guess_failures
+        )
         known = terms.distance + chance * terms.success_cost + (1.0 - chance) * terms.failure_cost
         guessed = chance * won + (1.0 - chance) * lost
         q_values = jnp.where(available, known + guessed, jnp.inf)
@@ -307,23 +316,6 @@ def least_values(
         for kind in (~inside, inside)
     ]
     return jnp.stack([*least, jnp.zeros(place.shape, jnp.float32)], axis=-1)
-
-
-def _guesses(context: Context, terms: ActionTerms) -> tuple[Float32[Array, "A"], Float32[Array, "A"]]:
-    """Guessed values after failure and after success of every action of one node; 0 after finish."""
-    subgoals = context.hopeful.shape[0]
-
-    def by_subgoal(values: Array) -> Array:
-        return _by_subgoal(values, subgoals)
-
-    def by_action(values: Float32[Array, "S E"]) -> Float32[Array, "A"]:
-        return jnp.append(values.reshape(-1), jnp.float32(0.0))
-
-    failed = context.hopeful & (by_subgoal(terms.success_probability) == 0)
-    failures = context.guess.count_by_state(jnp.sum(failed, axis=0, dtype=jnp.int32))
-    lost = context.guess.after_failure(failures, by_subgoal(terms.failure_cost))
-    won = context.guess.after_success(failures, by_subgoal(terms.success_cost))
-    return by_action(lost), by_action(won)
 
 
 def arrival(

@@ -11,7 +11,6 @@ not depend on their size.
 """
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -329,7 +328,7 @@ def _expand(
     row = unpack_rows(context.packed[rows, descent.action], context.tables.actions)
     parent = tree.history(descent.node, descent.owed)
     history = jax.vmap(step_row)(context.tables, row, parent, descent.success)
-    node = jax.vmap(functools.partial(new_node, config=config))(context, history)
+    node = new_node(context, history, config)
     known, key, slot = find(context, tree, history)
     if config.mode is SearchMode.AUTHORS_CODE:
         known = jnp.full_like(known, Tree.UNVISITED)
