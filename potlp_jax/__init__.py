@@ -22,7 +22,8 @@ from potlp_jax.planning.search_graph import SearchConfig
 from potlp_jax.records import Outcome, Trial, load_trial
 from potlp_jax.task.formula import TaskError
 from potlp_jax.task.task import Task, TaskArrays, TaskSizes, stack_tasks
-from potlp_jax.trial import TrialConfig, run_trial
+from potlp_jax.trial import run_trial
+from potlp_jax.trial_config import TrialConfig
 from potlp_jax.types import NO_ACTION, Status
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
 from potlp_jax.world.grid import BeliefMap, World, make_world

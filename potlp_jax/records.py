@@ -72,7 +72,8 @@ class Decision:
     ``kind`` is ``"action"`` (toward a subgoal), ``"finish"`` (acceptance in known space), ``"frontier"`` (nearest
     frontier: the baseline's move), ``"fallback"`` (the same as liveness rule of a planner without available action) or
     ``"none"``. ``choice`` is the index of the chosen action, None unless the policy searches. ``path`` is the part of
-    the known-space path that may be executed before the next decision, starting at ``cell``.
+    the known-space path that may be executed before the next decision, starting at ``cell``. ``looks`` holds, per
+    subgoal, the decision at which the panorama was taken that its estimates come from; empty where none is used.
     """
 
     index: int
@@ -90,6 +91,7 @@ class Decision:
     subgoals: tuple[tuple[int, int], ...]
     actions: tuple[ActionRecord, ...]
     path: tuple[tuple[int, int], ...]
+    looks: tuple[int, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -198,6 +200,7 @@ def _decision_from_dict(data: Mapping[str, Any]) -> Decision:
     values["value"] = float(data["value"])
     values["subgoals"] = _cells(data["subgoals"])
     values["path"] = _cells(data["path"])
+    values["looks"] = tuple(data.get("looks", ()))
     values["actions"] = tuple(_action_from_dict(action) for action in data["actions"])
     return Decision(**values)
 

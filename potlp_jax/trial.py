@@ -5,119 +5,28 @@ The loop knows a ``Robot`` only; the simulator is one, and a real robot is anoth
 
 import dataclasses
 import importlib.metadata
-import math
 from collections import Counter
-from collections.abc import Mapping
-from functools import partial
-from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
-from jaxtyping import Array, Bool, Float32, Int32, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
+from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator, estimator_for, look
 from potlp_jax.learning.labels import TrueMapEstimator
+from potlp_jax.learning.views import look_of_subgoals
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.history import ActionTerms
-from potlp_jax.planning.policies import DecisionConfig, Move, MoveKind, Policy, assess, decide, planning_problem
-from potlp_jax.planning.pouct import Plan, search_tree
-from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.product import KnownPath
-from potlp_jax.planning.search_graph import SearchConfig, SearchMode, Tree
-from potlp_jax.records import NEVER_SEEN, ActionRecord, Decision, Outcome, Trial
+from potlp_jax.planning.policies import Move, MoveKind, Policy, decide
+from potlp_jax.records import ActionRecord, Decision, Outcome, Trial
+from potlp_jax.robot import DIAGONAL, Robot, SimulatedRobot, Stop, as_cell
 from potlp_jax.task.task import Task, TaskArrays
+from potlp_jax.trial_config import TrialConfig
 from potlp_jax.types import NO_ACTION
-from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import BeliefMap, World
-from potlp_jax.world.sensing import SensorConfig, observe
 
-DIAGONAL: float = math.sqrt(2.0)
 STUCK_REPEATS: int = 3
 """Decisions in the same cell, state and map after which a trial counts as stuck."""
-
-
-@dataclasses.dataclass(frozen=True)
-class TrialConfig:
-    """Settings of a trial (MODEL.md section 7).
-
-    ``replan_distance`` is in cells; ``budget_factor`` times the map's ``height + width`` cells may be travelled;
-    ``revealed`` starts from the whole map.
-    """
-
-    decision: DecisionConfig = DecisionConfig()
-    sensor: SensorConfig = SensorConfig()
-    replan_distance: float = 4.0
-    budget_factor: float = 20.0
-    revealed: bool = False
-
-
-@struct.dataclass(kw_only=True)
-class Stop:
-    """When a robot that follows a path hands back control.
-
-    ``replan_distance`` (cells) applies once the map has changed since the decision: while nothing new is known there
-    is nothing to decide, and keeping to the target is what makes every policy reach it (liveness).
-    ``budget`` is what may still be travelled, in cells. ``is_frontier`` tells that the target is one, so that the
-    robot stops when nothing unobserved is left beside it.
-    """
-
-    replan_distance: Float32[Array, "*batch"]
-    budget: Float32[Array, "*batch"]
-    is_frontier: Bool[Array, "*batch"]
-
-
-@dataclasses.dataclass(frozen=True)
-class Leg:
-    """Cells entered on one advance, in order, the start left out."""
-
-    cells: tuple[tuple[int, int], ...]
-
-
-@runtime_checkable
-class Robot(Protocol):
-    """What the loop asks of a robot: a simulated one, or a real one."""
-
-    def observe(self) -> tuple[BeliefMap, tuple[int, int]]:
-        """The map as it is known now and the robot's cell."""
-        ...
-
-    def advance(self, path: KnownPath, stop: Stop) -> Leg:
-        """Follow ``path`` through known space, observing at every cell, until it ends or ``stop`` says so."""
-        ...
-
-
-class SimulatedRobot:
-    """A robot in a known ``World`` that sees along lines of sight."""
-
-    def __init__(self, world: World, config: TrialConfig) -> None:
-        self._world = world
-        self._config = config
-        self._cell = world.start
-        self._steps = 0
-        start = BeliefMap.revealed(world) if config.revealed else BeliefMap.unobserved(world)
-        self._belief = _observe(start, world, world.start, config.sensor)
-        self._first_seen = jnp.where(self._belief.unknown, NEVER_SEEN, 0).astype(jnp.int32)
-
-    @property
-    def first_seen(self) -> Int32[np.ndarray, "H W"]:
-        """Step at which each cell was first observed, ``NEVER_SEEN`` where it was not."""
-        return np.asarray(self._first_seen)
-
-    def observe(self) -> tuple[BeliefMap, tuple[int, int]]:
-        """The map as it is known now and the robot's cell."""
-        return self._belief, _cell(self._cell)
-
-    def advance(self, path: KnownPath, stop: Stop) -> Leg:
-        """Follow ``path`` through known space, observing at every cell, until it ends or ``stop`` says so."""
-        self._belief, self._first_seen, moved = _follow(
-            self._world, self._belief, self._first_seen, path, jnp.int32(self._steps), stop, self._config.sensor
-        )
-        moved = int(moved)
-        cells = np.asarray(path.cells)[1 : moved + 1]
-        self._cell = path.cells[moved]
-        self._steps += moved
-        return Leg(cells=tuple(_cell(cell) for cell in cells))
 
 
 def run_trial(
@@ -130,19 +39,25 @@ def run_trial(
     environment: str = "",
     seed: int | None = None,
     arrays: TaskArrays | None = None,
+    estimator: TrainedEstimator | None = None,
 ) -> Trial:
     """One trial of ``policy`` in ``world``, from its start to acceptance or failure.
 
-    ``key`` drives the planner's search; the same arguments give the same trial. ``arrays`` are the task's device
-    arrays where they shall be padded (default: ``task.arrays``). ``environment`` and ``seed`` go into the record.
+    ``key`` drives the planner's search and the camera's disturbance; the same arguments give the same trial. ``arrays``
+    are the task's device arrays where they shall be padded (default: ``task.arrays``). ``environment`` and ``seed`` go
+    into the record. ``estimator`` is for the policy ``potlp``; by default the shipped one for the task's propositions.
+
+    Raises:
+        CheckpointError: the estimator knows other propositions than the task, or none is shipped for them.
     """
     policy = Policy(policy)
     config = TrialConfig() if config is None else config
     if policy is Policy.KNOWN_MAP:
         config = dataclasses.replace(config, revealed=True)
-    estimator = TrueMapEstimator(world=world) if policy is Policy.ORACLE else None
-    robot = SimulatedRobot(world, config)
-    loop = Loop(robot, task, arrays if arrays is not None else task.arrays, policy, estimator, key, config)
+    robot = SimulatedRobot(world, config, jax.random.fold_in(key, _SENSING))
+    trained = estimator_for(task.propositions, estimator) if policy is Policy.POTLP else None
+    eyes = _first_estimator(policy, world, trained)
+    loop = Loop(robot, task, arrays if arrays is not None else task.arrays, policy, eyes, key, config)
     outcome = loop.run()
     return Trial(
         outcome=outcome,
@@ -161,8 +76,15 @@ def run_trial(
         seed=seed,
         status=loop.status,
         config=dataclasses.asdict(config),
-        versions=versions(),
+        versions=versions() | ({} if trained is None else {"estimator": trained.identity}),
     )
+
+
+def _first_estimator(policy: Policy, world: World, trained: TrainedEstimator | None) -> Estimator | None:
+    """What a policy that searches asks at the first decision, nothing seen yet."""
+    if policy is Policy.ORACLE:
+        return TrueMapEstimator(world=world)
+    return None if trained is None else trained.start(*world.shape)
 
 
 class Loop:
@@ -222,6 +144,8 @@ class Loop:
     def _decide(self, belief: BeliefMap, cell: tuple[int, int]) -> Move:
         index = len(self.decisions)
         key = jax.random.fold_in(self._key, index)
+        if isinstance(self._estimator, NetworkEstimator):
+            self._estimator = look(self._estimator, self._robot.panorama(), belief, jnp.asarray(cell, jnp.int32))
         move = _decide(
             belief,
             jnp.asarray(cell, jnp.int32),
@@ -232,7 +156,8 @@ class Loop:
             policy=self._policy,
             config=self._config.decision,
         )
-        self.decisions.append(_decision_record(move, index, len(self.path) - 1, cell, self.states[-1], key))
+        looks = _looks_of(self._estimator, move)
+        self.decisions.append(_decision_record(move, index, len(self.path) - 1, cell, self.states[-1], key, looks))
         self.status |= int(move.status)
         return move
 
@@ -265,7 +190,13 @@ _KIND_NAMES = {
 
 
 def _decision_record(
-    move: Move, index: int, step: int, cell: tuple[int, int], state: int, key: PRNGKeyArray
+    move: Move,
+    index: int,
+    step: int,
+    cell: tuple[int, int],
+    state: int,
+    key: PRNGKeyArray,
+    looks: tuple[int, ...],
 ) -> Decision:
     kind = int(move.kind)
     subgoals = np.asarray(move.subgoals.cells)[np.asarray(move.subgoals.mask)]
@@ -279,15 +210,24 @@ def _decision_record(
         key=tuple(int(word) for word in jax.random.key_data(key)),
         kind=_KIND_NAMES[kind],
         choice=None if int(move.action) == NO_ACTION else _unpadded_index(move, int(move.action)),
-        target=_cell(move.target_cell) if goes else None,
+        target=as_cell(move.target_cell) if goes else None,
         target_state=int(move.target_state) if goes else None,
         value=float(move.value),
         fallback=kind == MoveKind.FALLBACK,
         status=int(move.status),
-        subgoals=tuple(_cell(subgoal) for subgoal in subgoals),
+        subgoals=tuple(as_cell(subgoal) for subgoal in subgoals),
         actions=_action_records(move),
-        path=tuple(_cell(entry) for entry in path),
+        path=tuple(as_cell(entry) for entry in path),
+        looks=looks,
     )
+
+
+def _looks_of(estimator: Estimator | None, move: Move) -> tuple[int, ...]:
+    """Per subgoal, the look that its estimates come from; there is one look per decision."""
+    if not isinstance(estimator, NetworkEstimator):
+        return ()
+    looks = np.asarray(_look_numbers(estimator.views, move.subgoals))[np.asarray(move.subgoals.mask)]
+    return tuple(int(look) for look in looks)
 
 
 def _unpadded_index(move: Move, action: int) -> int:
@@ -315,7 +255,7 @@ def _action_records(move: Move) -> tuple[ActionRecord, ...]:
             ActionRecord(
                 index=_unpadded_index(move, int(index)),
                 subgoal=None if finish else subgoal,
-                cell=None if finish else _cell(cells[subgoal]),
+                cell=None if finish else as_cell(cells[subgoal]),
                 from_state=None if finish else int(edges[edge, 0]),
                 to_state=None if finish else int(edges[edge, 1]),
                 success_probability=float(terms["success_probability"][index]),
@@ -329,124 +269,13 @@ def _action_records(move: Move) -> tuple[ActionRecord, ...]:
     return tuple(records)
 
 
-def _cell(cell: Any) -> tuple[int, int]:
-    return int(cell[0]), int(cell[1])
-
-
 def versions() -> dict[str, str]:
     """Versions of what a trial's figures depend on."""
     return {name: importlib.metadata.version(name) for name in ("potlp-jax", "jax", "numpy")}
 
 
-def trial_config_from_dict(data: Mapping[str, Any]) -> TrialConfig:
-    """The configuration that a record keeps, as ``dataclasses.asdict`` wrote it."""
-    decision = data["decision"]
-    return TrialConfig(
-        **{
-            **data,
-            "sensor": SensorConfig(**data["sensor"]),
-            "decision": DecisionConfig(
-                **{
-                    **decision,
-                    "frontiers": FrontierConfig(**decision["frontiers"]),
-                    "search": SearchConfig(**{**decision["search"], "mode": SearchMode(decision["search"]["mode"])}),
-                }
-            ),
-        }
-    )
-
-
-_PLANNING = 1
-"""Name under which the trial's key is folded for the planner."""
+_PLANNING, _SENSING = 1, 2
+"""Names under which the trial's key is folded for the planner and for the sensors."""
 
 _decide = jax.jit(decide, static_argnames=("policy", "config"))
-_observe = jax.jit(observe, static_argnames=("config",))
-
-
-@partial(jax.jit, static_argnames=("config",))
-def _follow(
-    world: World,
-    belief: BeliefMap,
-    first_seen: Int32[Array, "H W"],
-    path: KnownPath,
-    steps: Int32[Array, ""],
-    stop: Stop,
-    config: SensorConfig,
-) -> tuple[BeliefMap, Int32[Array, "H W"], Int32[Array, ""]]:
-    """Move along the path cell by cell; returns the belief, when each cell was first seen, and the moves made."""
-    known_before = jnp.sum(~belief.unknown)
-    propositions_before = _propositions_seen(belief)
-    target = path.cells[path.length]
-
-    def goes_on(carry):
-        belief, _, moved, travelled = carry
-        changed = jnp.sum(~belief.unknown) > known_before
-        due = changed & (travelled >= stop.replan_distance)
-        surprised = (_propositions_seen(belief) & ~propositions_before) != 0
-        gone = stop.is_frontier & ~_beside_unobserved(belief, target)
-        stopped = due | surprised | gone | (travelled >= stop.budget)
-        return (moved < path.length) & ((moved == 0) | ~stopped)
-
-    def step(carry):
-        belief, first_seen, moved, travelled = carry
-        here, there = path.cells[moved], path.cells[moved + 1]
-        # On a map that holds no secret there is nothing to look for.
-        look = partial(observe, world=world, cell=there, config=config)
-        belief = jax.lax.cond(jnp.any(belief.unknown), look, lambda belief: belief, belief)
-        first_seen = jnp.where((first_seen == NEVER_SEEN) & ~belief.unknown, steps + moved + 1, first_seen)
-        diagonal = jnp.all(here != there)
-        return belief, first_seen, moved + 1, travelled + jnp.where(diagonal, DIAGONAL, 1.0).astype(jnp.float32)
-
-    start = (belief, first_seen, jnp.int32(0), jnp.float32(0.0))
-    belief, first_seen, moved, _ = jax.lax.while_loop(goes_on, step, start)
-    return belief, first_seen, moved
-
-
-def _propositions_seen(belief: BeliefMap) -> Int32[Array, ""]:
-    """Bits of the propositions that hold at some observed cell."""
-    return jax.lax.reduce(belief.letters, np.int32(0), jax.lax.bitwise_or, (0, 1))
-
-
-def _beside_unobserved(belief: BeliefMap, cell: Int32[Array, "2"]) -> Bool[Array, ""]:
-    """Whether a 4-neighbour of the cell is unobserved; outside of the array counts as unobserved."""
-    padded = jnp.pad(belief.unknown, 1, constant_values=True)
-    row, column = cell[0] + 1, cell[1] + 1
-    return padded[row - 1, column] | padded[row + 1, column] | padded[row, column - 1] | padded[row, column + 1]
-
-
-def replay_decision(trial: Trial, index: int) -> tuple[PlanningProblem, Plan, Tree]:
-    """Search again as in decision ``index`` of a recorded trial: its problem, plan and searched tree.
-
-    Raises ValueError where the trial has no such decision or its policy does not search.
-    """
-    if not 0 <= index < len(trial.decisions):
-        raise ValueError(f"the trial has decisions 0 to {len(trial.decisions) - 1}; there is no decision {index}")
-    if trial.policy != Policy.ORACLE:
-        raise ValueError(f"policy {trial.policy!r} does not search: its decisions have no tree")
-    decision = trial.decisions[index]
-    task = Task.from_hoa(trial.task_hoa, propositions=trial.propositions).arrays
-    config = trial_config_from_dict(trial.config)
-    problem = _replayed_problem(
-        trial.belief_at(decision.step),
-        jnp.asarray(decision.cell, jnp.int32),
-        jnp.int32(decision.state),
-        task,
-        TrueMapEstimator(world=trial.world),
-        config.decision,
-    )
-    key = jax.random.wrap_key_data(jnp.asarray(decision.key, jnp.uint32))
-    plan, tree = search_tree(problem, key, config.decision.search)
-    return problem, plan, tree
-
-
-@partial(jax.jit, static_argnames=("config",))
-def _replayed_problem(
-    belief: BeliefMap,
-    cell: Int32[Array, "2"],
-    state: Int32[Array, ""],
-    task: TaskArrays,
-    estimator: Estimator,
-    config: DecisionConfig,
-) -> PlanningProblem:
-    situation = assess(belief, cell, state, task, config.frontiers)
-    return planning_problem(situation, estimator(belief, situation.subgoals, task), config)
+_look_numbers = jax.jit(look_of_subgoals)

@@ -62,6 +62,8 @@ class Status(IntFlag):
     """No action was available; the robot went to the nearest frontier that violates nothing (liveness)."""
     NO_FRONTIER = 128
     """No action, no finish and no frontier that can be reached without violation."""
+    VIEW_OVERFLOW = 256
+    """The memory of panoramas was full; one was dropped that still showed a frontier."""
 
 
 def status_array(status: Status = Status.OK) -> UInt32[Array, ""]:

@@ -16,8 +16,10 @@ from potlp_jax.planning import policies
 from potlp_jax.planning.policies import DecisionConfig, MoveKind, Policy, decide
 from potlp_jax.planning.search_graph import SearchConfig
 from potlp_jax.records import Outcome, RecordError, load_trial
+from potlp_jax.replay import replay_decision
 from potlp_jax.task.task import Task, TaskSizes
-from potlp_jax.trial import TrialConfig, replay_decision, run_trial, trial_config_from_dict
+from potlp_jax.trial import run_trial
+from potlp_jax.trial_config import TrialConfig, trial_config_from_dict
 from potlp_jax.types import Status
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy, make_world, pad_world

@@ -41,6 +41,15 @@ Simulations = Annotated[
     int | None, typer.Option("--simulations", min=1, help="Simulations per decision of policies that search.")
 ]
 
+estimator_app = typer.Typer(
+    name="estimator", no_args_is_help=True, rich_markup_mode="rich", help="Describe or evaluate a trained estimator."
+)
+app.add_typer(estimator_app)
+Estimator = Annotated[Path, typer.Argument(metavar="CHECKPOINT", help="An estimator (.npz), as train.fit writes it.")]
+EstimatorFile = Annotated[
+    Path | None, typer.Option("--estimator", help="Trained estimator for the policy potlp; default: the shipped one.")
+]
+
 
 _ABOUT = (
     "Plan temporal-logic tasks in buildings that the robot has never seen.\n\n"
@@ -142,8 +151,14 @@ def run_command(
     environment: Environment,
     task: TaskName = "1",
     policy: Annotated[
-        str, typer.Option("--policy", "-p", help="known-map, baseline, optimistic or oracle.")
-    ] = "oracle",
+        str | None,
+        typer.Option(
+            "--policy",
+            "-p",
+            help="potlp (the default where an estimator is shipped), known-map, baseline, optimistic or oracle.",
+            show_default=False,
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="Which world of the split.")] = 0,
     split: SplitName = "validation",
     out: Annotated[
@@ -151,12 +166,13 @@ def run_command(
     ] = None,
     animation: Annotated[bool, typer.Option(help="Make the animation, the slowest of the three files.")] = True,
     simulations: Simulations = None,
+    estimator: EstimatorFile = None,
     json: Json = False,
 ) -> None:
     """Run one trial: one world, one task, one policy."""
     from potlp_jax.cli.run import run_one
 
-    run_one(environment, task, policy, seed, split, out, animation, simulations, json)
+    run_one(environment, task, policy, seed, split, out, animation, simulations, estimator, json)
 
 
 @app.command(
@@ -175,7 +191,12 @@ def run_command(
 def compare_command(
     environment: Environment,
     task: TaskName = "1",
-    policies: Annotated[str, typer.Option("--policies", help="Names, joined by commas.")] = "baseline,oracle",
+    policies: Annotated[
+        str | None,
+        typer.Option(
+            "--policies", help="Names, joined by commas; default: potlp where it is shipped.", show_default=False
+        ),
+    ] = None,
     trials: Annotated[int, typer.Option("--trials", "-n", min=1, help="Worlds; every policy runs in each.")] = 20,
     seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="First world of the split.")] = 0,
     split: SplitName = "validation",
@@ -184,12 +205,13 @@ def compare_command(
         typer.Option("--out", "-o", help="Folder for compare.json, trials.csv, scatter.png and table.txt."),
     ] = None,
     simulations: Simulations = None,
+    estimator: EstimatorFile = None,
     json: Json = False,
 ) -> None:
     """Compare policies in the same worlds, with the share of attainable savings and its uncertainty."""
     from potlp_jax.cli.compare import compare_policies
 
-    compare_policies(environment, task, policies, trials, seed, split, out, simulations, json)
+    compare_policies(environment, task, policies, trials, seed, split, out, simulations, estimator, json)
 
 
 @app.command(
@@ -214,12 +236,13 @@ def explain_command(
         typer.Option("--out", "-o", help="Search again and draw the top of the tree (.png, .svg or .pdf)."),
     ] = None,
     depth: Annotated[int, typer.Option(min=1, max=5, help="Actions in a row in the picture of the tree.")] = 2,
+    estimator: EstimatorFile = None,
     json: Json = False,
 ) -> None:
     """Explain one decision: the actions that were weighed, their estimates and expected costs."""
     from potlp_jax.cli.explain import explain_decision
 
-    explain_decision(decision, out, depth, json)
+    explain_decision(decision, out, depth, estimator, json)
 
 
 @app.command(
@@ -299,6 +322,56 @@ def bench_command(
     from potlp_jax.cli.bench import run_bench
 
     run_bench(parts, family, subgoals, batches, simulations, environment, task, size, sources, repeats, core, json)
+
+
+@estimator_app.command(
+    "evaluate",
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp estimator evaluate out/fit/estimator.npz data/validation[/cyan]
+
+[cyan]potlp estimator evaluate out/fit/estimator.npz data/validation --ablate all --out out/figures[/cyan]
+
+[dim]Needs the extra: pip install 'potlp-jax\\[train]'. docs/estimator.md says what the figures mean.[/dim]
+""",
+)
+@clear_errors
+def estimator_evaluate_command(
+    checkpoint: Estimator,
+    dataset: Annotated[Path, typer.Argument(metavar="DATASET", help="Folder of samples, as train.collect writes it.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for evaluation.json, table.txt and three pictures."),
+    ] = None,
+    ablate: Annotated[
+        str,
+        typer.Option("--ablate", help="Also without the [cyan]image[/cyan], with shuffled [cyan]phi[/cyan], or all."),
+    ] = "none",
+    json: Json = False,
+) -> None:
+    """Measure an estimator on worlds it has not seen: skill, calibration, errors of costs."""
+    from potlp_jax.cli.estimator import evaluate_estimator
+
+    evaluate_estimator(checkpoint, dataset, out, ablate, json)
+
+
+@estimator_app.command(
+    "info",
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp estimator info out/fit/estimator.npz[/cyan]
+
+[cyan]potlp estimator info out/fit/estimator.npz --json[/cyan]
+""",
+)
+@clear_errors
+def estimator_info_command(checkpoint: Estimator, json: Json = False) -> None:
+    """Show what an estimator knows, how large it is and how it was trained."""
+    from potlp_jax.cli.estimator import show_estimator
+
+    show_estimator(checkpoint, json)
 
 
 def main() -> None:

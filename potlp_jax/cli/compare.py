@@ -11,7 +11,15 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from potlp_jax.cli.inputs import make_world, read_environment_task, read_policy, read_split, trial_config
+from potlp_jax.cli.inputs import (
+    default_policy,
+    make_world,
+    read_environment_task,
+    read_policy,
+    read_split,
+    read_trained_estimator,
+    trial_config,
+)
 from potlp_jax.cli.output import (
     FAILED,
     console,
@@ -24,11 +32,13 @@ from potlp_jax.cli.output import (
 )
 from potlp_jax.environments import Generator, make
 from potlp_jax.environments.splits import Split
+from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.records import Outcome, Trial
 from potlp_jax.sweep.statistics import Comparison, TrialResult
 from potlp_jax.task.task import Task
-from potlp_jax.trial import TrialConfig, run_trial
+from potlp_jax.trial import run_trial
+from potlp_jax.trial_config import TrialConfig
 from potlp_jax.view.comparisons import draw_scatter, loss_lines, outcome_table, savings_table
 from potlp_jax.view.style import save_figure
 from potlp_jax.world.grid import World
@@ -57,12 +67,14 @@ class _Setting:
     task: Task
     policies: tuple[Policy, ...]
     config: TrialConfig
+    estimator: TrainedEstimator | None
 
     def trial(self, world: World, seed: int, policy: Policy) -> Trial:
         """The trial of a policy in world ``seed``; its key is the same for all policies."""
         name = f"{self.environment}/{self.split}"
         key = jax.random.key(seed)
-        return run_trial(world, self.task, policy, key, self.config, environment=name, seed=seed)
+        trained = self.estimator if policy is Policy.POTLP else None
+        return run_trial(world, self.task, policy, key, self.config, environment=name, seed=seed, estimator=trained)
 
     def pairs(self) -> Iterator[_Pair]:
         """The worlds in which the task is possible, with a trial of every policy in each."""
@@ -84,18 +96,21 @@ class _Setting:
 def compare_policies(
     environment: str,
     task_name: str,
-    policy_names: str,
+    policy_names: str | None,
     trials: int,
     seed: int,
     split_name: str,
     out: Path | None,
     simulations: int | None,
+    estimator: Path | None,
     json: bool,
 ) -> None:
     """Run every policy in the same worlds and report the paired figures (docs/model.md, section 8)."""
-    generator, policies, split = make(environment), _read_policies(policy_names), read_split(split_name)
+    generator, split = make(environment), read_split(split_name)
+    policies = _read_policies(default_policy(generator) if policy_names is None else policy_names)
+    trained = read_trained_estimator(estimator)
     task = read_environment_task(generator, task_name)
-    setting = _Setting(environment, generator, split, seed, task, policies, trial_config(simulations))
+    setting = _Setting(environment, generator, split, seed, task, policies, trial_config(simulations), trained)
     folder = output_folder(out)
     pairs = _run(setting, trials)
     results = {policy.value: [_result(pair, policy) for pair in pairs] for policy in policies}

@@ -3,12 +3,17 @@
 import re
 from pathlib import Path
 
+import numpy as np
+
+from potlp_jax.cli.inputs import read_trained_estimator
 from potlp_jax.cli.output import console, fail, note, print_json
 from potlp_jax.cli.run import RECORD
+from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.planning.tree_top import tree_top
 from potlp_jax.records import Decision, Trial, load_trial
-from potlp_jax.trial import replay_decision
+from potlp_jax.replay import panorama_at, replay_decision
 from potlp_jax.view.decisions import action_table, decision_to_dict, describe_decision
+from potlp_jax.view.panoramas import draw_panoramas
 from potlp_jax.view.style import save_figure
 from potlp_jax.view.trees import draw_tree
 
@@ -16,11 +21,10 @@ BREADTH: int = 4
 """Actions per node in the picture of a tree."""
 
 
-def explain_decision(name: str, out: Path | None, depth: int, json: bool) -> None:
-    """Print the actions of a decision; with ``out``, search again and draw the top of the tree."""
+def explain_decision(name: str, out: Path | None, depth: int, estimator: Path | None, json: bool) -> None:
+    """Print the actions of a decision; with ``out``, search again and draw the top of the tree, and what was seen."""
     trial, decision = _read_decision(name)
-    if out is not None:
-        _draw(trial, decision, out, depth)
+    files = [] if out is None else _draw(trial, decision, out, depth, read_trained_estimator(estimator))
     if json:
         print_json({"trial": trial.summary(), **decision_to_dict(decision)})
         return
@@ -30,8 +34,8 @@ def explain_decision(name: str, out: Path | None, depth: int, json: bool) -> Non
     else:
         output.print(describe_decision(trial, decision), markup=False)
         output.print(f"policy {trial.policy} does not search: it weighed no actions", markup=False)
-    if out is not None:
-        output.print(f"wrote {out}", markup=False)
+    for file in files:
+        output.print(f"wrote {file}", markup=False)
 
 
 def _read_decision(name: str) -> tuple[Trial, Decision]:
@@ -47,11 +51,18 @@ def _read_decision(name: str) -> tuple[Trial, Decision]:
     return trial, trial.decisions[index]
 
 
-def _draw(trial: Trial, decision: Decision, out: Path, depth: int) -> None:
+def _draw(trial: Trial, decision: Decision, out: Path, depth: int, estimator: TrainedEstimator | None) -> list[Path]:
+    """Pictures of the tree and, where the policy looks, of the panoramas; returns their files."""
     if not decision.actions:
         fail(f"decision {decision.index} of policy {trial.policy} did not search: there is no tree to draw")
-    problem, plan, tree = replay_decision(trial, decision.index)
+    problem, plan, tree = replay_decision(trial, decision.index, estimator)
     if int(plan.action) != decision.choice:
         note("searching again chose another action than recorded: the versions of the software may differ")
     top = tree_top(problem, tree, depth=depth, width=BREADTH)
     save_figure(draw_tree(top, describe_decision(trial, decision), breadth=BREADTH), out)
+    if not decision.looks:
+        return [out]
+    seen = {look: np.asarray(panorama_at(trial, trial.decisions[look])) for look in decision.looks}
+    beside = out.with_name(f"{out.stem}-panoramas.png")
+    save_figure(draw_panoramas(trial, decision, seen), beside)
+    return [out, beside]

@@ -7,9 +7,10 @@ from pathlib import Path
 from potlp_jax.cli.output import fail, note
 from potlp_jax.environments import Generator
 from potlp_jax.environments.splits import MAX_INDEX, Split, world_key
+from potlp_jax.learning.estimator import TrainedEstimator, read_estimator, shipped_estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task, shipped_tasks
-from potlp_jax.trial import TrialConfig
+from potlp_jax.trial_config import TrialConfig
 from potlp_jax.world.grid import World
 
 
@@ -39,6 +40,19 @@ def read_policy(name: str) -> Policy:
         return Policy(name.strip().replace("_", "-"))
     except ValueError:
         fail(f"unknown policy {name.strip()!r}; choose from: {', '.join(Policy)}")
+
+
+def default_policy(generator: Generator) -> Policy:
+    """PO-TLP where an estimator is shipped for the environment's propositions, else the baseline, with a note."""
+    if shipped_estimator(generator.propositions) is not None:
+        return Policy.POTLP
+    note(f"no estimator is shipped for {generator.name}: the policy is {Policy.BASELINE}; choose another with --policy")
+    return Policy.BASELINE
+
+
+def read_trained_estimator(path: Path | None) -> TrainedEstimator | None:
+    """An estimator from a file; None asks for the shipped one. Raises CheckpointError."""
+    return None if path is None else read_estimator(path)
 
 
 def read_split(name: str) -> Split:

@@ -5,7 +5,15 @@ from pathlib import Path
 import jax
 import typer
 
-from potlp_jax.cli.inputs import make_world, read_environment_task, read_policy, read_split, trial_config
+from potlp_jax.cli.inputs import (
+    default_policy,
+    make_world,
+    read_environment_task,
+    read_policy,
+    read_split,
+    read_trained_estimator,
+    trial_config,
+)
 from potlp_jax.cli.output import FAILED, console, output_folder, print_json, progress_bar
 from potlp_jax.environments import make
 from potlp_jax.records import Outcome, Trial
@@ -21,16 +29,19 @@ RECORD = "trial.json"
 def run_one(
     environment: str,
     task_name: str,
-    policy_name: str,
+    policy_name: str | None,
     seed: int,
     split_name: str,
     out: Path | None,
     animation: bool,
     simulations: int | None,
+    estimator: Path | None,
     json: bool,
 ) -> None:
     """Run a trial and leave with exit code 1 if it did not end satisfied."""
-    generator, policy, split = make(environment), read_policy(policy_name), read_split(split_name)
+    generator, split = make(environment), read_split(split_name)
+    policy = default_policy(generator) if policy_name is None else read_policy(policy_name)
+    trained = read_trained_estimator(estimator)
     task = read_environment_task(generator, task_name)
     world = make_world(generator, split, seed)
     folder = output_folder(out)
@@ -44,6 +55,7 @@ def run_one(
             trial_config(simulations),
             environment=f"{environment}/{split}",
             seed=seed,
+            estimator=trained,
         )
     files = [] if folder is None else _write(trial, folder, animation)
     if json:

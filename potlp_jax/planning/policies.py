@@ -3,7 +3,8 @@
 * ``known_map`` and ``baseline`` finish in known space where they can; otherwise they go to the nearest frontier that
   violates nothing (after Ayala et al. 2013). ``known_map`` is the same rule on a map that is revealed from the start.
 * ``optimistic`` takes an unobserved cell to be free and to carry whatever letter suits the task.
-* ``oracle`` and every other name with an estimator plan with high-level actions (Bradley et al. 2021, Algorithm 1).
+* ``potlp`` and ``oracle`` plan with high-level actions (Bradley et al. 2021, Algorithm 1), with estimates from a
+  trained network and from the true map.
 
 References:
   Bradley et al., Learning and Planning for Temporally Extended Tasks in Unknown Environments, ICRA 2021.
@@ -46,6 +47,12 @@ class Policy(StrEnum):
     BASELINE = "baseline"
     OPTIMISTIC = "optimistic"
     ORACLE = "oracle"
+    POTLP = "potlp"
+
+    @property
+    def searches(self) -> bool:
+        """Whether it weighs high-level actions, and needs an estimator."""
+        return self in (Policy.ORACLE, Policy.POTLP)
 
 
 class MoveKind:
@@ -168,7 +175,7 @@ def decide(
     situation = assess(belief, cell, state, task, config.frontiers)
     if policy is Policy.OPTIMISTIC:
         return _optimistic(situation, config)
-    if policy is Policy.ORACLE:
+    if policy.searches:
         if estimator is None:
             raise ValueError(f"policy {policy.value!r} needs an estimator")
         estimates = estimator(belief, situation.subgoals, task)

@@ -144,7 +144,7 @@ def _blocks(count: Int32[Array, ""]) -> Int32[Array, ""]:
     return (count + (_BLOCK - 1)) // _BLOCK
 
 
-def _over_frontier(grid: _Grid, body: Callable[[Int32[Array, "block"], Carry], Carry], carry: Carry) -> Carry:
+def _over_frontier(grid: _Grid, body: Callable[[Int32[Array, " block"], Carry], Carry], carry: Carry) -> Carry:
     """Fold ``body`` over the blocks of the list; dummies may be among the cells of the last."""
 
     def step(block: Array, carry: Carry) -> Carry:
@@ -184,7 +184,7 @@ def _label(grid: _Grid, width: int) -> _Grid:
     return dataclasses.replace(grid, parent=parent)
 
 
-def _summarise(grid: _Grid, width: int) -> tuple[Int32[Array, "cells"], Int32[Array, "cells"]]:
+def _summarise(grid: _Grid, width: int) -> tuple[Int32[Array, " cells"], Int32[Array, " cells"]]:
     """Size and subgoal of each component, at the component's root.
 
     With ``n`` cells that sum to ``S``, the cell ``p`` nearest the centroid minimises ``n p^2 - 2 p S``. Taken relative
@@ -219,9 +219,9 @@ def _summarise(grid: _Grid, width: int) -> tuple[Int32[Array, "cells"], Int32[Ar
 
 def _nearest(
     grid: _Grid,
-    kept: Bool[Array, "real"],
-    subgoal: Int32[Array, "cells"],
-    distance: Float32[Array, "real"],
+    kept: Bool[Array, " real"],
+    subgoal: Int32[Array, " cells"],
+    distance: Float32[Array, " real"],
     most: int,
 ) -> tuple[Float32[Array, "S"], Int32[Array, "S"], Int32[Array, "S"]]:
     """Distance, subgoal and root of the nearest components, by (distance, subgoal); ``_NEVER`` where there is none."""

@@ -90,7 +90,7 @@ def visible(occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], config: Senso
     return near | free_seen | (occupied & _dilate(free_seen))
 
 
-def _reach(occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], lines: _Lines) -> Int32[Array, "lines"]:
+def _reach(occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], lines: _Lines) -> Int32[Array, " lines"]:
     """The last step of every line before it is stopped."""
     rows, columns = lines.margin
     padded = jnp.pad(_cell_codes(occupied), ((rows, rows), (columns, columns)), constant_values=_OCCUPIED_BIT)
@@ -113,7 +113,7 @@ def _cell_codes(occupied: Bool[Array, "H W"]) -> UInt8[Array, "H W"]:
     return code
 
 
-def _range_maxima(values: Int32[Array, "lines"], levels: int) -> Int32[Array, "entries"]:
+def _range_maxima(values: Int32[Array, " lines"], levels: int) -> Int32[Array, " entries"]:
     """Row ``l`` of the (flattened) table holds the maximum of every block of ``2 ** l`` values from an index on."""
     rows = [values]
     for level in range(levels - 1):

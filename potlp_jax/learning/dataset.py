@@ -1,0 +1,365 @@
+"""Records for training the estimator, on disk: Parquet shards, made by simulation or from a robot's log.
+
+A dataset is a folder. Shard ``S`` is two files, ``views-SSSSS.parquet`` (one row a panorama) and
+``samples-SSSSS.parquet`` (one row a (view, subgoal, outcome class)). Each is written under a temporary name and
+renamed, the samples last: a shard exists when its samples file does. Every file carries the dataset's metadata as JSON
+in its schema, under the key ``potlp``. ``docs/dataset.md`` describes the columns.
+"""
+
+import dataclasses
+import json
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jaxtyping import Float32, Int8, Int32, UInt8
+
+SCHEMA_VERSION: int = 1
+"""Changes when a column or its meaning does."""
+
+JPEG_QUALITY: int = 92
+
+_METADATA_KEY = b"potlp"
+
+_TEMPORARY = ".tmp"
+
+VIEWS_SCHEMA = pa.schema(
+    {
+        "view": pa.int64(),
+        "world": pa.int64(),
+        "step": pa.int32(),
+        "row": pa.int32(),
+        "column": pa.int32(),
+        "format": pa.string(),
+        "image": pa.binary(),
+    }
+)
+
+SAMPLES_SCHEMA = pa.schema(
+    {
+        "view": pa.int64(),
+        "task": pa.string(),
+        "outcome_class": pa.int32(),
+        "row": pa.int32(),
+        "column": pa.int32(),
+        "bearing": pa.float32(),
+        "distance": pa.float32(),
+        "phi_stay": pa.list_(pa.int8()),
+        "phi_go": pa.list_(pa.int8()),
+        "success_probability": pa.float32(),
+        "success_cost": pa.float32(),
+        "failure_cost": pa.float32(),
+        "success_weight": pa.float32(),
+        "failure_weight": pa.float32(),
+    }
+)
+
+
+class DatasetError(ValueError):
+    """A dataset cannot be read, or not be continued; the message says which file and what to do."""
+
+
+@dataclass(frozen=True)
+class DatasetMetadata:
+    """What all shards of a dataset share. Nested values are JSON-able.
+
+    Attributes:
+        propositions: Sigma: the order of the entries of ``phi_stay`` and ``phi_go``.
+        environment: name of the family of worlds, or of the building.
+        generator: the family's configuration.
+        split: name of the split that the worlds are from (``environments.splits``); for real data any name.
+        camera: geometry of the panorama.
+        disturbance: what was added to the clean image.
+        encoding: format and quality of the encoded images.
+        weights: the bounds of ``success_weight`` and ``failure_weight``: ``low`` and ``high``.
+        collection: how poses, tasks and classes were drawn, seeds included.
+        versions: of the libraries.
+        unit: the unit of every distance, cost and weight.
+        resolution: side of a cell in that unit.
+        source: ``simulation``, or what else made the records.
+        schema_version: ``SCHEMA_VERSION`` at the time of writing.
+    """
+
+    propositions: tuple[str, ...]
+    environment: str
+    generator: Mapping[str, Any]
+    split: str
+    camera: Mapping[str, Any]
+    disturbance: Mapping[str, Any]
+    encoding: Mapping[str, Any]
+    weights: Mapping[str, float]
+    collection: Mapping[str, Any]
+    versions: Mapping[str, str]
+    unit: str = "cells"
+    resolution: float = 1.0
+    source: str = "simulation"
+    schema_version: int = SCHEMA_VERSION
+
+    def to_json(self) -> str:
+        """Canonical text: equal metadata give equal text."""
+        return json.dumps(dataclasses.asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str) -> "DatasetMetadata":
+        """The metadata that ``to_json`` wrote. Raises DatasetError where the text is something else."""
+        try:
+            data = json.loads(text)
+            version = data["schema_version"]
+            if version != SCHEMA_VERSION:
+                raise DatasetError(
+                    f"schema version {version}; this library reads {SCHEMA_VERSION}: collect the dataset again, or use "
+                    "the version of the library that wrote it"
+                )
+            return cls(**{**data, "propositions": tuple(data["propositions"])})
+        except (KeyError, TypeError, json.JSONDecodeError) as error:
+            raise DatasetError(f"not the metadata of a dataset: {error!r}") from error
+
+    def differences(self, other: "DatasetMetadata") -> list[str]:
+        """Names of what differs, with both values; dotted names inside of nested values."""
+        return _differences("", json.loads(self.to_json()), json.loads(other.to_json()))
+
+
+@dataclass
+class Samples:
+    """A dataset in memory, on the host; images stay encoded and are decoded per batch by ``decode``.
+
+    Attributes:
+        images: one per view.
+        view_of: index into ``images``.
+        bearing: direction of the subgoal in the map's frame, radians, 0 along increasing columns, growing clockwise
+            on a map with row 0 on top.
+        distance: known-space geodesic from the pose, letters ignored.
+        phi_stay, phi_go: the outcome class's vectors over ``metadata.propositions``, entries -1, 0, 1.
+        success: the true P_S.
+        success_cost: the true R_S, NaN where P_S = 0.
+        failure_cost: the true R_F.
+        success_weight, failure_weight: cost of missing a success and of taking a failure.
+        metadata: what the shards share.
+    """
+
+    images: list[bytes]
+    view_of: Int32[np.ndarray, "N"]
+    bearing: Float32[np.ndarray, "N"]
+    distance: Float32[np.ndarray, "N"]
+    phi_stay: Int8[np.ndarray, "N P"]
+    phi_go: Int8[np.ndarray, "N P"]
+    success: Float32[np.ndarray, "N"]
+    success_cost: Float32[np.ndarray, "N"]
+    failure_cost: Float32[np.ndarray, "N"]
+    success_weight: Float32[np.ndarray, "N"]
+    failure_weight: Float32[np.ndarray, "N"]
+    metadata: DatasetMetadata
+
+
+def encode(
+    image: UInt8[np.ndarray, "rows columns 3"], image_format: str = "jpeg", quality: int = JPEG_QUALITY
+) -> bytes:
+    """The RGB image as ``jpeg`` of this quality, or as ``png`` (without loss)."""
+    if image_format not in ("jpeg", "png"):
+        raise DatasetError(f"unknown image format {image_format!r}; choose jpeg or png")
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if image_format == "jpeg" else []
+    extension = ".jpg" if image_format == "jpeg" else ".png"
+    done, data = cv2.imencode(extension, cv2.cvtColor(image, cv2.COLOR_RGB2BGR), options)
+    if not done:
+        raise DatasetError(f"OpenCV could not encode an image of shape {image.shape} as {image_format}")
+    return data.tobytes()
+
+
+def decode(image: bytes) -> UInt8[np.ndarray, "rows columns 3"]:
+    """The RGB image; may be called from several threads."""
+    decoded = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR) if image else None
+    if decoded is None:
+        raise DatasetError(f"not an image: {len(image)} bytes that OpenCV does not decode")
+    return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
+
+
+def views_file(folder: Path | str, shard: int) -> Path:
+    """The file of a shard's views."""
+    return Path(folder) / f"views-{shard:05d}.parquet"
+
+
+def samples_file(folder: Path | str, shard: int) -> Path:
+    """The file of a shard's samples; it exists where the shard is finished."""
+    return Path(folder) / f"samples-{shard:05d}.parquet"
+
+
+def view_id(shard: int, index: int) -> int:
+    """The number of view ``index`` of a shard: unique in the dataset."""
+    return shard << 32 | index
+
+
+def finished_shards(folder: Path | str) -> set[int]:
+    """Numbers of the shards that are complete; none where there is no such folder."""
+    names = (re.fullmatch(r"samples-(\d{5})\.parquet", path.name) for path in Path(folder).glob("samples-*.parquet"))
+    return {int(name[1]) for name in names if name}
+
+
+def write_shard(
+    folder: Path | str,
+    number: int,
+    views: Mapping[str, Any],
+    samples: Mapping[str, Any],
+    metadata: DatasetMetadata,
+) -> None:
+    """Write both files of a shard, columns as in ``VIEWS_SCHEMA`` and ``SAMPLES_SCHEMA``.
+
+    A process that is killed at any time leaves the shard either complete or not there.
+    """
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    _write_table(views_file(folder, number), views, VIEWS_SCHEMA, metadata)
+    _write_table(samples_file(folder, number), samples, SAMPLES_SCHEMA, metadata)
+
+
+def remove_unfinished_files(folder: Path | str) -> None:
+    """Remove what processes that were killed had begun to write; nobody may be writing to the folder."""
+    for path in Path(folder).glob(f"*.parquet.*{_TEMPORARY}"):
+        path.unlink()
+
+
+def read_metadata(folder: Path | str) -> DatasetMetadata:
+    """The metadata that all finished shards share.
+
+    Raises:
+        DatasetError: no shards, a file that cannot be read, another schema version, or shards that differ.
+    """
+    shards = sorted(finished_shards(folder))
+    if not shards:
+        raise DatasetError(f"there is no dataset in {folder}: no finished shard (samples-*.parquet)")
+    paths = [path(folder, shard) for shard in shards for path in (views_file, samples_file)]
+    first = _metadata_of(paths[0], _schema_of(paths[0]))
+    for path in paths[1:]:
+        differences = first.differences(_metadata_of(path, _schema_of(path)))
+        if differences:
+            raise DatasetError(f"{path.name} is from another dataset than {paths[0].name}: {'; '.join(differences)}")
+    return first
+
+
+def read_dataset(folder: Path | str) -> Samples:
+    """All finished shards of a dataset, in the order of their numbers.
+
+    Raises:
+        DatasetError: no shards, a file that is truncated or has other columns, another schema version, shards with
+            different metadata, samples without a view, or values out of range.
+    """
+    metadata = read_metadata(folder)
+    images: list[bytes] = []
+    parts: list[dict[str, np.ndarray]] = []
+    for shard in sorted(finished_shards(folder)):
+        views = _read_table(views_file(folder, shard), VIEWS_SCHEMA, ("view", "image"))
+        samples = _read_table(samples_file(folder, shard), SAMPLES_SCHEMA, None)
+        path = samples_file(folder, shard)
+        columns = _sample_columns(samples, len(metadata.propositions), path)
+        columns["view_of"] = len(images) + _index_of(columns.pop("view"), views["view"].to_numpy(), path)
+        parts.append(columns)
+        images += views["image"].to_pylist()
+    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return Samples(images=images, metadata=metadata, **joined)
+
+
+def _write_table(path: Path, columns: Mapping[str, Any], schema: pa.Schema, metadata: DatasetMetadata) -> None:
+    table = pa.Table.from_pydict(dict(columns), schema.with_metadata({_METADATA_KEY: metadata.to_json().encode()}))
+    temporary = path.with_name(f"{path.name}.{os.getpid()}{_TEMPORARY}")
+    with temporary.open("wb") as file:
+        pq.write_table(table, file, compression="zstd")
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def _broken(path: Path, why: str) -> DatasetError:
+    return DatasetError(f"{path} {why}: delete both files of the shard and collect or convert it again")
+
+
+def _schema_of(path: Path) -> pa.Schema:
+    try:
+        return pq.read_schema(path)
+    except FileNotFoundError as error:
+        raise _broken(path, "is missing") from error
+    except (pa.ArrowInvalid, OSError) as error:
+        raise _broken(path, f"cannot be read ({error})") from error
+
+
+def _metadata_of(path: Path, schema: pa.Schema) -> DatasetMetadata:
+    text = (schema.metadata or {}).get(_METADATA_KEY)
+    if text is None:
+        raise DatasetError(f"{path} has no metadata of a dataset in its schema (key '{_METADATA_KEY.decode()}')")
+    try:
+        return DatasetMetadata.from_json(text.decode())
+    except DatasetError as error:
+        raise DatasetError(f"{path}: {error}") from error
+
+
+def _read_table(path: Path, schema: pa.Schema, columns: tuple[str, ...] | None) -> pa.Table:
+    found = _schema_of(path)
+    wrong = [field.name for field in schema if field.name not in found.names or found.field(field.name) != field]
+    if wrong:
+        raise _broken(path, f"has other columns than the schema: {', '.join(wrong)}")
+    try:
+        return pq.read_table(path, columns=list(columns or schema.names))
+    except (pa.ArrowInvalid, OSError) as error:
+        raise _broken(path, f"cannot be read ({error})") from error
+
+
+def _sample_columns(table: pa.Table, propositions: int, path: Path) -> dict[str, np.ndarray]:
+    """Columns of ``Samples`` by name, and ``view``."""
+    numbers = {
+        "view": "view",
+        "bearing": "bearing",
+        "distance": "distance",
+        "success": "success_probability",
+        "success_cost": "success_cost",
+        "failure_cost": "failure_cost",
+        "success_weight": "success_weight",
+        "failure_weight": "failure_weight",
+    }
+    columns = {name: table[column].to_numpy() for name, column in numbers.items()}
+    for name in ("phi_stay", "phi_go"):
+        lists = table[name].combine_chunks()
+        if np.any(np.diff(np.asarray(lists.offsets)) != propositions):
+            raise _broken(path, f"has {name} whose length is not the number of propositions, {propositions}")
+        columns[name] = lists.flatten().to_numpy().reshape(-1, propositions)
+    _check_values(columns, path)
+    return columns
+
+
+def _check_values(columns: Mapping[str, np.ndarray], path: Path) -> None:
+    success = columns["success"] > 0
+    positive = ("success_weight", "failure_weight")
+    rules = {
+        "success_probability must lie in [0, 1]": (columns["success"] >= 0) & (columns["success"] <= 1),
+        "success_cost must be a positive number where success_probability > 0": ~success
+        | (np.isfinite(columns["success_cost"]) & (columns["success_cost"] > 0)),
+        "failure_cost must be a number >= 0": np.isfinite(columns["failure_cost"]) & (columns["failure_cost"] >= 0),
+        "distance must be a number >= 0": np.isfinite(columns["distance"]) & (columns["distance"] >= 0),
+        "bearing must be a number": np.isfinite(columns["bearing"]),
+        **{f"{name} must be a positive number": np.isfinite(columns[name]) & (columns[name] > 0) for name in positive},
+    }
+    for rule, holds in rules.items():
+        if not holds.all():
+            raise DatasetError(f"{path}, row {int(np.argmin(holds))}: {rule}")
+
+
+def _index_of(wanted: np.ndarray, views: np.ndarray, path: Path) -> Int32[np.ndarray, "N"]:
+    """Position of each sample's view among the shard's views."""
+    position = {view: index for index, view in enumerate(views.tolist())}
+    if len(position) < len(views):
+        raise _broken(path, "has views that occur twice")
+    try:
+        return np.array([position[view] for view in wanted.tolist()], np.int32)
+    except KeyError as error:
+        raise _broken(path, f"has samples of view {error}, which is not in the shard") from error
+
+
+def _differences(name: str, one: Any, other: Any) -> list[str]:
+    if isinstance(one, dict) and isinstance(other, dict):
+        prefix = f"{name}." if name else ""
+        keys = sorted({*one, *other})
+        return [found for key in keys for found in _differences(prefix + key, one.get(key), other.get(key))]
+    return [] if one == other else [f"{name} is {one!r} in one and {other!r} in the other"]

@@ -1,0 +1,151 @@
+"""The trained network as an estimator: what it is asked in a decision, and which one belongs to which propositions.
+
+``TrainedEstimator`` is what is read from a file, on the host; ``NetworkEstimator`` is the pytree that a decision calls
+inside jit, with the panoramas seen so far. Which propositions an estimator knows is written in its file.
+"""
+
+import dataclasses
+import functools
+import hashlib
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float32, Int32, UInt8
+
+from potlp_jax.learning.checkpoints import CheckpointError, load_estimator, require_propositions
+from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
+from potlp_jax.learning.views import Views, look_of_subgoals, no_views, places_of_looks, remember
+from potlp_jax.planning.estimates import Estimates
+from potlp_jax.planning.product import product_distances
+from potlp_jax.task.task import TaskArrays
+from potlp_jax.types import NO_STATE
+from potlp_jax.world.frontiers import Subgoals
+from potlp_jax.world.grid import BeliefMap
+from potlp_jax.world.panorama import bearing
+
+MEMORY: int = 64
+"""Panoramas that are remembered. A trial takes 14 to 100, of which seldom more than a dozen still show a frontier."""
+
+
+@struct.dataclass(kw_only=True)
+class NetworkEstimator:
+    """P_S, R_S and R_F from the panoramas seen so far (Bradley et al. 2021, section IV). ``config`` is static."""
+
+    params: Params
+    views: Views
+    config: NetworkConfig = struct.field(pytree_node=False)
+
+    def __call__(self, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays) -> Estimates:
+        """Estimates of every real (subgoal, class); padded pairs have P_S = 0. At least one look must be remembered.
+
+        The network counts in cells. Subgoals are asked one after the other, so that padded ones cost nothing.
+        """
+        network = EstimatorNetwork(self.config)
+        places = places_of_looks(self.views, look_of_subgoals(self.views, subgoals))
+        poses = self.views.cells[places]
+        distance = _distances(belief, poses, subgoals)
+        angle = jax.vmap(bearing)(poses, subgoals.cells)
+        classes = task.class_mask.shape[0]
+
+        def ask(subgoal: Int32[Array, ""], answers: Float32[Array, "3 S C"]) -> Float32[Array, "3 S C"]:
+            features, residual = network.centre(self.views.features[places[subgoal]], angle[subgoal])
+            answer = network.answer(
+                self.params,
+                jnp.broadcast_to(features[None], (classes, *features.shape)),
+                jnp.broadcast_to(residual, (classes,)),
+                jnp.broadcast_to(distance[subgoal], (classes,)),
+                task.class_phi[:, 0],
+                task.class_phi[:, 1],
+            )
+            row = jnp.stack([answer.success_probability, answer.success_cost, answer.failure_cost])
+            return answers.at[:, subgoal].set(row)
+
+        # Real subgoals come first.
+        real = jnp.sum(subgoals.mask, dtype=jnp.int32)
+        nothing = jnp.stack(
+            [jnp.zeros((subgoals.mask.shape[0], classes)), *[jnp.ones((subgoals.mask.shape[0], classes))] * 2]
+        )
+        probability, success_cost, failure_cost = jax.lax.fori_loop(0, real, ask, nothing)
+        return Estimates(
+            success_probability=jnp.where(task.class_mask[None, :], probability, 0.0),
+            success_cost=success_cost * belief.resolution,
+            failure_cost=failure_cost * belief.resolution,
+        )
+
+    def look(
+        self, panorama: UInt8[Array, "rows columns 3"], belief: BeliefMap, cell: Int32[Array, "2"]
+    ) -> "NetworkEstimator":
+        """The estimator after it has seen ``panorama`` from ``cell``."""
+        features = EstimatorNetwork(self.config).encode(self.params, panorama)
+        return dataclasses.replace(self, views=remember(self.views, features, belief, cell))
+
+
+def _distances(belief: BeliefMap, poses: Int32[Array, "S 2"], subgoals: Subgoals) -> Float32[Array, " S"]:
+    """From each pose to its subgoal through known space, letters ignored, in cells; 0 where masked."""
+    open_cells = jnp.where(belief.free, 0, NO_STATE).astype(jnp.int32)[:, :, None]
+    states = jnp.where(subgoals.mask, 0, NO_STATE).astype(jnp.int32)
+    fields = product_distances(open_cells, belief.free, poses, states, jnp.float32(1.0))
+    count = jnp.arange(poses.shape[0], dtype=jnp.int32)
+    distance = fields[count, subgoals.cells[:, 0], subgoals.cells[:, 1], 0]
+    return jnp.where(jnp.isfinite(distance), distance, 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainedEstimator:
+    """An estimator read from a file. ``name`` and ``digest`` (of the file) identify it in records."""
+
+    params: Params
+    config: NetworkConfig
+    metadata: Mapping[str, Any]
+    name: str
+    digest: str
+
+    @property
+    def identity(self) -> str:
+        """Name and digest, as in records."""
+        return f"{self.name} {self.digest}"
+
+    def start(self, height: int, width: int, memory: int = MEMORY) -> NetworkEstimator:
+        """For a new trial on a map of this size: nothing seen yet."""
+        views = no_views(memory, self.config.feature_shape, height, width)
+        return NetworkEstimator(params=self.params, views=views, config=self.config)
+
+
+look = jax.jit(NetworkEstimator.look)
+"""``NetworkEstimator.look`` compiled: one compilation per network and size of the map."""
+
+
+@functools.lru_cache(maxsize=8)
+def read_estimator(path: Path) -> TrainedEstimator:
+    """Read an estimator. Raises CheckpointError where the file is none."""
+    params, config, metadata = load_estimator(path)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    return TrainedEstimator(params=params, config=config, metadata=metadata, name=path.stem, digest=digest)
+
+
+def shipped_estimator(propositions: tuple[str, ...]) -> TrainedEstimator | None:
+    """The estimator that comes with the package for these propositions, in this order; None where there is none."""
+    with resources.as_file(resources.files("potlp_jax.learning") / "data") as folder:
+        found = [read_estimator(path) for path in sorted(folder.glob("*.npz"))]
+    return next((estimator for estimator in found if estimator.config.propositions == propositions), None)
+
+
+def estimator_for(propositions: tuple[str, ...], given: TrainedEstimator | None = None) -> TrainedEstimator:
+    """The estimator to use for a task: the one given, else the shipped one.
+
+    Raises:
+        CheckpointError: the one given knows other propositions, or none is shipped for these.
+    """
+    estimator = shipped_estimator(propositions) if given is None else given
+    if estimator is None:
+        raise CheckpointError(
+            f"no estimator is shipped for the propositions {', '.join(propositions)}: choose another policy, or give "
+            "an estimator that was trained for them (docs/estimator.md)"
+        )
+    require_propositions(estimator.config, propositions, f"estimator {estimator.name}")
+    return estimator

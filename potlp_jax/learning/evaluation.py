@@ -1,0 +1,377 @@
+"""How good an estimator is on a data set: predictions, their figures, and what is left without picture or question.
+
+**Figures.** For samples with label y = P_S (0 or 1; real data may lie between) and prediction p:
+
+- Brier score: mean of (p - y)^2. Skill over the constant prior q: 1 - Brier / mean of (q - y)^2: 1 is perfect, 0 no
+  better than saying q always. The prior is one number for all groups of samples; ``own_skill`` compares with the
+  group's own mean instead, which is harder.
+- Log loss: mean of -[y log p + (1 - y) log(1 - p)].
+- ROC-AUC: probability that a random success is given a larger p than a random failure, ties counting half.
+- Calibration error: mean of |mean p - mean y| over ``BINS`` bins of p of equal width, weighted by their samples.
+- Errors of R_S over successes (weight y) and of R_F over failures (weight 1 - y): MAE, RMSE, bias = mean of predicted
+  - true, and R^2 = 1 - squared error / squared error of the constant mean of these very samples.
+
+**Ablations.** A network that does not look answers as well with its pictures blacked out; one that does not heed the
+question answers as well with the vectors phi of other samples. Groups and labels stay those of the intact samples.
+"""
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int8, Int64
+
+from potlp_jax.learning.checkpoints import require_propositions
+from potlp_jax.learning.dataset import Samples, decode, encode
+from potlp_jax.learning.network import Answers, EstimatorNetwork, NetworkConfig, Params
+from potlp_jax.learning.training import Batch, Batches, batch_answers
+
+BINS: int = 10
+
+DISTANCE_BANDS: tuple[float, ...] = (15.0, 30.0, 60.0, 120.0)
+"""Bounds between the bands of distance, in sides of a cell."""
+
+INTACT = "intact"
+ABLATIONS: tuple[str, ...] = ("image", "phi")
+
+SHUFFLE_SEED: int = 0
+
+_VIEWS_PER_BATCH = 16
+_SAMPLES_PER_VIEW = 16
+
+
+class EvaluationError(ValueError):
+    """An estimator cannot be evaluated on a data set; the message names what does not fit."""
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """What an estimator says of each sample of a data set, in the data set's order."""
+
+    success_logit: Float32[np.ndarray, "N"]
+    """Log odds of P_S."""
+    success_cost: Float32[np.ndarray, "N"]
+    """R_S, in the unit of cost."""
+    failure_cost: Float32[np.ndarray, "N"]
+    """R_F, in the unit of cost."""
+
+    @property
+    def success(self) -> Float64[np.ndarray, "N"]:
+        """P_S."""
+        return np.exp(-np.logaddexp(0.0, -self.success_logit.astype(np.float64)))
+
+
+@dataclass(frozen=True)
+class Prior:
+    """The constant answer that the skill compares with.
+
+    Attributes:
+        value: a mean of P_S.
+        source: ``training``: of the data that the estimator was trained on; ``evaluated``: of the data it is
+            evaluated on, where the estimator's metadata do not say the former. The latter is the harder opponent.
+    """
+
+    value: float
+    source: str
+
+
+@dataclass(frozen=True)
+class CostErrors:
+    """Errors of R_S or R_F over the samples where it is defined; NaN where there are none."""
+
+    samples: int
+    mae: float
+    rmse: float
+    bias: float
+    r2: float
+
+
+@dataclass(frozen=True)
+class ReliabilityBin:
+    """Predictions p with low <= p < high (the last bin includes 1); means are NaN where there are none."""
+
+    low: float
+    high: float
+    samples: int
+    predicted: float
+    observed: float
+
+
+@dataclass(frozen=True)
+class Figures:
+    """The figures of some samples, as in this module's docstring; NaN where one is not defined."""
+
+    samples: int
+    success_rate: float
+    brier: float
+    skill: float
+    own_skill: float
+    log_loss: float
+    auc: float
+    calibration_error: float
+    success_cost: CostErrors
+    failure_cost: CostErrors
+    bins: tuple[ReliabilityBin, ...]
+
+
+@dataclass(frozen=True)
+class Report:
+    """The figures of a data set.
+
+    Attributes:
+        overall: of all samples.
+        groups: of parts of them: by ``proposition`` asked for (a sample that asks for two is in both), by the number
+            of propositions ``avoided`` on the way, by ``distance``. Parts without samples are left out.
+    """
+
+    overall: Figures
+    groups: Mapping[str, Mapping[str, Figures]]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, NaN where a figure is not defined."""
+        groups = {
+            name: {part: dataclasses.asdict(figures) for part, figures in parts.items()}
+            for name, parts in self.groups.items()
+        }
+        return {"overall": dataclasses.asdict(self.overall), "groups": groups}
+
+
+def check_fit(
+    config: NetworkConfig, metadata: Mapping[str, Any], samples: Samples, estimator: str, dataset: str
+) -> None:
+    """Whether the estimator's answers mean the same as the data set's labels.
+
+    Args:
+        metadata: the estimator's, as ``load_estimator`` gives them.
+        estimator, dataset: their names in messages.
+
+    Raises:
+        CheckpointError: other propositions.
+        EvaluationError: another size of panorama, another camera or another unit of cost than those it learned from.
+    """
+    require_propositions(config, tuple(samples.metadata.propositions), estimator)
+    if not samples.images:
+        raise EvaluationError(f"{dataset} has no panoramas")
+    size = decode(samples.images[0]).shape[:2]
+    if size != config.image_shape:
+        raise EvaluationError(
+            f"{dataset} has panoramas of {size} pixels; {estimator} was made for {config.image_shape}"
+        )
+    trained_on = metadata.get("data", {})
+    for name in ("camera", "unit"):
+        here = getattr(samples.metadata, name)
+        if name in trained_on and trained_on[name] != here:
+            raise EvaluationError(
+                f"{estimator} learned from data with {name} {trained_on[name]}; {dataset} has {here}: collect a data "
+                "set with the same, or train an estimator for this one"
+            )
+
+
+def prior_of(metadata: Mapping[str, Any], samples: Samples) -> Prior:
+    """The mean P_S of the training data if the estimator's metadata have it (``prior``), else of these samples."""
+    stored = metadata.get("prior")
+    if isinstance(stored, int | float) and 0 <= stored <= 1:
+        return Prior(float(stored), "training")
+    return Prior(float(np.mean(samples.success, dtype=np.float64)), "evaluated")
+
+
+def ablated(samples: Samples, ablation: str) -> Samples:
+    """The samples without what ``ablation`` takes away.
+
+    ``image``: all panoramas black. ``phi``: each sample has the pair of vectors phi of another one, by a permutation
+    drawn from ``SHUFFLE_SEED``. ``intact``: the samples themselves.
+    """
+    if ablation == INTACT:
+        return samples
+    if ablation == "image":
+        black = encode(np.zeros_like(decode(samples.images[0])), "png")
+        return dataclasses.replace(samples, images=[black] * len(samples.images))
+    if ablation == "phi":
+        order = np.random.default_rng(SHUFFLE_SEED).permutation(len(samples.view_of))
+        return dataclasses.replace(samples, phi_stay=samples.phi_stay[order], phi_go=samples.phi_go[order])
+    raise EvaluationError(f"unknown ablation {ablation!r}; choose from: {', '.join(ABLATIONS)}")
+
+
+@functools.lru_cache(8)
+def _make_answer_step(network: EstimatorNetwork) -> Callable[[Params, Batch], Answers]:
+    """The compiled answers to one batch, not augmented."""
+
+    @jax.jit
+    def answer_step(params: Params, batch: Batch) -> Answers:
+        pixels = batch.images.astype(jnp.float32) / jnp.float32(255)
+        return batch_answers(network, params, pixels, batch.bearing, batch)
+
+    return answer_step
+
+
+def predict(
+    network: EstimatorNetwork, params: Params, samples: Samples, on_progress: Callable[[int], None] = lambda done: None
+) -> Predictions:
+    """The estimator's answers to all samples; ``on_progress`` is told the number of answers so far.
+
+    Raises TrainingError where there are no samples.
+    """
+    step = _make_answer_step(network)
+    names = tuple(Answers.__dataclass_fields__)
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    done = 0
+    for batch in Batches(samples, _VIEWS_PER_BATCH, _SAMPLES_PER_VIEW, seed=0).evaluation_batches():
+        answers, mask = step(params, batch), np.asarray(batch.mask)
+        for name in names:
+            rows[name].append(np.asarray(getattr(answers, name))[mask])
+        done += int(mask.sum())
+        on_progress(done)
+    # Batches give the samples view by view, and those of a view in the data set's order.
+    order = np.argsort(samples.view_of, kind="stable")
+    columns = {name: np.empty(len(order), np.float32) for name in names}
+    for name in names:
+        columns[name][order] = np.concatenate(rows[name])
+    return Predictions(**columns)
+
+
+def evaluate(samples: Samples, predictions: Predictions, prior: Prior) -> Report:
+    """All figures. ``samples`` are the intact ones, also for the predictions of an ablation."""
+
+    def of(chosen: np.ndarray | slice) -> Figures:
+        return figures_of(_part(samples, chosen), _part(predictions, chosen), prior)
+
+    groups = {
+        name: {part: of(chosen) for part, chosen in parts.items() if chosen.any()}
+        for name, parts in groups_of(samples).items()
+    }
+    return Report(of(slice(None)), groups)
+
+
+def groups_of(samples: Samples) -> dict[str, dict[str, Bool[np.ndarray, "N"]]]:
+    """Which samples belong to the parts of each group (see ``Report``)."""
+    asked = {name: samples.phi_go[:, p] == 1 for p, name in enumerate(samples.metadata.propositions)}
+    avoided = np.sum(samples.phi_stay == -1, axis=1)
+    bounds = (0.0, *(bound * samples.metadata.resolution for bound in DISTANCE_BANDS), np.inf)
+    bands = {}
+    for low, high in itertools.pairwise(bounds):
+        name = f"{low:g} to {high:g}" if np.isfinite(high) else f"over {low:g}"
+        bands[name] = (samples.distance >= low) & (samples.distance < high)
+    counts = range(len(samples.metadata.propositions) + 1)
+    return {"proposition": asked, "avoided": {str(n): avoided == n for n in counts}, "distance": bands}
+
+
+def figures_of(samples: Samples, predictions: Predictions, prior: Prior) -> Figures:
+    """The figures of at least one sample."""
+    true, said = samples.success.astype(np.float64), predictions.success
+    logit = predictions.success_logit.astype(np.float64)
+    rate, brier = float(true.mean()), float(np.mean((said - true) ** 2))
+    bins = reliability(true, said)
+    gaps = [bin.samples * abs(bin.predicted - bin.observed) for bin in bins if bin.samples]
+    return Figures(
+        samples=len(true),
+        success_rate=rate,
+        brier=brier,
+        skill=_gain(brier, float(np.mean((prior.value - true) ** 2))),
+        own_skill=_gain(brier, float(np.mean((rate - true) ** 2))),
+        log_loss=float(np.mean(true * np.logaddexp(0, -logit) + (1 - true) * np.logaddexp(0, logit))),
+        auc=roc_auc(true, logit),
+        calibration_error=sum(gaps) / len(true),
+        success_cost=cost_errors(samples.success_cost, predictions.success_cost, true),
+        failure_cost=cost_errors(samples.failure_cost, predictions.failure_cost, 1 - true),
+        bins=bins,
+    )
+
+
+def reliability(true: Float64[np.ndarray, "N"], said: Float64[np.ndarray, "N"]) -> tuple[ReliabilityBin, ...]:
+    """The bins of a reliability diagram."""
+    index = np.minimum((said * BINS).astype(np.int64), BINS - 1)
+    counts = np.bincount(index, minlength=BINS)
+    with np.errstate(invalid="ignore"):
+        predicted, observed = (np.bincount(index, values, BINS) / counts for values in (said, true))
+    return tuple(
+        ReliabilityBin(b / BINS, (b + 1) / BINS, int(counts[b]), float(predicted[b]), float(observed[b]))
+        for b in range(BINS)
+    )
+
+
+def roc_auc(true: Float64[np.ndarray, "N"], score: Float64[np.ndarray, "N"]) -> float:
+    """The area under the ROC curve; a label between 0 and 1 is that share of a success. NaN where one kind is missing.
+
+    By ranks: a success beats the failures with lower scores, and half of those with its own.
+    """
+    _, rank = np.unique(score, return_inverse=True)
+    successes, failures = np.bincount(rank, true), np.bincount(rank, 1 - true)
+    pairs = successes.sum() * failures.sum()
+    below = np.cumsum(failures) - failures
+    return float(np.sum(successes * (below + failures / 2)) / pairs) if pairs > 0 else float("nan")
+
+
+def cost_errors(
+    true: Float32[np.ndarray, "N"], said: Float32[np.ndarray, "N"], share: Float64[np.ndarray, "N"]
+) -> CostErrors:
+    """Errors over samples with a positive share and a known cost, weighted by the share."""
+    known = (share > 0) & np.isfinite(true)
+    if not known.any():
+        return CostErrors(0, *[float("nan")] * 4)
+    weight, target = share[known], true[known].astype(np.float64)
+    error = said[known].astype(np.float64) - target
+    squared = float(np.average(error**2, weights=weight))
+    variance = float(np.average((target - np.average(target, weights=weight)) ** 2, weights=weight))
+    return CostErrors(
+        samples=int(known.sum()),
+        mae=float(np.average(np.abs(error), weights=weight)),
+        rmse=squared**0.5,
+        bias=float(np.average(error, weights=weight)),
+        r2=_gain(squared, variance),
+    )
+
+
+def most_confident(samples: Samples, predictions: Predictions, count: int) -> dict[str, Int64[np.ndarray, " k"]]:
+    """Up to ``count`` samples each of the most confident answers that are right or wrong, one per panorama.
+
+    Keys: ``true positives``, ``true negatives``, ``false positives``, ``false negatives``. A label counts as a success
+    from one half on.
+    """
+    happened, logit = samples.success >= 0.5, predictions.success_logit
+    kinds = {
+        "true positives": (happened & (logit >= 0), -logit),
+        "true negatives": (~happened & (logit < 0), logit),
+        "false positives": (~happened & (logit >= 0), -logit),
+        "false negatives": (happened & (logit < 0), logit),
+    }
+    chosen = {}
+    for name, (belongs, doubt) in kinds.items():
+        order = np.argsort(doubt, kind="stable")
+        order = order[belongs[order]]
+        _, first = np.unique(samples.view_of[order], return_index=True)
+        chosen[name] = order[np.sort(first)[:count]]
+    return chosen
+
+
+def class_in_words(
+    phi_stay: Int8[np.ndarray, "P"], phi_go: Int8[np.ndarray, "P"], propositions: tuple[str, ...]
+) -> tuple[str, str]:
+    """What must hold on the way, and what at its end: ``stay: not fire`` and ``go: alarm, not exit``."""
+
+    def words(phi: np.ndarray) -> str:
+        literals = list(zip(phi.tolist(), propositions, strict=True))
+        wanted, unwanted = (
+            [p for value, p in literals if value == 1],
+            [f"not {p}" for value, p in literals if value == -1],
+        )
+        return ", ".join(wanted + unwanted) or "anything"
+
+    return f"stay: {words(phi_stay)}", f"go: {words(phi_go)}"
+
+
+def _gain(error: float, reference: float) -> float:
+    return 1 - error / reference if reference > 0 else float("nan")
+
+
+def _part(columns: Any, chosen: np.ndarray | slice) -> Any:
+    """Some of the samples (or predictions); images are not touched."""
+    arrays = {field.name: getattr(columns, field.name) for field in dataclasses.fields(columns)}
+    return dataclasses.replace(
+        columns, **{name: array[chosen] for name, array in arrays.items() if isinstance(array, np.ndarray)}
+    )

@@ -1,0 +1,356 @@
+"""The estimator: P_S, R_S and R_F from a panorama, a distance and the vectors phi (Bradley et al. 2021, section IV-B).
+
+Four convolutions encode the panorama (the first stage, once per panorama); the distance and both phi are then joined
+to every spatial element; eight more convolutions and five fully connected layers answer (the second stage, once per
+subgoal and outcome class). This is the only module that imports Flax's modules.
+
+**One panorama, many subgoals.** All convolutions pad circularly across the image's width, and the first stage's total
+stride is ``STRIDE`` = 16, so rolling the image by 16 px rolls the features by one column, exactly. The paper's network
+sees an image centred on the subgoal; here the features are rolled instead, by the multiple of 16 px nearest to the
+subgoal's bearing. What is left of the bearing, at most half a column, enters the second stage as sine and cosine.
+
+**What differs from the textbook layer.** The first two convolutions have kernels as large as their strides (4 and 2):
+such a convolution is a matrix product of patches, whose gradient costs a CPU several times less than that of
+overlapping strided kernels. A condition that is constant over the image passes a convolution as one vector per sample,
+so the second stage's first layer adds ``W @ condition`` to every element instead of convolving copies of it. Circular
+padding hides from a convolution where the centre is: a learned bias per spatial element says it. Layers that keep the
+shape have a residual connection. There is no normalisation layer: one panorama's answer never depends on the batch.
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float32, Int8, PRNGKeyArray, UInt8
+
+Params = Any
+"""Parameters of the network: nested dictionaries of float32 arrays, ``{"first": ..., "second": ...}``."""
+
+STRIDE: int = 16
+"""Pixels of the image per column (and row) of the features."""
+
+_FIRST_KERNELS = (4, 2, 3, 3)
+_FIRST_STRIDES = (4, 2, 2, 1)
+_SECOND_STRIDES = (2, 1, 1, 1, 2, 1, 1, 1)
+_OUTPUTS = 3
+_SLOPE = 0.1
+
+
+class NetworkError(ValueError):
+    """A network's configuration does not fit together, or does not fit what it is asked."""
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkConfig:
+    """Everything that, with the parameters, defines the answers; it is stored in every checkpoint.
+
+    Attributes:
+        propositions: Sigma: the meaning of the entries of both phi, in order.
+        image_shape: rows and columns of the panorama; the rows a multiple of 64, the columns of 64 too.
+        first_widths: channels of the four convolutions before phi is joined.
+        second_widths: channels of the eight after.
+        dense_widths: units of the first four fully connected layers; the fifth has the three outputs.
+        distance_scale: the distance is divided by it.
+        success_cost_scale, failure_cost_scale: unit of the outputs R_S and R_F, and of their errors in the loss
+            (standard deviations over the training data).
+        step: the least R_S, one step of the grid, in the unit of cost.
+        pixel_mean, pixel_scale: pixels in [0, 1] enter as ``(pixel - pixel_mean) / pixel_scale``.
+    """
+
+    propositions: tuple[str, ...]
+    image_shape: tuple[int, int] = (128, 512)
+    first_widths: tuple[int, ...] = (16, 32, 48, 48)
+    second_widths: tuple[int, ...] = (32, 32, 32, 32, 48, 48, 48, 48)
+    dense_widths: tuple[int, ...] = (128, 64, 64, 32)
+    distance_scale: float = 30.0
+    success_cost_scale: float = 30.0
+    failure_cost_scale: float = 30.0
+    step: float = 1.0
+    pixel_mean: float = 0.5
+    pixel_scale: float = 0.25
+
+    def __post_init__(self) -> None:
+        for name, count in (
+            ("first_widths", len(_FIRST_STRIDES)),
+            ("second_widths", len(_SECOND_STRIDES)),
+            ("dense_widths", 4),
+        ):
+            widths = getattr(self, name)
+            if len(widths) != count or min(widths) < 1:
+                raise NetworkError(f"{name} is {widths}; give {count} positive numbers")
+        side = STRIDE * math.prod(_SECOND_STRIDES)
+        if any(size < side or size % side for size in self.image_shape):
+            raise NetworkError(f"image_shape is {self.image_shape}; rows and columns must be multiples of {side}")
+        for name in ("distance_scale", "success_cost_scale", "failure_cost_scale", "step", "pixel_scale"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise NetworkError(f"{name} is {getattr(self, name)}; give a positive number")
+        if not self.propositions:
+            raise NetworkError("propositions is empty; name at least one")
+
+    @property
+    def feature_shape(self) -> tuple[int, int, int]:
+        """Rows, columns and channels of the first stage's output."""
+        rows, columns = self.image_shape
+        return rows // STRIDE, columns // STRIDE, self.first_widths[-1]
+
+    def to_json(self) -> dict[str, Any]:
+        """The configuration as JSON-able values."""
+        return {
+            name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self).items()
+        }
+
+    @classmethod
+    def from_json(cls, data: dict[str, Any]) -> "NetworkConfig":
+        """What ``to_json`` gave. Raises NetworkError where fields are missing, unknown or do not fit together."""
+        names = {field.name for field in dataclasses.fields(cls)}
+        if set(data) != names:
+            raise NetworkError(f"network configuration: fields {sorted(set(data) ^ names)} are missing or unknown")
+        fields: dict[str, Any] = {n: tuple(value) if isinstance(value, list) else value for n, value in data.items()}
+        return cls(**fields)
+
+
+@struct.dataclass(kw_only=True)
+class Answers:
+    """What the network says of (subgoal, class) pairs; costs in the unit of the training data's costs."""
+
+    success_logit: Float32[Array, "*B"]
+    """Log odds of P_S."""
+    success_cost: Float32[Array, "*B"]
+    """R_S, at least one step."""
+    failure_cost: Float32[Array, "*B"]
+    """R_F, at least 0."""
+
+    @property
+    def success_probability(self) -> Float32[Array, "*B"]:
+        """P_S."""
+        return jax.nn.sigmoid(self.success_logit)
+
+
+def _deviation(gain: float) -> Callable[..., Array]:
+    """Initialiser that gives the standard deviation ``sqrt(gain / inputs)``; ``EstimatorNetwork.init`` draws."""
+
+    def fill(key: PRNGKeyArray, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
+        return jnp.full(shape, math.sqrt(gain / math.prod(shape[:-1])), dtype)
+
+    return fill
+
+
+class _Convolution(nn.Module):
+    """Convolution and leaky ReLU: circular across the width, zeros above and below; patches where kernel = stride."""
+
+    width: int
+    kernel: int
+    stride: int
+    gain: float = 2.0
+
+    @nn.compact
+    def __call__(self, x: Array, added: Array | None = None) -> Array:
+        initial = _deviation(self.gain)
+        if self.kernel == self.stride:
+            x = nn.Dense(self.width, kernel_init=initial)(_patches(x, self.stride))
+        else:
+            edge = self.kernel // 2
+            x = jnp.concatenate([x[..., -edge:, :], x, x[..., :edge, :]], axis=-2)
+            kernel, strides = (self.kernel, self.kernel), (self.stride, self.stride)
+            x = nn.Conv(self.width, kernel, strides, padding=((edge, edge), (0, 0)), kernel_init=initial)(x)
+        return nn.leaky_relu(x if added is None else x + added, _SLOPE)
+
+
+def _patches(x: Array, side: int) -> Array:
+    """``[..., rows, columns, channels]`` to one vector of ``side * side * channels`` per patch."""
+    *batch, rows, columns, channels = x.shape
+    x = x.reshape(*batch, rows // side, side, columns // side, side, channels)
+    return jnp.moveaxis(x, -4, -3).reshape(*batch, rows // side, columns // side, side * side * channels)
+
+
+class _FirstStage(nn.Module):
+    widths: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, pixels: Array) -> Array:
+        x = pixels
+        for width, kernel, stride in zip(self.widths, _FIRST_KERNELS, _FIRST_STRIDES, strict=True):
+            x = _Convolution(width, kernel, stride)(x)
+        return x
+
+
+class _SecondStage(nn.Module):
+    widths: tuple[int, ...]
+    dense_widths: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, features: Array, condition: Array) -> Array:
+        """``[B, rows, columns, F]`` and ``[B, conditions]`` to ``[B, 3]``."""
+        x = self._joined(features, condition)
+        for width, stride in zip(self.widths[1:], _SECOND_STRIDES[1:], strict=True):
+            keeps = stride == 1 and width == x.shape[-1]
+            # Each residual layer adds to the variance; a small gain keeps seven of them in bounds.
+            y = _Convolution(width, 3, stride, gain=0.5 if keeps else 2.0)(x)
+            x = x + y if keeps else y
+        x = x.reshape(x.shape[0], -1)
+        for width in self.dense_widths:
+            x = nn.leaky_relu(nn.Dense(width, kernel_init=_deviation(2.0))(x), _SLOPE)
+        # Small, so that training starts near the constant prior.
+        return nn.Dense(_OUTPUTS, kernel_init=_deviation(0.01))(x)
+
+    def _joined(self, features: Array, condition: Array) -> Array:
+        """The first convolution of ``features`` with ``condition`` joined to every element (and to the padding)."""
+        width, stride = self.widths[0], _SECOND_STRIDES[0]
+        shape = (features.shape[1] // stride, features.shape[2] // stride, width)
+        position = self.param("position", nn.initializers.constant(0.1), shape)
+        of_condition = nn.Dense(width, use_bias=False, kernel_init=_deviation(2.0))(condition)
+        return _Convolution(width, 3, stride)(features, position[None] + of_condition[:, None, None, :])
+
+
+@dataclasses.dataclass(frozen=True)
+class EstimatorNetwork:
+    """Pure functions of the parameters. ``*B`` are any leading dimensions, equal in all arguments of a call.
+
+    Angles are bearings in the map's plane in radians, 0 along increasing columns, growing clockwise as seen on the map
+    with row 0 on top; the panorama's centre looks along bearing 0, and its right half along positive bearings.
+    """
+
+    config: NetworkConfig
+
+    def init(self, key: PRNGKeyArray) -> Params:
+        """New parameters: normal with the standard deviations of the modules' initialisers, biases 0."""
+        # One random vector for all: drawn leaf by leaf, the generator is compiled once for each.
+        deviations = jax.jit(self._deviations)()
+        leaves, structure = jax.tree.flatten(deviations)
+        noise = jax.random.normal(key, (sum(leaf.size for leaf in leaves),))
+        ends = np.cumsum([leaf.size for leaf in leaves]).tolist()
+        parts = [noise[end - leaf.size : end].reshape(leaf.shape) for end, leaf in zip(ends, leaves, strict=True)]
+        return jax.tree.unflatten(structure, [leaf * part for leaf, part in zip(leaves, parts, strict=True)])
+
+    def _deviations(self) -> Params:
+        key = jax.random.key(0)
+        rows, columns, channels = self.config.feature_shape
+        pixels = jnp.zeros((1, *self.config.image_shape, 3))
+        conditions = jnp.zeros((1, 2 * len(self.config.propositions) + 3))
+        features = jnp.zeros((1, rows, columns, channels))
+        return {
+            "first": self._first.init(key, pixels)["params"],
+            "second": self._second.init(key, features, conditions)["params"],
+        }
+
+    def encode(
+        self, params: Params, image: UInt8[Array, "*B rows columns 3"]
+    ) -> Float32[Array, "*B feature_rows feature_columns F"]:
+        """The first stage: features of panoramas in the world's frame. Raises NetworkError for another image size."""
+        return self.encode_pixels(params, image.astype(jnp.float32) / jnp.float32(255))
+
+    def encode_pixels(
+        self, params: Params, pixels: Float32[Array, "*B rows columns 3"]
+    ) -> Float32[Array, "*B feature_rows feature_columns F"]:
+        """The first stage for pixels in [0, 1]."""
+        if pixels.shape[-3:-1] != self.config.image_shape:
+            raise NetworkError(f"image of {pixels.shape[-3:-1]}; this network was made for {self.config.image_shape}")
+        normalised = (pixels - jnp.float32(self.config.pixel_mean)) / jnp.float32(self.config.pixel_scale)
+        flat = normalised.reshape(-1, *normalised.shape[-3:])
+        features = self._first.apply({"params": params["first"]}, flat)
+        assert isinstance(features, jax.Array)
+        return features.reshape(*pixels.shape[:-3], *features.shape[1:])
+
+    def centre(
+        self, features: Float32[Array, "*B feature_rows feature_columns F"], bearing: Float32[Array, "*B"]
+    ) -> tuple[Float32[Array, "*B feature_rows feature_columns F"], Float32[Array, "*B"]]:
+        """Features rolled by whole columns so that ``bearing`` is in the centre, and the angle that is left.
+
+        The angle left is at most half a column, ``pi / feature_columns``, and positive where the subgoal lies to the
+        right of the centre.
+        """
+        columns = features.shape[-2]
+        column = jnp.float32(2 * math.pi / columns)
+        shift = jnp.round(bearing / column)
+        own = jnp.broadcast_to(jnp.arange(columns), (*bearing.shape, columns))
+        source = (own + shift[..., None].astype(jnp.int32)) % columns
+        rolled = jnp.take_along_axis(features, source[..., None, :, None], axis=-2)
+        return rolled, bearing - shift * column
+
+    def answer(
+        self,
+        params: Params,
+        features: Float32[Array, "*B feature_rows feature_columns F"],
+        residual: Float32[Array, "*B"],
+        distance: Float32[Array, "*B"],
+        phi_stay: Int8[Array, "*B P"],
+        phi_go: Int8[Array, "*B P"],
+    ) -> Answers:
+        """The second stage, for features and residual angles as ``centre`` gives them.
+
+        ``distance`` is the known-space distance from the panorama's pose to the subgoal. Raises NetworkError where the
+        vectors phi have another length than the network's propositions.
+        """
+        expected = len(self.config.propositions)
+        if phi_stay.shape[-1] != expected or phi_go.shape[-1] != expected:
+            raise NetworkError(
+                f"phi of lengths {phi_stay.shape[-1]} and {phi_go.shape[-1]}; this network knows {expected} "
+                f"propositions: {', '.join(self.config.propositions)}"
+            )
+        # Half a column is turned into a quarter of a circle: the sine then uses its whole range.
+        angle = residual * jnp.float32(self.config.feature_shape[1] / 2)
+        scaled = distance / jnp.float32(self.config.distance_scale)
+        scalars = jnp.stack([scaled, jnp.sin(angle), jnp.cos(angle)], axis=-1)
+        condition = jnp.concatenate([phi_stay.astype(jnp.float32), phi_go.astype(jnp.float32), scalars], axis=-1)
+        outputs = self._second.apply(
+            {"params": params["second"]},
+            features.reshape(-1, *features.shape[-3:]),
+            condition.reshape(-1, condition.shape[-1]),
+        )
+        assert isinstance(outputs, jax.Array)
+        logit, success, failure = jnp.moveaxis(outputs.reshape(*distance.shape, _OUTPUTS), -1, 0)
+        return Answers(
+            success_logit=logit,
+            success_cost=jnp.float32(self.config.step)
+            + jnp.float32(self.config.success_cost_scale) * jax.nn.softplus(success),
+            failure_cost=jnp.float32(self.config.failure_cost_scale) * jax.nn.softplus(failure),
+        )
+
+    @property
+    def _first(self) -> _FirstStage:
+        return _FirstStage(self.config.first_widths)
+
+    @property
+    def _second(self) -> _SecondStage:
+        return _SecondStage(self.config.second_widths, self.config.dense_widths)
+
+
+def parameter_count(params: Params) -> int:
+    """Number of parameters."""
+    return sum(leaf.size for leaf in jax.tree.leaves(params))
+
+
+def operation_counts(config: NetworkConfig) -> tuple[int, int]:
+    """Floating-point operations forward, per panorama (first stage) and per (subgoal, class) pair (second stage).
+
+    Two per multiplication of a matrix product: a convolution counts ``2 * rows * columns * kernel^2 * in * out`` at its
+    output's size, a dense layer ``2 * in * out``. A training step's floor is three times these: forward, and backward
+    once to the inputs and once to the parameters (less the first layer's inputs, which need no gradient).
+    """
+    first = _convolution_operations(config.image_shape, 3, config.first_widths, _FIRST_KERNELS, _FIRST_STRIDES)
+    rows, columns, channels = config.feature_shape
+    kernels = (3,) * len(config.second_widths)
+    second = _convolution_operations((rows, columns), channels, config.second_widths, kernels, _SECOND_STRIDES)
+    second += 2 * (2 * len(config.propositions) + 3) * config.second_widths[0]
+    shrink = math.prod(_SECOND_STRIDES)
+    units = [(rows // shrink) * (columns // shrink) * config.second_widths[-1], *config.dense_widths, _OUTPUTS]
+    return first, second + sum(2 * i * o for i, o in itertools.pairwise(units))
+
+
+def _convolution_operations(
+    size: tuple[int, int], channels: int, widths: tuple[int, ...], kernels: tuple[int, ...], strides: tuple[int, ...]
+) -> int:
+    rows, columns = size
+    total = 0
+    for width, kernel, stride in zip(widths, kernels, strides, strict=True):
+        rows, columns = rows // stride, columns // stride
+        total += 2 * rows * columns * kernel**2 * channels * width
+        channels = width
+    return total

@@ -1,0 +1,696 @@
+"""Training of the estimator: the loss, one pure step, and a loop that can be killed at any time.
+
+**Loss** (Stein, Bradley and Roy 2018, as Bradley et al. 2021 use it). For a sample with label y = P_S, predicted p, and
+weights w_S (what it costs to miss the success) and w_F (what a failure taken costs),
+
+    cross-entropy  -[y w_S log p + (1 - y) w_F log(1 - p)]
+    success cost   y (R_S - predicted R_S)^2 / success_cost_scale^2
+    failure cost   (1 - y) (R_F - predicted R_F)^2 / failure_cost_scale^2
+
+averaged over samples and summed, the last two times ``cost_share``. The scales are the standard deviations over the
+training data and stay in ``NetworkConfig``. The weights are divided by their mean over the training data. Weights that
+differ between successes and failures move p away from the frequency of success: p / (1 - p) is multiplied by w_S / w_F.
+``TrainingConfig.weighting`` mixes them with 1: at 1 the loss is the paper's, at 0 p is calibrated.
+
+**Order.** The batch of a step depends on (seed, step) alone: every epoch has its own permutation of the views and its
+own choice of samples. Augmentation depends on (key, step). So a training that is resumed from a checkpoint does what it
+would have done, bit for bit, on the same machine and versions.
+
+A batch is grouped: some panoramas, and several samples of each, so that the first stage runs once per panorama.
+"""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import struct
+from jaxtyping import Array, Bool, Float32, Int8, Int32, PRNGKeyArray, UInt8, UInt32
+
+from potlp_jax.learning.checkpoints import checkpoint_steps, load_checkpoint, save_checkpoint
+from potlp_jax.learning.dataset import Samples, decode
+from potlp_jax.learning.network import Answers, EstimatorNetwork, NetworkConfig, Params
+
+_PREFETCHED = 4
+
+
+class TrainingError(ValueError):
+    """The data cannot be trained on, or training has diverged; the message says what to do."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingConfig:
+    """How to train.
+
+    Attributes:
+        steps: planned optimiser steps; the learning rate ends at 0 there.
+        seed: of the parameters, the order of the data and the augmentation.
+        views_per_batch, samples_per_view: panoramas in a batch, and samples of each; a view with more samples gives
+            a new random choice in every epoch, one with fewer is padded.
+        learning_rate: the peak, after a linear rise over ``warmup`` of all steps, then a cosine to 0.
+        weight_decay: of AdamW.
+        clip_norm: the gradient is scaled down to this norm.
+        average_decay: of the moving average of the parameters that is evaluated and kept; 0 for none.
+        weighting: 1: the cross-entropy weighted by what mistakes cost; 0: not weighted; between: a mix.
+        cost_share: factor of both cost terms.
+        mirror: probability of mirroring a panorama, its subgoals' bearings with it.
+        brightness, colour: standard deviations of the logarithm of a random gain per panorama, of all channels and of
+            each channel.
+        patience: evaluations without a better validation loss before training stops; 0 for never.
+        checkpoint_steps: steps between checkpoints; there is one after every epoch too.
+    """
+
+    steps: int
+    seed: int = 0
+    views_per_batch: int = 16
+    samples_per_view: int = 16
+    learning_rate: float = 2e-3
+    warmup: float = 0.05
+    weight_decay: float = 1e-3
+    clip_norm: float = 1.0
+    average_decay: float = 0.995
+    weighting: float = 0.25
+    cost_share: float = 0.5
+    mirror: float = 0.5
+    brightness: float = 0.05
+    colour: float = 0.02
+    patience: int = 6
+    checkpoint_steps: int = 200
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "views_per_batch", "samples_per_view", "checkpoint_steps"):
+            if getattr(self, name) < 1:
+                raise TrainingError(f"{name} is {getattr(self, name)}; give at least 1")
+        for name in ("weighting", "mirror", "warmup", "average_decay"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise TrainingError(f"{name} is {getattr(self, name)}; give a number from 0 to 1")
+
+
+@struct.dataclass(kw_only=True)
+class Batch:
+    """``G`` panoramas with ``K`` samples each; ``mask`` is True where a sample is real."""
+
+    images: UInt8[Array, "G rows columns 3"]
+    bearing: Float32[Array, "G K"]
+    distance: Float32[Array, "G K"]
+    phi_stay: Int8[Array, "G K P"]
+    phi_go: Int8[Array, "G K P"]
+    success: Float32[Array, "G K"]
+    """The true P_S."""
+    success_cost: Float32[Array, "G K"]
+    """The true R_S; NaN where P_S = 0."""
+    failure_cost: Float32[Array, "G K"]
+    """The true R_F; may be NaN where it is not known."""
+    success_weight: Float32[Array, "G K"]
+    failure_weight: Float32[Array, "G K"]
+    mask: Bool[Array, "G K"]
+
+
+@struct.dataclass(kw_only=True)
+class Sums:
+    """Sums over samples, from which losses and scores follow; sums of several batches add up."""
+
+    count: Float32[Array, ""]
+    cross_entropy: Float32[Array, ""]
+    """Weighted."""
+    success_error: Float32[Array, ""]
+    """Squared, in squared scales."""
+    failure_error: Float32[Array, ""]
+    successes: Float32[Array, ""]
+    failures: Float32[Array, ""]
+    brier: Float32[Array, ""]
+    prior_brier: Float32[Array, ""]
+    """Of the constant answer: the mean P_S of the training data."""
+
+
+@struct.dataclass(kw_only=True)
+class TrainState:
+    """Everything that the rest of a training depends on."""
+
+    step: Int32[Array, ""]
+    """Steps done."""
+    key: UInt32[Array, "2"]
+    """Data of the key of the augmentation; folded with the step."""
+    params: Params
+    optimizer: Any
+    average: Params
+    """Moving average of the parameters: what is evaluated."""
+    best: Params
+    """The average that had the lowest validation loss."""
+    best_loss: Float32[Array, ""]
+    best_step: Int32[Array, ""]
+    evaluations_since_best: Int32[Array, ""]
+    sums: Sums
+    """Of the training batches since the last evaluation."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DataScale:
+    """Figures of the training data that the loss and the scores use.
+
+    Attributes:
+        mean_weight: mean over samples of the weight of what happened.
+        prior: mean P_S, the constant answer that the Brier skill compares with.
+    """
+
+    mean_weight: float
+    prior: float
+
+    @classmethod
+    def of(cls, samples: Samples) -> "DataScale":
+        """The figures of these samples. Raises TrainingError where there are none."""
+        if not len(samples.success):
+            raise TrainingError("the data set has no samples")
+        weight = samples.success * samples.success_weight + (1 - samples.success) * samples.failure_weight
+        return cls(float(np.mean(weight, dtype=np.float64)), float(np.mean(samples.success, dtype=np.float64)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """Scores over samples; losses as in this module's docstring, costs' errors in the unit of cost.
+
+    ``skill`` is ``1 - brier / brier of the constant prior``. Errors of a label that does not occur are NaN.
+    """
+
+    samples: int
+    loss: float
+    cross_entropy: float
+    success_loss: float
+    failure_loss: float
+    brier: float
+    skill: float
+    success_rmse: float
+    failure_rmse: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """What the observer of a training is told after every evaluation."""
+
+    step: int
+    epoch: float
+    seconds: float
+    """Since the start, over all resumptions."""
+    learning_rate: float
+    training: Evaluation
+    """Mean over the batches since the last evaluation, augmented, at the parameters of each step."""
+    validation: Evaluation
+    best_step: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Trained:
+    """The end of a training: the best parameters, and why it ended (``planned``, ``patience`` or ``time``)."""
+
+    params: Params
+    best_step: int
+    best_loss: float
+    steps: int
+    reason: str
+    seconds: float
+
+
+def network_config(samples: Samples, image_shape: tuple[int, int]) -> NetworkConfig:
+    """A network for these samples: their propositions, and normalisers from their distances and costs."""
+    step = float(samples.metadata.resolution)
+    succeeded, failed = samples.success > 0, (samples.success < 1) & np.isfinite(samples.failure_cost)
+    return NetworkConfig(
+        propositions=tuple(samples.metadata.propositions),
+        image_shape=image_shape,
+        distance_scale=_spread(samples.distance, step),
+        success_cost_scale=_spread(samples.success_cost[succeeded], step),
+        failure_cost_scale=_spread(samples.failure_cost[failed], step),
+        step=step,
+    )
+
+
+def _spread(values: np.ndarray, least: float) -> float:
+    """Standard deviation, at least ``least``."""
+    return max(float(np.std(values, dtype=np.float64)), least) if len(values) else least
+
+
+def loss_sums(answers: Answers, batch: Batch, config: NetworkConfig, scale: DataScale, weighting: float) -> Sums:
+    """The sums over a batch; padding and costs that are not known count nothing."""
+    real = batch.mask.astype(jnp.float32)
+    success = jnp.where(batch.mask, batch.success, jnp.float32(0))
+    mean = jnp.float32(scale.mean_weight)
+    of_success = weighting * jnp.where(batch.mask, batch.success_weight, jnp.float32(0)) / mean + (1 - weighting)
+    of_failure = weighting * jnp.where(batch.mask, batch.failure_weight, jnp.float32(0)) / mean + (1 - weighting)
+    # softplus(-x) = -log sigmoid(x) and softplus(x) = -log(1 - sigmoid(x)), without overflow.
+    missed = success * of_success * jax.nn.softplus(-answers.success_logit)
+    taken = (1 - success) * of_failure * jax.nn.softplus(answers.success_logit)
+    probability = answers.success_probability
+    known_success = batch.mask & (success > 0) & jnp.isfinite(batch.success_cost)
+    known_failure = batch.mask & (success < 1) & jnp.isfinite(batch.failure_cost)
+    return Sums(
+        count=jnp.sum(real),
+        cross_entropy=jnp.sum(real * (missed + taken)),
+        success_error=_squared_errors(
+            answers.success_cost, batch.success_cost, known_success, success, config.success_cost_scale
+        ),
+        failure_error=_squared_errors(
+            answers.failure_cost, batch.failure_cost, known_failure, 1 - success, config.failure_cost_scale
+        ),
+        successes=jnp.sum(jnp.where(known_success, success, jnp.float32(0))),
+        failures=jnp.sum(jnp.where(known_failure, 1 - success, jnp.float32(0))),
+        brier=jnp.sum(real * (probability - success) ** 2),
+        prior_brier=jnp.sum(real * (jnp.float32(scale.prior) - success) ** 2),
+    )
+
+
+def _squared_errors(predicted: Array, true: Array, known: Array, share: Array, scale: float) -> Array:
+    # The label is replaced before the subtraction: a NaN behind `where` would still make the gradient NaN.
+    error = (predicted - jnp.where(known, true, jnp.float32(0))) / jnp.float32(scale)
+    return jnp.sum(jnp.where(known, share * error**2, jnp.float32(0)))
+
+
+def total_loss(sums: Sums, cost_share: float) -> Float32[Array, ""]:
+    """The loss that is minimised: all terms per sample."""
+    return (sums.cross_entropy + cost_share * (sums.success_error + sums.failure_error)) / jnp.maximum(
+        sums.count, jnp.float32(1)
+    )
+
+
+def evaluation_of(sums: Sums, config: NetworkConfig, cost_share: float) -> Evaluation:
+    """The scores that follow from sums."""
+    figures = {field.name: float(getattr(sums, field.name)) for field in dataclasses.fields(sums)}
+    count = max(figures["count"], 1.0)
+
+    def rmse(error: float, number: float, scale: float) -> float:
+        return scale * (error / number) ** 0.5 if number > 0 else float("nan")
+
+    return Evaluation(
+        samples=int(figures["count"]),
+        loss=float(total_loss(sums, cost_share)),
+        cross_entropy=figures["cross_entropy"] / count,
+        success_loss=figures["success_error"] / count,
+        failure_loss=figures["failure_error"] / count,
+        brier=figures["brier"] / count,
+        skill=1 - figures["brier"] / figures["prior_brier"] if figures["prior_brier"] > 0 else float("nan"),
+        success_rmse=rmse(figures["success_error"], figures["successes"], config.success_cost_scale),
+        failure_rmse=rmse(figures["failure_error"], figures["failures"], config.failure_cost_scale),
+    )
+
+
+def augment(
+    batch: Batch, key: PRNGKeyArray, config: TrainingConfig
+) -> tuple[Float32[Array, "G rows columns 3"], Float32[Array, "G K"]]:
+    """Pixels in [0, 1] and bearings, after random mirroring and gains.
+
+    The column of a pixel and its bearing change sign together, so mirroring the panorama negates the bearings. It is
+    the image that is mirrored, not the features: the first stage's kernels are not symmetrical.
+    """
+    of_mirror, of_brightness, of_colour = jax.random.split(key, 3)
+    views = batch.images.shape[0]
+    mirrored = jax.random.bernoulli(of_mirror, config.mirror, (views,))
+    images = jnp.where(mirrored[:, None, None, None], batch.images[:, :, ::-1], batch.images)
+    bearing = jnp.where(mirrored[:, None], -batch.bearing, batch.bearing)
+    pixels = images.astype(jnp.float32) / jnp.float32(255)
+    if config.brightness or config.colour:
+        gain = config.brightness * jax.random.normal(of_brightness, (views, 1, 1, 1))
+        gain = gain + config.colour * jax.random.normal(of_colour, (views, 1, 1, 3))
+        pixels = jnp.clip(pixels * jnp.exp(gain), 0, 1)
+    return pixels, bearing
+
+
+def batch_answers(
+    network: EstimatorNetwork,
+    params: Params,
+    pixels: Float32[Array, "G rows columns 3"],
+    bearing: Float32[Array, "G K"],
+    batch: Batch,
+) -> Answers:
+    """The network's answers for a batch: the first stage once per panorama."""
+    features = network.encode_pixels(params, pixels)
+    repeated = jnp.broadcast_to(features[:, None], (*bearing.shape, *features.shape[1:]))
+    centred, residual = network.centre(repeated, bearing)
+    return network.answer(params, centred, residual, batch.distance, batch.phi_stay, batch.phi_go)
+
+
+def learning_rate_schedule(config: TrainingConfig) -> optax.Schedule:
+    """Linear warm-up, then a cosine to 0 at the last planned step."""
+    warmup = max(1, round(config.warmup * config.steps))
+    return optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, warmup, max(config.steps, warmup + 1))
+
+
+def make_optimizer(config: TrainingConfig) -> optax.GradientTransformation:
+    """AdamW with clipped gradients; biases and positions do not decay."""
+    return optax.chain(
+        optax.clip_by_global_norm(config.clip_norm),
+        optax.adamw(
+            learning_rate_schedule(config),
+            weight_decay=config.weight_decay,
+            mask=lambda params: jax.tree_util.tree_map_with_path(
+                lambda path, _: jax.tree_util.keystr(path[-1:], simple=True) == "kernel", params
+            ),
+        ),
+    )
+
+
+def initial_state(network: EstimatorNetwork, config: TrainingConfig) -> TrainState:
+    """The state before the first step."""
+    of_params, of_augmentation = jax.random.split(jax.random.key(config.seed))
+    params = network.init(of_params)
+    return TrainState(
+        step=jnp.int32(0),
+        key=jax.random.key_data(of_augmentation),
+        params=params,
+        optimizer=make_optimizer(config).init(params),
+        average=params,
+        best=params,
+        best_loss=jnp.float32(jnp.inf),
+        best_step=jnp.int32(0),
+        evaluations_since_best=jnp.int32(0),
+        sums=_no_sums(),
+    )
+
+
+def _no_sums() -> Sums:
+    return Sums(**{field.name: jnp.float32(0) for field in dataclasses.fields(Sums)})
+
+
+@functools.lru_cache(8)
+def make_train_step(
+    network: EstimatorNetwork, config: TrainingConfig, scale: DataScale
+) -> Callable[[TrainState, Batch], tuple[TrainState, Float32[Array, ""]]]:
+    """One compiled step: the next state, and the loss of this batch before it."""
+    optimizer = make_optimizer(config)
+
+    def loss(params: Params, batch: Batch, key: PRNGKeyArray) -> tuple[Array, Sums]:
+        pixels, bearing = augment(batch, key, config)
+        answers = batch_answers(network, params, pixels, bearing, batch)
+        sums = loss_sums(answers, batch, network.config, scale, config.weighting)
+        return total_loss(sums, config.cost_share), sums
+
+    @jax.jit
+    def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, Float32[Array, ""]]:
+        key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step)
+        (value, sums), gradient = jax.value_and_grad(loss, has_aux=True)(state.params, batch, key)
+        with jax.numpy_dtype_promotion("standard"):  # Optax mixes integer counters and floats
+            update, optimizer_state = optimizer.update(gradient, state.optimizer, state.params)
+        params = optax.apply_updates(state.params, update)
+        # Early on the average follows quickly, so that it does not remember the initial parameters.
+        done = state.step.astype(jnp.float32)
+        decay = jnp.minimum(jnp.float32(config.average_decay), (1 + done) / (10 + done))
+        average = jax.tree.map(lambda old, new: decay * old + (1 - decay) * new, state.average, params)
+        state = dataclasses.replace(
+            state,
+            step=state.step + 1,
+            params=params,
+            optimizer=optimizer_state,
+            average=average,
+            sums=jax.tree.map(jnp.add, state.sums, sums),
+        )
+        return state, value
+
+    return train_step
+
+
+@functools.lru_cache(8)
+def make_evaluate_step(
+    network: EstimatorNetwork, scale: DataScale, weighting: float
+) -> Callable[[Params, Batch], Sums]:
+    """The compiled sums of one batch, not augmented."""
+
+    @jax.jit
+    def evaluate_step(params: Params, batch: Batch) -> Sums:
+        pixels = batch.images.astype(jnp.float32) / jnp.float32(255)
+        answers = batch_answers(network, params, pixels, batch.bearing, batch)
+        return loss_sums(answers, batch, network.config, scale, weighting)
+
+    return evaluate_step
+
+
+class Batches:
+    """The batches of a data set, each a function of its number.
+
+    Args:
+        samples: the data; views without samples are never drawn.
+        views, samples_per_view: shape of a batch.
+        seed: of the order.
+    """
+
+    def __init__(self, samples: Samples, views: int, samples_per_view: int, seed: int) -> None:
+        if not len(samples.view_of):
+            raise TrainingError("the data set has no samples")
+        self._samples = samples
+        self._seed = seed
+        self._order = np.argsort(samples.view_of, kind="stable")
+        self._views, first, counts = np.unique(samples.view_of[self._order], return_index=True, return_counts=True)
+        self._members = [self._order[start : start + count] for start, count in zip(first, counts, strict=True)]
+        self.views = min(views, len(self._views))
+        self.samples_per_view = samples_per_view
+        self.per_epoch = len(self._views) // self.views
+        self._permutation = functools.lru_cache(2)(
+            lambda epoch: np.random.default_rng((seed, epoch)).permutation(len(self._views))
+        )
+
+    def training_batch(self, step: int) -> Batch:
+        """The batch of this step; an epoch's last views that fill no batch are left out of that epoch."""
+        epoch, index = divmod(step, self.per_epoch)
+        chosen = self._permutation(epoch)[index * self.views : (index + 1) * self.views]
+        return self._batch([(view, self._choice(epoch, view)) for view in chosen.tolist()])
+
+    def evaluation_batches(self) -> Iterator[Batch]:
+        """Every sample once, in a fixed order; a view with many samples comes several times."""
+        size = self.samples_per_view
+        groups = [
+            (view, members[start : start + size])
+            for view, members in enumerate(self._members)
+            for start in range(0, len(members), size)
+        ]
+        blocks = [groups[start : start + self.views] for start in range(0, len(groups), self.views)]
+        return prefetched(lambda index: self._batch(blocks[index]), 0, len(blocks))
+
+    def _choice(self, epoch: int, view: int) -> Int32[np.ndarray, " k"] | np.ndarray:
+        members = self._members[view]
+        if len(members) <= self.samples_per_view:
+            return members
+        random = np.random.default_rng((self._seed, epoch, view, 1))
+        return random.choice(members, self.samples_per_view, replace=False)
+
+    def _batch(self, groups: list[tuple[int, np.ndarray]]) -> Batch:
+        index = np.zeros((self.views, self.samples_per_view), np.int64)
+        mask = np.zeros(index.shape, bool)
+        for row, (_, members) in enumerate(groups):
+            index[row, : len(members)] = members
+            mask[row, : len(members)] = True
+        images = [decode(self._samples.images[self._views[view]]) for view, _ in groups]
+        images += [np.zeros_like(images[0])] * (self.views - len(groups))
+        columns = {
+            name: jnp.asarray(getattr(self._samples, name)[index])
+            for name in Batch.__dataclass_fields__
+            if name not in ("images", "mask")
+        }
+        return Batch(images=jnp.asarray(np.stack(images)), mask=jnp.asarray(mask), **columns)
+
+
+def prefetched(make: Callable[[int], Batch], start: int, stop: int) -> Iterator[Batch]:
+    """``make(start)``, ..., ``make(stop - 1)`` in this order, made a few ahead in another thread."""
+    with ThreadPoolExecutor(1, thread_name_prefix="decode") as pool:
+        pending = [pool.submit(make, number) for number in range(start, min(start + _PREFETCHED, stop))]
+        try:
+            for number in range(start, stop):
+                batch = pending.pop(0).result()
+                if number + _PREFETCHED < stop:
+                    pending.append(pool.submit(make, number + _PREFETCHED))
+                yield batch
+        finally:
+            for future in pending:
+                future.cancel()
+
+
+def check_data(training: Samples, validation: Samples) -> None:
+    """Raises TrainingError where the two data sets do not belong together."""
+    for name in ("propositions", "environment", "camera", "unit", "resolution"):
+        one, other = getattr(training.metadata, name), getattr(validation.metadata, name)
+        if one != other:
+            raise TrainingError(f"the data sets differ in {name}: {one} for training, {other} for validation")
+
+
+def seconds_per_step(network: EstimatorNetwork, training: Samples, config: TrainingConfig, steps: int = 8) -> float:
+    """Measured time of a step with its share of decoding, after compilation; nothing is kept of these steps."""
+    batches = Batches(training, config.views_per_batch, config.samples_per_view, config.seed)
+    train_step = make_train_step(network, config, DataScale.of(training))
+    state = initial_state(network, config)
+    started = 0.0
+    for number, batch in enumerate(prefetched(batches.training_batch, 0, steps + 2)):
+        if number == 2:
+            started = time.perf_counter()
+        state, value = train_step(state, batch)
+        value.block_until_ready()
+    return (time.perf_counter() - started) / steps
+
+
+def steps_per_epoch(training: Samples, config: TrainingConfig) -> int:
+    """Batches in an epoch."""
+    return Batches(training, config.views_per_batch, config.samples_per_view, config.seed).per_epoch
+
+
+def training_identity(
+    network: EstimatorNetwork, training: Samples, validation: Samples, config: TrainingConfig
+) -> dict[str, Any]:
+    """What must be equal for a training to be resumed: network, configuration, data and versions of libraries."""
+
+    def data(samples: Samples) -> dict[str, Any]:
+        return {"views": len(samples.images), "samples": len(samples.success), "split": samples.metadata.split}
+
+    return {
+        "network": network.config.to_json(),
+        "training": dataclasses.asdict(config),
+        "training_data": data(training),
+        "validation_data": data(validation),
+        "versions": {name: version(name) for name in ("jax", "jaxlib", "flax", "optax", "numpy")},
+    }
+
+
+def train(
+    network: EstimatorNetwork,
+    training: Samples,
+    validation: Samples,
+    config: TrainingConfig,
+    *,
+    folder: Path | None = None,
+    budget_seconds: float = float("inf"),
+    on_start: Callable[[int], None] = lambda step: None,
+    on_step: Callable[[int, float], None] = lambda step, loss: None,
+    on_evaluation: Callable[[Progress], None] = lambda progress: None,
+) -> Trained:
+    """Train, from the newest checkpoint in ``folder`` if there is one, and give the best parameters.
+
+    Args:
+        folder: where checkpoints go; None for none.
+        budget_seconds: training stops after this time, over all resumptions, also where steps are left.
+        on_start: told the number of steps already done.
+        on_step: told the number of steps done and the last batch's loss.
+        on_evaluation: told the scores after every epoch and at the end.
+
+    Raises:
+        TrainingError: the data do not fit, or the loss is not finite.
+        CheckpointError: the newest checkpoint is damaged or of another training.
+    """
+    check_data(training, validation)
+    loop = _Loop(network, training, validation, config, folder)
+    on_start(loop.steps_done)
+    remaining = prefetched(loop.batches.training_batch, loop.steps_done, config.steps)
+    for batch in remaining if loop.reason(budget_seconds) is None else ():
+        on_step(loop.steps_done + 1, loop.advance(batch))
+        out_of_time = loop.seconds >= budget_seconds
+        if loop.steps_done % loop.batches.per_epoch == 0 or loop.steps_done == config.steps or out_of_time:
+            on_evaluation(loop.evaluate())
+            loop.save()
+        elif loop.steps_done % config.checkpoint_steps == 0:
+            loop.save()
+        if loop.reason(budget_seconds) is not None:
+            break
+    return loop.result(budget_seconds)
+
+
+class _Loop:
+    """The state of a running training, on the host."""
+
+    def __init__(
+        self,
+        network: EstimatorNetwork,
+        training: Samples,
+        validation: Samples,
+        config: TrainingConfig,
+        folder: Path | None,
+    ) -> None:
+        self._network, self._config, self._folder = network, config, folder
+        scale = DataScale.of(training)
+        self.batches = Batches(training, config.views_per_batch, config.samples_per_view, config.seed)
+        self._validation = Batches(validation, config.views_per_batch, config.samples_per_view, config.seed)
+        self._identity = training_identity(network, training, validation, config)
+        self._train_step = make_train_step(network, config, scale)
+        self._evaluate_step = make_evaluate_step(network, scale, config.weighting)
+        self._schedule = learning_rate_schedule(config)
+        self._state = initial_state(network, config)
+        before = 0.0
+        saved = checkpoint_steps(folder) if folder is not None else []
+        if folder is not None and saved:
+            self._state, progress = load_checkpoint(folder, saved[-1], self._state, self._identity)
+            before = progress["seconds"]
+        self._started = time.perf_counter() - before
+        self.steps_done = int(self._state.step)
+
+    @property
+    def seconds(self) -> float:
+        return time.perf_counter() - self._started
+
+    def advance(self, batch: Batch) -> float:
+        """One step; its loss."""
+        self._state, value = self._train_step(self._state, batch)
+        loss = float(value)
+        if not np.isfinite(loss):
+            raise TrainingError(
+                f"the loss of step {self.steps_done + 1} is {loss}: lower the learning rate "
+                f"({self._config.learning_rate}) or look for values out of range in the data; the checkpoint before "
+                "it is kept"
+            )
+        self.steps_done += 1
+        return loss
+
+    def evaluate(self) -> Progress:
+        """Scores on the validation data; remembers the best parameters and starts new sums."""
+        sums = _no_sums()
+        for batch in self._validation.evaluation_batches():
+            sums = jax.tree.map(jnp.add, sums, self._evaluate_step(self._state.average, batch))
+        config, network = self._config, self._network.config
+        validation = evaluation_of(sums, network, config.cost_share)
+        trained = evaluation_of(self._state.sums, network, config.cost_share)
+        if not np.isfinite(validation.loss):
+            raise TrainingError(f"the validation loss after step {self.steps_done} is {validation.loss}")
+        state = dataclasses.replace(
+            self._state, sums=_no_sums(), evaluations_since_best=self._state.evaluations_since_best + 1
+        )
+        if validation.loss < float(state.best_loss):
+            state = dataclasses.replace(
+                state,
+                best=state.average,
+                best_loss=jnp.float32(validation.loss),
+                best_step=jnp.int32(self.steps_done),
+                evaluations_since_best=jnp.int32(0),
+            )
+        self._state = state
+        return Progress(
+            step=self.steps_done,
+            epoch=self.steps_done / self.batches.per_epoch,
+            seconds=self.seconds,
+            learning_rate=float(np.asarray(self._schedule(self.steps_done))),
+            training=trained,
+            validation=validation,
+            best_step=int(state.best_step),
+        )
+
+    def save(self) -> None:
+        """Write a checkpoint, if there is a folder for it."""
+        if self._folder is not None:
+            save_checkpoint(self._folder, self.steps_done, self._state, self._identity, {"seconds": self.seconds})
+
+    def reason(self, budget_seconds: float) -> str | None:
+        """Why training is over, or None."""
+        if self.steps_done >= self._config.steps:
+            return "planned"
+        if self._config.patience and int(self._state.evaluations_since_best) >= self._config.patience:
+            return "patience"
+        return "time" if self.seconds >= budget_seconds else None
+
+    def result(self, budget_seconds: float) -> Trained:
+        """The best parameters so far."""
+        return Trained(
+            params=self._state.best,
+            best_step=int(self._state.best_step),
+            best_loss=float(self._state.best_loss),
+            steps=self.steps_done,
+            reason=self.reason(budget_seconds) or "planned",
+            seconds=self.seconds,
+        )

@@ -1,0 +1,94 @@
+"""Decisions of recorded trials, made again: from the world, the beliefs and the looks that the record implies."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int32, UInt8
+
+from potlp_jax.learning.checkpoints import CheckpointError
+from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, look
+from potlp_jax.learning.labels import TrueMapEstimator
+from potlp_jax.planning.estimates import Estimator
+from potlp_jax.planning.policies import DecisionConfig, Policy, assess, planning_problem
+from potlp_jax.planning.pouct import Plan, search_tree
+from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.search_graph import Tree
+from potlp_jax.records import Decision, Trial
+from potlp_jax.robot import photograph
+from potlp_jax.task.task import Task, TaskArrays
+from potlp_jax.trial_config import TrialConfig, trial_config_from_dict
+from potlp_jax.world.grid import BeliefMap
+from potlp_jax.world.panorama import Disturbance
+
+
+def replay_decision(
+    trial: Trial, index: int, estimator: TrainedEstimator | None = None
+) -> tuple[PlanningProblem, Plan, Tree]:
+    """Search again as in decision ``index`` of a recorded trial: its problem, plan and searched tree.
+
+    ``estimator`` is the one of the trial, where its policy uses one; by default the shipped one.
+
+    Raises:
+        ValueError: the trial has no such decision, or its policy does not search.
+        CheckpointError: the estimator is not the trial's.
+    """
+    if not 0 <= index < len(trial.decisions):
+        raise ValueError(f"the trial has decisions 0 to {len(trial.decisions) - 1}; there is no decision {index}")
+    if not Policy(trial.policy).searches:
+        raise ValueError(f"policy {trial.policy!r} does not search: its decisions have no tree")
+    decision = trial.decisions[index]
+    task = Task.from_hoa(trial.task_hoa, propositions=trial.propositions)
+    config = trial_config_from_dict(trial.config)
+    problem = _replayed_problem(
+        trial.belief_at(decision.step),
+        jnp.asarray(decision.cell, jnp.int32),
+        jnp.int32(decision.state),
+        task.arrays,
+        _replayed_estimator(trial, index, task, estimator, config),
+        config.decision,
+    )
+    key = jax.random.wrap_key_data(jnp.asarray(decision.key, jnp.uint32))
+    plan, tree = search_tree(problem, key, config.decision.search)
+    return problem, plan, tree
+
+
+def _replayed_estimator(
+    trial: Trial, index: int, task: Task, estimator: TrainedEstimator | None, config: TrialConfig
+) -> Estimator | None:
+    """The estimator with all that it had seen at a decision: the looks are taken again."""
+    if trial.policy != Policy.POTLP:
+        return TrueMapEstimator(world=trial.world)
+    trained = estimator_for(task.propositions, estimator)
+    if trial.versions.get("estimator") != trained.identity:
+        raise CheckpointError(
+            f"the trial was made with the estimator {trial.versions.get('estimator')}, not {trained.identity}: "
+            "give that one"
+        )
+    eyes = trained.start(*trial.world.shape)
+    for decision in trial.decisions[: index + 1]:
+        cell = jnp.asarray(decision.cell, jnp.int32)
+        eyes = look(eyes, panorama_at(trial, decision, config), trial.belief_at(decision.step), cell)
+    return eyes
+
+
+def panorama_at(trial: Trial, decision: Decision, config: TrialConfig | None = None) -> UInt8[Array, "rows columns 3"]:
+    """What the camera saw at a decision of a trial in simulation."""
+    config = trial_config_from_dict(trial.config) if config is None else config
+    if config.disturbance != Disturbance():
+        raise ValueError("the trial's camera was disturbed: its panoramas cannot be made again without the trial's key")
+    cell = jnp.asarray(decision.cell, jnp.int32)
+    return photograph(trial.world, cell, jax.random.key(0), config.camera, config.disturbance)
+
+
+@partial(jax.jit, static_argnames=("config",))
+def _replayed_problem(
+    belief: BeliefMap,
+    cell: Int32[Array, "2"],
+    state: Int32[Array, ""],
+    task: TaskArrays,
+    estimator: Estimator,
+    config: DecisionConfig,
+) -> PlanningProblem:
+    situation = assess(belief, cell, state, task, config.frontiers)
+    return planning_problem(situation, estimator(belief, situation.subgoals, task), config)

@@ -1,0 +1,272 @@
+"""An estimator's figures as tables, and as pictures: reliability, costs, right and wrong predictions."""
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from potlp_jax.learning.dataset import Samples, decode
+from potlp_jax.learning.evaluation import INTACT, CostErrors, Figures, Predictions, Report, class_in_words
+from potlp_jax.view.style import CHOSEN, FAINT, INK, STATE_COLOURS, new_figure
+from potlp_jax.world.panorama import roll_to
+
+VARIANTS: Mapping[str, str] = MappingProxyType({INTACT: "intact", "image": "image blacked out", "phi": "phi shuffled"})
+"""What was evaluated, in words."""
+
+_PARTS = {"proposition": "asks for {}", "avoided": "avoids {}", "distance": "distance {}"}
+
+_KINDS = {
+    "true positives": "right: said yes, and it is there",
+    "true negatives": "right: said no, and it is not there",
+    "false positives": "wrong: said yes, but it is not there",
+    "false negatives": "wrong: said no, but it is there",
+}
+_COLUMNS = 2
+
+
+def probability_table(report: Report, title: str) -> Table:
+    """The figures of P_S, of all samples and of every group."""
+    names = ("number", "mean\nP_S", "Brier\nscore", "skill", "own\nskill", "log\nloss", "AUC", "calib.\nerror")
+
+    def cells(figures: Figures) -> list[str]:
+        values = (figures.skill, figures.own_skill, figures.log_loss, figures.auc, figures.calibration_error)
+        first = [f"{figures.samples}", _number(figures.success_rate, 2), _number(figures.brier, 3)]
+        return first + [_number(value, 3) for value in values]
+
+    return _group_table(f"{title}: P_S", names, [cells(figures) for _, figures in _rows(report)], report)
+
+
+def cost_table(report: Report, title: str) -> Table:
+    """The errors of R_S where it succeeded and of R_F where it failed, of all samples and of every group."""
+    names = [f"{cost}\n{name}" for cost in ("R_S", "R_F") for name in ("MAE", "RMSE", "bias", "R²")]
+
+    def cells(errors: CostErrors) -> list[str]:
+        values = [_number(value, 1) for value in (errors.mae, errors.rmse, errors.bias)]
+        return [*values, _number(errors.r2, 2)]
+
+    rows = [cells(figures.success_cost) + cells(figures.failure_cost) for _, figures in _rows(report)]
+    return _group_table(f"{title}: costs", names, rows, report)
+
+
+def ablation_table(reports: Mapping[str, Report]) -> Table:
+    """What is left of the skill, of all samples and of every group, when something is taken away.
+
+    ``reports`` has ``intact``, and the ablations.
+    """
+    others = [name for name in reports if name != INTACT]
+    names = ["intact\nskill"]
+    for other in others:
+        names += [VARIANTS[other].replace(" ", "\n", 1), "share\nlost"]
+    skills = {name: [figures.skill for _, figures in _rows(report)] for name, report in reports.items()}
+    rows = []
+    for number, intact in enumerate(skills[INTACT]):
+        cells = [_number(intact, 3)]
+        for other in others:
+            lost = (intact - skills[other][number]) / intact if intact > 0 else math.nan
+            cells += [_number(skills[other][number], 3), "-" if math.isnan(lost) else f"{100 * lost:.0f}%"]
+        rows.append(cells)
+    return _group_table("ablations: skill over the constant prior", names, rows, reports[INTACT])
+
+
+def _rows(report: Report) -> list[tuple[str, Figures]]:
+    """All samples, then the parts of every group, with names for people."""
+    parts = [
+        (_PARTS[group].format(part), figures)
+        for group, members in report.groups.items()
+        for part, figures in members.items()
+    ]
+    return [("all", report.overall), *parts]
+
+
+def _last_rows(report: Report) -> set[int]:
+    """Positions in ``_rows`` after which another group begins."""
+    return set(itertools.accumulate((len(members) for members in report.groups.values()), initial=0))
+
+
+def _group_table(title: str, names: Sequence[str], rows: Sequence[Sequence[str]], report: Report) -> Table:
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, padding=0)
+    table.add_column("samples", no_wrap=True)
+    for name in names:
+        table.add_column(name, justify="right", no_wrap=True)
+    ends = _last_rows(report)
+    for number, ((name, _), cells) in enumerate(zip(_rows(report), rows, strict=True)):
+        table.add_row(name, *cells, end_section=number in ends, style=None if number else "bold")
+    return table
+
+
+def _number(value: float, digits: int) -> str:
+    # Adding zero turns a rounded -0.0 into 0.0.
+    return "-" if math.isnan(value) else f"{round(value, digits) + 0.0:.{digits}f}"
+
+
+def draw_reliability(reports: Mapping[str, Report], title: str) -> Figure:
+    """Left, how often it was there over what was predicted, with the numbers of predictions; right, skill by group.
+
+    ``reports`` has ``intact``, and the ablations that were made; those show up in the right panel.
+    """
+    figure = new_figure(11.5, 5.9)
+    figure.text(0.5, 0.975, title, ha="center", va="top", size=9, color=INK)
+    overall = reports[INTACT].overall
+    _draw_bins(figure.add_axes((0.07, 0.32, 0.37, 0.58)), overall)
+    _draw_counts(figure.add_axes((0.07, 0.09, 0.37, 0.17)), overall)
+    _draw_skills(figure.add_axes((0.63, 0.09, 0.35, 0.81)), reports)
+    return figure
+
+
+def _draw_bins(axes: Axes, figures: Figures) -> None:
+    filled = [entry for entry in figures.bins if entry.samples]
+    axes.plot([0, 1], [0, 1], color=FAINT, linewidth=1.0, label="calibrated")
+    axes.axhline(figures.success_rate, color=FAINT, linewidth=1.0, linestyle=":", label="mean of all samples")
+    said, seen = [entry.predicted for entry in filled], [entry.observed for entry in filled]
+    errors = [2 * math.sqrt(max(y * (1 - y), 0.0) / entry.samples) for y, entry in zip(seen, filled, strict=True)]
+    style = {"color": STATE_COLOURS[0], "marker": "o", "markersize": 5, "linewidth": 1.5, "capsize": 2}
+    axes.errorbar(said, seen, errors, **style, label="± 2 standard errors, as if independent")
+    axes.set(xlim=(0, 1), ylim=(-0.02, 1.02))
+    axes.set_ylabel("how often it was there", color=INK)
+    axes.tick_params(labelbottom=False)
+    axes.grid(color="#EEEEEE", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.legend(loc="upper left", fontsize=8.5, framealpha=0.9)
+    text = (
+        f"Brier score {figures.brier:.4f}\nskill {_number(figures.skill, 3)}\nAUC {_number(figures.auc, 3)}\n"
+        f"calibration error {figures.calibration_error:.3f}\n{figures.samples} samples"
+    )
+    axes.text(0.97, 0.04, text, transform=axes.transAxes, ha="right", va="bottom", size=8.5, color=INK)
+
+
+def _draw_counts(axes: Axes, figures: Figures) -> None:
+    middle = [(entry.low + entry.high) / 2 for entry in figures.bins]
+    width = 0.9 * (figures.bins[0].high - figures.bins[0].low)
+    axes.bar(middle, [entry.samples for entry in figures.bins], width, color=STATE_COLOURS[5])
+    axes.set(xlim=(0, 1))
+    axes.set_xlabel("predicted P_S", color=INK)
+    axes.set_ylabel("samples", color=INK)
+    axes.yaxis.set_major_locator(MaxNLocator(3, integer=True))
+
+
+def _draw_skills(axes: Axes, reports: Mapping[str, Report]) -> None:
+    rows = _rows(reports[INTACT])
+    styles = {INTACT: ("o", STATE_COLOURS[0]), "image": ("s", STATE_COLOURS[1]), "phi": ("D", STATE_COLOURS[2])}
+    least = 0.0
+    for name, report in reports.items():
+        skills = [figures.skill for _, figures in _rows(report)]
+        marker, colour = styles[name]
+        axes.scatter(skills, range(len(rows)), s=34, marker=marker, color=colour, label=VARIANTS[name], zorder=3)
+        least = min([least, *(skill for skill in skills if math.isfinite(skill))])
+    for last in _last_rows(reports[INTACT]):
+        axes.axhline(last + 0.5, color="#DDDDDD", linewidth=0.8)
+    axes.set_yticks(range(len(rows)), [f"{name} ({figures.samples})" for name, figures in rows], size=8.5)
+    axes.axvline(0, color=INK, linewidth=0.8)
+    axes.set(ylim=(len(rows) - 0.4, -0.6), xlim=(1.05 * least - 0.04, 1.02))
+    axes.set_xlabel("Brier skill over the constant prior", color=INK)
+    axes.grid(axis="x", color="#EEEEEE", linewidth=0.6)
+    axes.set_axisbelow(True)
+    if len(reports) > 1:
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, fontsize=8, frameon=False, borderpad=0)
+
+
+def draw_costs(samples: Samples, predictions: Predictions, overall: Figures, title: str) -> Figure:
+    """Predicted over true costs: R_S where it was there, R_F where it was not."""
+    figure = new_figure(11.5, 5.6)
+    figure.text(0.5, 0.975, title, ha="center", va="top", size=9, color=INK)
+    unit = samples.metadata.unit
+    panels = (
+        ("R_S where it is there", samples.success, samples.success_cost, predictions.success_cost),
+        ("R_F where it is not there", 1 - samples.success, samples.failure_cost, predictions.failure_cost),
+    )
+    errors = (overall.success_cost, overall.failure_cost)
+    for column, ((name, share, true, said), figures) in enumerate(zip(panels, errors, strict=True)):
+        axes = figure.add_axes((0.06 + 0.49 * column, 0.1, 0.42, 0.77))
+        known = (share > 0) & np.isfinite(true)
+        _draw_cost(axes, true[known], said[known], share[known], figures, unit)
+        axes.set_title(f"{name} ({figures.samples} samples; darker: more)", size=10, color=INK)
+    return figure
+
+
+def _draw_cost(
+    axes: Axes, true: np.ndarray, said: np.ndarray, share: np.ndarray, errors: CostErrors, unit: str
+) -> None:
+    limit = 1.03 * max([1.0, *true.tolist(), *said.tolist()])
+    axes.plot([0, limit], [0, limit], color=FAINT, linewidth=1.0, zorder=3)
+    if len(true):
+        axes.hexbin(true, said, gridsize=48, extent=(0, limit, 0, limit), bins="log", mincnt=1, cmap="Blues", vmin=0.3)
+        mean = float(np.average(true, weights=share))
+        axes.axhline(mean, color=CHOSEN, linewidth=1.0, linestyle=":")
+        note = {"textcoords": "offset points", "ha": "right", "va": "bottom", "size": 8, "color": CHOSEN}
+        axes.annotate("the constant mean", (limit, mean), (-4, 2), **note)
+    axes.set(xlim=(0, limit), ylim=(0, limit))
+    axes.set_xlabel(f"true cost [{unit}]", color=INK)
+    axes.set_ylabel(f"predicted cost [{unit}]", color=INK)
+    text = (
+        f"MAE {_number(errors.mae, 1)}\nRMSE {_number(errors.rmse, 1)}\nbias {_number(errors.bias, 1)}\n"
+        f"R² {_number(errors.r2, 2)}"
+    )
+    axes.text(0.03, 0.97, text, transform=axes.transAxes, ha="left", va="top", size=8.5, color=INK)
+
+
+def draw_predictions(
+    samples: Samples, predictions: Predictions, chosen: Mapping[str, np.ndarray], title: str
+) -> Figure:
+    """Panoramas of the samples that ``most_confident`` chose, each rolled so that its subgoal is in the centre."""
+    width, picture, words, heading = 11.5, 5.5 / 4, 0.62, 0.42
+    rows = {name: max(1, math.ceil(len(members) / _COLUMNS)) for name, members in chosen.items()}
+    height = 0.45 + sum(heading + count * (picture + words) for count in rows.values())
+    figure = new_figure(width, height)
+    figure.text(0.5, 1 - 0.1 / height, title, ha="center", va="top", size=9, color=INK)
+    top = height - 0.45
+    for name, members in chosen.items():
+        colour = STATE_COLOURS[2] if name.startswith("true") else STATE_COLOURS[1]
+        label = f"{_KINDS[name]} (most confident first)" if len(members) else f"{_KINDS[name]}: none"
+        figure.text(0.2 / width, (top - 0.2) / height, label, va="center", size=11, weight="bold", color=colour)
+        top -= heading
+        for number, index in enumerate(members.tolist()):
+            row, column = divmod(number, _COLUMNS)
+            left, bottom = 0.2 + 5.6 * column, top - row * (picture + words) - picture
+            box = (left / width, bottom / height, 5.5 / width, picture / height)
+            _draw_prediction(figure, box, samples, predictions, index)
+            text = describe_prediction(samples, predictions, index)
+            figure.text(box[0], box[1] - 0.04 / height, text, va="top", size=7.5, color=INK, linespacing=1.15)
+        top -= rows[name] * (picture + words)
+    return figure
+
+
+def _draw_prediction(
+    figure: Figure,
+    box: tuple[float, float, float, float],
+    samples: Samples,
+    predictions: Predictions,
+    index: int,
+) -> None:
+    axes = figure.add_axes(box)
+    image = jnp.asarray(decode(samples.images[int(samples.view_of[index])]))
+    rolled = np.asarray(roll_to(image, jnp.float32(samples.bearing[index])))
+    axes.imshow(rolled, aspect="auto", interpolation="nearest")
+    rows, columns = rolled.shape[:2]
+    centre = columns / 2 - 0.5
+    style = {"color": CHOSEN, "markersize": 7, "markeredgecolor": "white", "markeredgewidth": 0.8, "clip_on": False}
+    axes.plot([centre, centre], [0, rows - 1], color=CHOSEN, linewidth=0.6, alpha=0.55)
+    axes.plot(centre, rows * 0.035, marker="v", **style)
+    axes.plot(centre, rows * 0.955, marker="^", **style)
+    axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xticks=[], yticks=[])
+
+
+def describe_prediction(samples: Samples, predictions: Predictions, index: int) -> str:
+    """Three lines: what must hold on the way, what is looked for, and the numbers, with the true ones that count."""
+    stay, go = class_in_words(samples.phi_stay[index], samples.phi_go[index], samples.metadata.propositions)
+    true = float(samples.success[index])
+    numbers = [f"P_S {predictions.success[index]:.3f} (true {true:g})"]
+    costs = (
+        ("R_S", predictions.success_cost[index], samples.success_cost[index], true > 0),
+        ("R_F", predictions.failure_cost[index], samples.failure_cost[index], true < 1),
+    )
+    numbers += [f"{name} {said:.0f}" + (f" (true {cost:.0f})" if counts else "") for name, said, cost, counts in costs]
+    numbers.append(f"distance {samples.distance[index]:.0f} {samples.metadata.unit}")
+    return "\n".join((stay, go, "    ".join(numbers)))

@@ -1,0 +1,72 @@
+"""What the robot saw of each subgoal when it decided: panoramas with the answers of the estimator."""
+
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import UInt8
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from potlp_jax.records import Decision, Trial
+from potlp_jax.view.decisions import describe_decision, rank_actions
+from potlp_jax.view.style import CHOSEN, INK, new_figure
+from potlp_jax.world.panorama import bearing, roll_to
+
+_ACTIONS_SHOWN = 6
+
+
+def draw_panoramas(
+    trial: Trial, decision: Decision, panoramas: Mapping[int, UInt8[np.ndarray, "rows columns 3"]]
+) -> Figure:
+    """One row per subgoal: the panorama that its estimates come from, rolled so that the subgoal is in the centre.
+
+    Args:
+        trial: the trial of the decision.
+        decision: one whose policy looked (``decision.looks`` is not empty).
+        panoramas: by the number of the decision at which they were taken, in the frame of the map.
+    """
+    count = len(decision.subgoals)
+    figure = new_figure(12.0, 0.7 + 1.75 * count)
+    figure.suptitle(describe_decision(trial, decision), x=0.01, ha="left", fontsize=9)
+    grid = figure.add_gridspec(
+        count, 2, width_ratios=(2.6, 1.0), left=0.01, right=0.995, top=1 - 0.55 / (0.7 + 1.75 * count), bottom=0.02
+    )
+    chosen = {action.subgoal for action in decision.actions if action.index == decision.choice}
+    for subgoal, look in enumerate(decision.looks):
+        origin = trial.decisions[look].cell
+        picture, text = figure.add_subplot(grid[subgoal, 0]), figure.add_subplot(grid[subgoal, 1])
+        _draw_rolled(picture, panoramas[look], origin, decision.subgoals[subgoal])
+        mark = "chosen: " if subgoal in chosen else ""
+        when = "now" if look == decision.index else f"at decision {look}"
+        picture.set_title(
+            f"{mark}s{subgoal} at {decision.subgoals[subgoal]}, seen {when} from {origin}",
+            fontsize=8,
+            loc="left",
+            color=CHOSEN if mark else INK,
+        )
+        text.axis("off")
+        text.text(0.0, 1.0, _answers(decision, subgoal), va="top", fontsize=7.5, family="monospace", color=INK)
+    return figure
+
+
+def _draw_rolled(axes: Axes, panorama: np.ndarray, origin: tuple[int, int], subgoal: tuple[int, int]) -> None:
+    angle = bearing(jnp.asarray(origin, jnp.int32), jnp.asarray(subgoal, jnp.int32))
+    rolled = np.asarray(roll_to(jnp.asarray(panorama), angle))
+    axes.imshow(rolled, aspect="auto", interpolation="nearest")
+    axes.axvline(rolled.shape[1] / 2 - 0.5, color=CHOSEN, linewidth=1.0, linestyle=(0, (4, 4)))
+    axes.set_xticks([])
+    axes.set_yticks([])
+
+
+def _answers(decision: Decision, subgoal: int) -> str:
+    """The cheapest actions of a subgoal as lines of text; says how many are left out."""
+    own = [action for action in rank_actions(decision) if action.subgoal == subgoal]
+    lines = ["try      P_S    R_S    R_F      Q"] if own else ["nothing can be tried here"]
+    for action in own[:_ACTIONS_SHOWN]:
+        lines.append(
+            f"{action.from_state}→{action.to_state}  {action.success_probability:8.2f} {action.success_cost:6.0f} "
+            f"{action.failure_cost:6.0f} {action.q_value:6.0f}"
+        )
+    hidden = len(own) - _ACTIONS_SHOWN
+    return "\n".join(lines + ([f"and {hidden} more"] if hidden > 0 else []))

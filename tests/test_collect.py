@@ -1,0 +1,269 @@
+"""Collection: what is recorded is what there is to see, and a process that is killed loses and repeats nothing."""
+
+import dataclasses
+import itertools
+import math
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+
+from potlp_jax.environments.firefighting import Firefighting
+from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.learning.dataset import (
+    DatasetError,
+    decode,
+    finished_shards,
+    read_dataset,
+    read_metadata,
+    samples_file,
+    views_file,
+)
+from potlp_jax.learning.formulas import TaskDistribution
+from potlp_jax.task.task import Task
+from potlp_jax.world.panorama import CameraConfig, render
+from potlp_jax.world.sensing import SensorConfig
+from tests.reference.dijkstra import dijkstra, grid_moves
+from tests.reference.sensing import visible
+from train.collect import CollectConfig, collect, main, summary, survey
+from train.explorer import Explorer, ExplorerConfig
+
+GENERATOR = Firefighting.toy()
+CONFIG = CollectConfig(
+    worlds_per_shard=2,
+    views_per_world=5,
+    spacing=(1.0, 8.0),
+    tasks_per_world=4,
+    classes=5,
+    staying_sets=2,
+    held_out=("F exit",),
+    image_format="png",
+    camera=CameraConfig(height=16, width=64),
+    explorer=ExplorerConfig(sensor=SensorConfig(range_cells=9.0)),
+)
+WORLDS = 8
+REPOSITORY = Path(__file__).parent.parent
+
+
+def _collect(folder, processes=1):
+    collect(GENERATOR, "firefighting", Split.TRAINING, WORLDS, folder, CONFIG, processes)
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """A folder that keeps compiled programs, for this process and those that it starts."""
+    settings = {
+        "jax_compilation_cache_dir": str(tmp_path_factory.mktemp("programs")),
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        # As in conftest.py, for the processes that are started.
+        "jax_numpy_rank_promotion": "raise",
+        "jax_numpy_dtype_promotion": "strict",
+    }
+    before = {name: jax.config.values[name] for name in settings}
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in settings.items():
+            jax.config.update(name, value)
+            patch.setenv(name.upper(), str(value))
+        yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+@pytest.fixture(scope="module")
+def dataset(compiled, tmp_path_factory):
+    """A small dataset, collected without interruption."""
+    folder = tmp_path_factory.mktemp("dataset")
+    _collect(folder)
+    return folder
+
+
+def _tables(folder):
+    """Views and samples of all shards, as pandas reads them."""
+    shards = sorted(finished_shards(folder))
+    return tuple(
+        pd.concat([pd.read_parquet(file(folder, shard)) for shard in shards]) for file in (views_file, samples_file)
+    )
+
+
+def test_views_show_the_world_from_where_the_robot_stood(dataset):
+    views, _ = _tables(dataset)
+    assert views["view"].is_unique
+    assert set(views["world"]) == set(range(WORLDS))
+    assert (views.groupby("world").size() <= CONFIG.views_per_world).all()
+    assert views.groupby("world")["step"].apply(lambda steps: steps.is_monotonic_increasing).all()
+    look = jax.jit(lambda world, cell: render(world, cell, CONFIG.camera))
+    for view in views.itertuples():
+        world = GENERATOR.generate(world_key(Split.TRAINING, view.world, GENERATOR.name))
+        expected = look(world, jnp.asarray([view.row, view.column], jnp.int32))
+        _assert_same_picture(decode(view.image), np.asarray(expected))
+
+
+def test_samples_are_distinct_classes_of_their_tasks(dataset):
+    views, samples = _tables(dataset)
+    together = samples.merge(views, on="view", suffixes=("", "_of_robot"))
+    assert len(together) == len(samples)
+    tasks = {text: Task.from_formula(text, GENERATOR.propositions) for text in set(samples["task"])}
+    classes = [(*(tuple(phi) for phi in tasks[row.task].classes[row.outcome_class]),) for row in samples.itertuples()]
+    assert classes == [(tuple(row.phi_stay), tuple(row.phi_go)) for row in samples.itertuples()]
+    keys = pd.DataFrame({"view": samples["view"].to_numpy(), "class": classes, "row": samples["row"].to_numpy()})
+    keys["column"] = samples["column"].to_numpy()
+    assert not keys.duplicated().any()
+    bearing = np.arctan2(together["row"] - together["row_of_robot"], together["column"] - together["column_of_robot"])
+    np.testing.assert_allclose(together["bearing"], bearing, atol=1e-6)
+
+
+def test_labels_and_weights_are_in_their_ranges(dataset):
+    samples = read_dataset(dataset)
+    bounds = samples.metadata.weights
+    succeeds = samples.success == 1
+    assert 0 < succeeds.sum() < len(succeeds)
+    assert (samples.success_cost[succeeds] >= 1).all()
+    assert np.isnan(samples.success_cost[~succeeds]).all()
+    for weights in (samples.success_weight, samples.failure_weight):
+        assert (weights >= np.float32(bounds["low"])).all()
+        assert (weights <= np.float32(bounds["high"])).all()
+    longest = math.dist((0, 0), GENERATOR.config.shape)
+    expected = np.clip(2 * samples.failure_cost, bounds["low"], bounds["high"])
+    np.testing.assert_allclose(samples.failure_weight, expected, rtol=1e-6)
+    assert (samples.distance > 0).all()
+    assert (samples.distance < 4 * longest).all()
+
+
+def test_the_metadata_say_how_it_was_made(dataset):
+    metadata = read_metadata(dataset)
+    assert metadata.propositions == GENERATOR.propositions
+    assert metadata.split == "training"
+    assert metadata.generator["hallway_length"] == GENERATOR.config.hallway_length
+    assert metadata.camera["width"] == 64
+    assert metadata.collection["seed"] == CONFIG.seed
+    assert metadata.collection["held_out"] == ["F exit"]
+    assert "F exit" not in set(_tables(dataset)[1]["task"])
+    words = summary(read_dataset(dataset))
+    assert f"{len(_tables(dataset)[0])} views" in words
+    assert all(name in words for name in GENERATOR.propositions)
+
+
+def test_a_killed_collection_continues_and_nothing_is_there_twice(dataset, tmp_path):
+    # Types are checked in there as in here: the programs are then the same, and compiled already.
+    start = (
+        "from jaxtyping import install_import_hook; install_import_hook('potlp_jax', 'beartype.beartype'); "
+        f"from tests.test_collect import _collect; from pathlib import Path; _collect(Path({str(tmp_path)!r}))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", start], cwd=REPOSITORY, stderr=subprocess.DEVNULL)
+    while process.poll() is None and not finished_shards(tmp_path):
+        time.sleep(0.002)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    first = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("samples-*.parquet")}
+    assert 0 < len(first) < WORLDS // CONFIG.worlds_per_shard
+    # What a process that dies while it writes leaves behind.
+    last = WORLDS // CONFIG.worlds_per_shard - 1
+    (tmp_path / f"views-{last:05d}.parquet.1.tmp").write_bytes(b"PAR1")
+    if last not in finished_shards(tmp_path):
+        views_file(tmp_path, last).write_bytes(b"PAR1")
+    _collect(tmp_path)
+    assert {name: (tmp_path / name).stat().st_mtime_ns for name in first} == first
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in dataset.iterdir())
+    for found, expected in zip(_tables(tmp_path), _tables(dataset), strict=True):
+        pd.testing.assert_frame_equal(
+            found.drop(columns="image", errors="ignore"), expected.drop(columns="image", errors="ignore")
+        )
+    for found, expected in zip(_tables(tmp_path)[0]["image"], _tables(dataset)[0]["image"], strict=True):
+        _assert_same_picture(decode(found), decode(expected))
+    before = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    _collect(tmp_path)
+    assert {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
+
+
+def test_several_processes_take_whole_shards(tmp_path):
+    # Worlds without views cost nothing: what counts is that other processes write the shards that are missing.
+    config = dataclasses.replace(CONFIG, views_per_world=0)
+    collect(GENERATOR, "firefighting", Split.TRAINING, 2, tmp_path, config)
+    first = samples_file(tmp_path, 0).stat().st_mtime_ns
+    collect(GENERATOR, "firefighting", Split.TRAINING, WORLDS, tmp_path, config, processes=2)
+    assert finished_shards(tmp_path) == set(range(WORLDS // config.worlds_per_shard))
+    assert samples_file(tmp_path, 0).stat().st_mtime_ns == first
+    assert read_dataset(tmp_path).images == []
+
+
+def _assert_same_picture(found, expected):
+    """Programs compiled apart may round differently: by one step of brightness, here and there."""
+    difference = np.abs(found.astype(int) - expected)
+    assert difference.max() <= 1
+    assert (difference > 0).mean() < 0.01
+
+
+def test_a_folder_with_other_settings_is_not_continued(dataset):
+    other = dataclasses.replace(CONFIG, seed=5)
+    with pytest.raises(DatasetError, match=r"collection.seed is 0 in one and 5 in the other"):
+        collect(GENERATOR, "firefighting", Split.TRAINING, WORLDS, dataset, other)
+    with pytest.raises(DatasetError, match=r"split is 'training' in one and 'validation' in the other"):
+        collect(GENERATOR, "firefighting", Split.VALIDATION, WORLDS, dataset, CONFIG)
+
+
+def test_worlds_fill_whole_shards(tmp_path, monkeypatch, capsys):
+    with pytest.raises(DatasetError, match="ask for 4 worlds"):
+        collect(GENERATOR, "firefighting", Split.TRAINING, 5, tmp_path, CONFIG)
+    monkeypatch.setenv("POTLP_NO_CACHE", "1")
+    with pytest.raises(SystemExit) as stopped:
+        main(["--environment", "toy", "--worlds", "3", "--worlds-per-shard", "2", "--out", str(tmp_path)])
+    assert stopped.value.code == 1
+    assert "ask for 2 worlds" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def _wander(index, seed=0):
+    world = GENERATOR.generate(world_key(Split.TRAINING, index, GENERATOR.name))
+    rng = np.random.default_rng(seed)
+    tasks = [TaskDistribution(GENERATOR.propositions).draw(rng) for _ in range(4)]
+    return world, list(Explorer(world, tasks, rng, CONFIG.explorer).poses())
+
+
+def test_subgoals_in_view_and_their_distances_equal_the_reference(compiled):
+    world, poses = _wander(1)
+    occupied = np.asarray(world.occupied).tolist()
+    hidden, several = 0, 0
+    for pose in poses[:: max(1, len(poses) // 8)]:
+        scene = survey(world, pose.belief, jnp.asarray(pose.cell, jnp.int32))
+        free = np.asarray(pose.belief.free).tolist()
+
+        def moves(cell, free=free):
+            return ((there, step) for there, step in grid_moves(free, cell) if free[there[0]][there[1]])
+
+        distances = dijkstra(pose.cell, moves)
+        seen = visible(occupied, pose.cell, float(sum(world.shape)))
+        component = np.asarray(scene.subgoals.component)
+        for s in np.flatnonzero(scene.subgoals.mask):
+            cell = tuple(np.asarray(scene.subgoals.cells[s]).tolist())
+            assert float(scene.distance[s]) == pytest.approx(distances[cell], rel=1e-5)
+            in_view = any(tuple(at) in seen for at in np.argwhere(component == s).tolist())
+            assert bool(scene.in_view[s]) == in_view
+            hidden += not in_view
+        assert not np.any(np.asarray(scene.in_view) & ~np.asarray(scene.subgoals.mask))
+        several += int(scene.in_view.sum()) > 1
+    assert hidden > 0
+    assert several > 0
+
+
+def test_the_explorer_sees_much_of_the_building_and_walks_through_known_cells(compiled):
+    for index in (0, 1):
+        world, poses = _wander(index)
+        free = int((~world.occupied).sum())
+        known = [int(pose.belief.free.sum()) for pose in poses]
+        assert known == sorted(known)
+        assert known[-1] > 0.8 * free
+        limit = CONFIG.explorer.travel_factor * sum(world.shape)
+        assert poses[0].cell == tuple(world.start.tolist())
+        for before, after in itertools.pairwise(poses):
+            assert after.step > before.step
+            assert after.travelled - before.travelled >= math.dist(before.cell, after.cell) - 1e-6
+            assert after.travelled <= limit + math.sqrt(2)
+            # The robot entered the cell knowing that it is free.
+            assert bool(after.belief.free[after.cell])

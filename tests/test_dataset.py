@@ -1,0 +1,245 @@
+"""Datasets on disk: what is written is read back, by this library and by pandas; what is damaged is named."""
+
+import dataclasses
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from potlp_jax.learning.dataset import (
+    SCHEMA_VERSION,
+    DatasetError,
+    DatasetMetadata,
+    decode,
+    encode,
+    finished_shards,
+    read_dataset,
+    read_metadata,
+    remove_unfinished_files,
+    samples_file,
+    view_id,
+    views_file,
+    write_shard,
+)
+
+METADATA = DatasetMetadata(
+    propositions=("fire", "exit", "alarm"),
+    environment="somewhere",
+    generator={"rooms": 2, "sizes": [3, 4]},
+    split="training",
+    camera={"height": 4},
+    disturbance={},
+    encoding={"format": "png"},
+    weights={"low": 1.0, "high": 9.0},
+    collection={"seed": 3},
+    versions={"numpy": "2"},
+)
+
+
+def _image(seed):
+    return np.random.default_rng(seed).integers(0, 256, (4, 8, 3)).astype(np.uint8)
+
+
+def _shard(shard, views=3, seed=0):
+    """Columns of a shard with two samples a view; the samples name the views in reverse order."""
+    rng = np.random.default_rng([shard, seed])
+    ids = [view_id(shard, index) for index in range(views)]
+    count = 2 * views
+    success = rng.integers(0, 2, count).astype(float)
+    numbers = {name: rng.random(count) + 1 for name in ("distance", "failure_cost", "success_weight", "failure_weight")}
+    view_columns = {
+        "view": ids,
+        "world": [7] * views,
+        "step": list(range(views)),
+        "row": [1] * views,
+        "column": [2] * views,
+        "format": ["png"] * views,
+        "image": [encode(_image(shard * 100 + index), "png") for index in range(views)],
+    }
+    sample_columns = {
+        "view": ids[::-1] * 2,
+        "task": ["F exit"] * count,
+        "outcome_class": [0] * count,
+        "row": [3] * count,
+        "column": [4] * count,
+        "bearing": rng.uniform(-3, 3, count),
+        "phi_stay": rng.integers(-1, 2, (count, 3)).tolist(),
+        "phi_go": rng.integers(-1, 2, (count, 3)).tolist(),
+        "success_probability": success,
+        "success_cost": np.where(success > 0, 2.5, np.nan),
+        **numbers,
+    }
+    return view_columns, sample_columns
+
+
+def _write(folder, shards, metadata=METADATA):
+    columns = {shard: _shard(shard) for shard in shards}
+    for shard, (views, samples) in columns.items():
+        write_shard(folder, shard, views, samples, metadata)
+    return columns
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    columns = _write(tmp_path, [4, 0])
+    samples = read_dataset(tmp_path)
+    assert samples.metadata == read_metadata(tmp_path)
+    assert samples.metadata.differences(METADATA) == []
+    row = 0
+    for shard in (0, 4):
+        views, expected = columns[shard]
+        for index, view in enumerate(expected["view"]):
+            image = samples.images[samples.view_of[row]]
+            assert image == views["image"][views["view"].index(view)]
+            assert samples.bearing[row] == np.float32(expected["bearing"][index])
+            assert samples.distance[row] == np.float32(expected["distance"][index])
+            assert samples.phi_stay[row].tolist() == expected["phi_stay"][index]
+            assert samples.phi_go[row].tolist() == expected["phi_go"][index]
+            assert samples.success[row] == expected["success_probability"][index]
+            assert np.isnan(samples.success_cost[row]) == (samples.success[row] == 0)
+            assert samples.failure_cost[row] == np.float32(expected["failure_cost"][index])
+            assert samples.success_weight[row] == np.float32(expected["success_weight"][index])
+            assert samples.failure_weight[row] == np.float32(expected["failure_weight"][index])
+            row += 1
+    assert row == len(samples.success)
+    assert len(samples.images) == 6
+
+
+def test_pandas_reads_it_without_this_library(tmp_path):
+    columns = _write(tmp_path, [2])
+    views = pd.read_parquet(views_file(tmp_path, 2))
+    samples = pd.read_parquet(samples_file(tmp_path, 2))
+    together = samples.merge(views, on="view", suffixes=("", "_of_robot"), validate="many_to_one")
+    assert len(together) == len(columns[2][1]["view"])
+    assert [list(phi) for phi in samples["phi_go"]] == columns[2][1]["phi_go"]
+    np.testing.assert_array_equal(decode(views["image"].iloc[1]), _image(201))
+
+
+def test_colours_survive_encoding():
+    red_left_blue_right = np.zeros((16, 16, 3), np.uint8)
+    red_left_blue_right[:, :8, 0] = 200
+    red_left_blue_right[:, 8:, 2] = 200
+    np.testing.assert_array_equal(decode(encode(red_left_blue_right, "png")), red_left_blue_right)
+    jpeg = encode(red_left_blue_right, "jpeg")
+    assert jpeg[:2] == b"\xff\xd8"
+    assert np.abs(decode(jpeg).astype(int) - red_left_blue_right).mean() < 20
+
+
+def test_no_image_and_no_format():
+    with pytest.raises(DatasetError, match="not an image"):
+        decode(b"abc")
+    with pytest.raises(DatasetError, match="not an image"):
+        decode(b"")
+    with pytest.raises(DatasetError, match="jpeg or png"):
+        encode(_image(0), "gif")
+
+
+def test_a_shard_exists_when_its_samples_do(tmp_path):
+    _write(tmp_path, [0, 1])
+    samples_file(tmp_path, 1).unlink()
+    half_written = tmp_path / "views-00002.parquet.123.tmp"
+    half_written.write_bytes(b"PAR1")
+    assert finished_shards(tmp_path) == {0}
+    assert len(read_dataset(tmp_path).images) == 3
+    remove_unfinished_files(tmp_path)
+    assert not half_written.exists()
+    assert finished_shards(tmp_path / "nowhere") == set()
+
+
+def test_an_empty_folder_is_no_dataset(tmp_path):
+    with pytest.raises(DatasetError, match="no finished shard"):
+        read_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("file", [views_file, samples_file])
+def test_a_truncated_file_is_named(tmp_path, file):
+    _write(tmp_path, [0, 1])
+    path = file(tmp_path, 1)
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(DatasetError, match=f"{path.name} cannot be read"):
+        read_dataset(tmp_path)
+
+
+def test_damage_inside_of_a_file_is_named(tmp_path):
+    _write(tmp_path, [0])
+    path = views_file(tmp_path, 0)
+    data = path.read_bytes()
+    path.write_bytes(data[:8] + b"\xff" * 200 + data[208:])
+    with pytest.raises(DatasetError, match=path.name):
+        read_dataset(tmp_path)
+
+
+def test_missing_views_are_named(tmp_path):
+    _write(tmp_path, [0])
+    views_file(tmp_path, 0).unlink()
+    with pytest.raises(DatasetError, match=r"views-00000.parquet is missing"):
+        read_dataset(tmp_path)
+
+
+def test_shards_of_different_datasets_do_not_mix(tmp_path):
+    _write(tmp_path, [0])
+    other = dataclasses.replace(METADATA, split="test", generator={"rooms": 5, "sizes": [3, 4]})
+    _write(tmp_path, [1], other)
+    with pytest.raises(DatasetError, match=r"generator.rooms is 2 in one and 5 in the other.*split is 'training'"):
+        read_dataset(tmp_path)
+
+
+def test_another_schema_version_is_refused(tmp_path):
+    _write(tmp_path, [0], dataclasses.replace(METADATA, schema_version=SCHEMA_VERSION + 1))
+    with pytest.raises(DatasetError, match=f"schema version {SCHEMA_VERSION + 1}"):
+        read_dataset(tmp_path)
+
+
+def test_other_columns_are_refused(tmp_path):
+    _write(tmp_path, [0])
+    path = samples_file(tmp_path, 0)
+    table = pq.read_table(path)
+    wrong = table.set_column(table.schema.get_field_index("distance"), "distance", pa.array([1] * len(table)))
+    pq.write_table(wrong.drop_columns(["phi_go"]), path)
+    with pytest.raises(DatasetError, match="distance, phi_go"):
+        read_dataset(tmp_path)
+
+
+def test_a_foreign_file_has_no_metadata(tmp_path):
+    _write(tmp_path, [0])
+    pq.write_table(pa.table({"a": [1]}), samples_file(tmp_path, 0))
+    with pytest.raises(DatasetError, match="no metadata"):
+        read_dataset(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("view", view_id(0, 99), "which is not in the shard"),
+        ("phi_go", [1, 0], "phi_go whose length"),
+        ("success_probability", 1.5, "row 1: success_probability"),
+        ("failure_weight", 0.0, "row 1: failure_weight"),
+        ("failure_cost", -1.0, "row 1: failure_cost"),
+        ("distance", np.inf, "row 1: distance"),
+        ("bearing", np.nan, "row 1: bearing"),
+    ],
+)
+def test_values_out_of_range_are_named(tmp_path, column, value, message):
+    views, samples = _shard(0)
+    samples[column] = list(samples[column])
+    samples[column][1] = value
+    write_shard(tmp_path, 0, views, samples, METADATA)
+    with pytest.raises(DatasetError, match=message):
+        read_dataset(tmp_path)
+
+
+def test_a_success_has_a_cost(tmp_path):
+    views, samples = _shard(0)
+    samples["success_probability"] = [1.0] * 6
+    samples["success_cost"] = [2.0] * 5 + [np.nan]
+    write_shard(tmp_path, 0, views, samples, METADATA)
+    with pytest.raises(DatasetError, match="row 5: success_cost"):
+        read_dataset(tmp_path)
+
+
+def test_views_are_unique(tmp_path):
+    views, samples = _shard(0)
+    write_shard(tmp_path, 0, {**views, "view": [0, 1, 0]}, {**samples, "view": [0] * 6}, METADATA)
+    with pytest.raises(DatasetError, match="twice"):
+        read_dataset(tmp_path)

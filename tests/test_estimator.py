@@ -1,0 +1,148 @@
+"""The network inside a decision: against asking pair by pair; padding, records and replays; which estimator is used."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from potlp_jax.environments import make
+from potlp_jax.environments.splits import world_key
+from potlp_jax.learning.checkpoints import CheckpointError, save_estimator
+from potlp_jax.learning.estimator import estimator_for, look, read_estimator, shipped_estimator
+from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
+from potlp_jax.planning.policies import Policy
+from potlp_jax.records import load_trial
+from potlp_jax.replay import panorama_at, replay_decision
+from potlp_jax.task.task import Task
+from potlp_jax.trial import run_trial
+from potlp_jax.trial_config import TrialConfig
+from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
+from potlp_jax.world.grid import BeliefMap
+from potlp_jax.world.panorama import Disturbance, render
+from potlp_jax.world.sensing import SensorConfig, observe
+from tests.reference.dijkstra import product_distances
+
+TINY = {"first_widths": (4, 4, 4, 4), "second_widths": (4,) * 8, "dense_widths": (8, 8, 8, 8)}
+NEAR = TrialConfig(sensor=SensorConfig(range_cells=5.0))
+
+
+@pytest.fixture(scope="module")
+def generator():
+    return make("toy")
+
+
+@pytest.fixture(scope="module")
+def trained(generator, tmp_path_factory):
+    config = NetworkConfig(propositions=generator.propositions, **TINY)
+    path = tmp_path_factory.mktemp("estimator") / "tiny.npz"
+    save_estimator(path, EstimatorNetwork(config).init(jax.random.key(3)), config, {})
+    return read_estimator(path)
+
+
+@pytest.fixture(scope="module")
+def world(generator):
+    return generator.generate(world_key("validation", 0, generator.name))
+
+
+@pytest.fixture(scope="module")
+def task(generator):
+    return Task.from_formula(generator.tasks["1"], propositions=generator.propositions)
+
+
+@pytest.fixture(scope="module")
+def trial(world, task, trained):
+    return run_trial(world, task, Policy.POTLP, jax.random.key(0), NEAR, estimator=trained)
+
+
+def test_answers_equal_the_network_asked_pair_by_pair(world, task, trained):
+    belief = observe(BeliefMap.unobserved(world), world, world.start, NEAR.sensor)
+    subgoals = find_subgoals(belief, belief.free, jnp.zeros(world.shape), FrontierConfig())
+    eyes = look(trained.start(*world.shape), render(world, world.start), belief, world.start)
+    estimates = eyes(belief, subgoals, task.arrays)
+    network = EstimatorNetwork(trained.config)
+    features = network.encode(trained.params, render(world, world.start))
+    start = tuple(world.start.tolist())
+    count = int(subgoals.mask.sum())
+    assert count > 0
+    assert len(task.classes) > 0
+    free = np.asarray(belief.free)
+    distances = product_distances(free, np.zeros(free.shape, int), np.zeros((1, 1), int), [False], start, 0)
+    for s in range(count):
+        row, column = subgoals.cells[s].tolist()
+        angle = jnp.float32(math.atan2(row - start[0], column - start[1]))
+        centred, residual = network.centre(features, angle)
+        for c, (stay, go) in enumerate(task.classes):
+            answer = network.answer(
+                trained.params,
+                centred[None],
+                residual[None],
+                jnp.float32(distances[((row, column), 0)])[None],
+                jnp.asarray([stay], jnp.int8),
+                jnp.asarray([go], jnp.int8),
+            )
+            pair = (estimates.success_probability, estimates.success_cost, estimates.failure_cost)
+            expected = (answer.success_probability, answer.success_cost, answer.failure_cost)
+            for found, wanted in zip(pair, expected, strict=True):
+                np.testing.assert_allclose(found[s, c], wanted[0], rtol=1e-4)
+    assert np.all(np.asarray(estimates.success_probability)[count:] == 0)
+    assert np.all(np.asarray(estimates.success_cost) > 0)
+
+
+def test_a_trial_is_satisfied_and_repeats(world, task, trained, trial):
+    again = run_trial(world, task, Policy.POTLP, jax.random.key(0), NEAR, estimator=trained)
+    assert trial.outcome == "satisfied"
+    assert again.path == trial.path
+    assert again.decisions == trial.decisions
+    assert trial.versions["estimator"] == trained.identity
+
+
+def test_looks_name_earlier_decisions(trial):
+    assert any(decision.looks for decision in trial.decisions)
+    for decision in trial.decisions:
+        assert len(decision.looks) == len(decision.subgoals)
+        assert all(0 <= number <= decision.index for number in decision.looks)
+
+
+def test_a_saved_trial_replays_its_decisions(trial, trained, tmp_path):
+    trial.save(tmp_path / "trial.json")
+    loaded = load_trial(tmp_path / "trial.json")
+    assert loaded.decisions == trial.decisions
+    searched = [decision for decision in loaded.decisions if decision.actions]
+    decision = searched[-1]
+    _, plan, _ = replay_decision(loaded, decision.index, trained)
+    q_values = {action.index: action.q_value for action in decision.actions}
+    assert int(plan.action) == decision.choice
+    for index, value in q_values.items():
+        np.testing.assert_allclose(plan.q_values[index], value, rtol=1e-4)
+
+
+def test_a_replay_wants_the_same_estimator(trial, trained):
+    other = dataclasses.replace(trained, digest="another")
+    with pytest.raises(CheckpointError, match="give that one"):
+        replay_decision(trial, 0, other)
+
+
+def test_panoramas_are_made_again(world, trial):
+    last = trial.decisions[-1]
+    expected = render(world, jnp.asarray(last.cell, jnp.int32))
+    np.testing.assert_array_equal(panorama_at(trial, last), expected)
+
+
+def test_a_disturbed_camera_changes_what_is_estimated(world, task, trained, trial):
+    noisy = dataclasses.replace(NEAR, disturbance=Disturbance(noise=40.0, exposure=0.5))
+    disturbed = run_trial(world, task, Policy.POTLP, jax.random.key(0), noisy, estimator=trained)
+    assert disturbed.decisions[0].actions != trial.decisions[0].actions
+    with pytest.raises(ValueError, match="disturbed"):
+        panorama_at(disturbed, disturbed.decisions[0])
+
+
+def test_which_estimator_is_used(trained, generator):
+    assert estimator_for(generator.propositions, trained) is trained
+    with pytest.raises(CheckpointError, match="knows the propositions"):
+        estimator_for(("other",), trained)
+    with pytest.raises(CheckpointError, match="no estimator is shipped"):
+        estimator_for(("other",))
+    assert shipped_estimator(("other",)) is None

@@ -1,0 +1,416 @@
+"""Training: the loss against plain NumPy, the order of the data, learning what can be learned, death and resumption."""
+
+import dataclasses
+import itertools
+import math
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from potlp_jax.learning.checkpoints import CheckpointError, checkpoint_steps, load_estimator
+from potlp_jax.learning.dataset import DatasetMetadata, Samples, encode
+from potlp_jax.learning.network import Answers, EstimatorNetwork
+from potlp_jax.learning.training import (
+    Batch,
+    Batches,
+    DataScale,
+    TrainingConfig,
+    TrainingError,
+    augment,
+    batch_answers,
+    evaluation_of,
+    initial_state,
+    learning_rate_schedule,
+    loss_sums,
+    make_train_step,
+    network_config,
+    total_loss,
+    train,
+)
+
+SHAPE = (64, 128)
+ROOT = Path(__file__).parents[1]
+WIDTHS = {
+    "first_widths": (8, 12, 12, 16),
+    "second_widths": (12, 12, 12, 12, 16, 16, 16, 16),
+    "dense_widths": (24, 16, 16, 16),
+}
+TINY = {"first_widths": (2, 2, 2, 3), "second_widths": (3,) * 8, "dense_widths": (4, 4, 4, 4)}
+METADATA = DatasetMetadata(
+    propositions=("red", "green"),
+    environment="synthetic",
+    generator={},
+    split="training",
+    camera={},
+    disturbance={},
+    encoding={"format": "png"},
+    weights={"low": 1.0, "high": 50.0},
+    collection={},
+    versions={},
+)
+
+
+def synthetic(views: int, per_view: int, seed: int) -> Samples:
+    """Grey noise with two patches, one red and one green; a subgoal succeeds where phi asks for its patch's colour.
+
+    The label needs the picture, the bearing and phi together. R_S is larger for green, R_F is half the distance.
+    """
+    draw = np.random.default_rng(seed)
+    images, columns = [], {name: [] for name in ("view_of", "bearing", "distance", "go", "success")}
+    for view in range(views):
+        image = draw.integers(90, 130, (*SHAPE, 3)).astype(np.uint8)
+        places = draw.permutation(8)[:2] * 16 + 8
+        for colour, place in enumerate(places):
+            patch = (slice(24, 44), (place + np.arange(-9, 9)) % SHAPE[1])
+            image[patch[0], patch[1]] = np.array([220, 40, 40] if colour == 0 else [40, 220, 40], np.uint8)
+        images.append(encode(image, "png"))
+        for _ in range(per_view):
+            there, asked = draw.integers(0, 2, 2)
+            columns["view_of"].append(view)
+            columns["bearing"].append(2 * math.pi * places[there] / SHAPE[1] - math.pi + draw.uniform(-0.1, 0.1))
+            columns["distance"].append(draw.uniform(1, 40))
+            columns["go"].append([1, -1] if asked == 0 else [-1, 1])
+            columns["success"].append(float(there == asked))
+    go = np.array(columns["go"], np.int8)
+    success, distance = np.array(columns["success"], np.float32), np.array(columns["distance"], np.float32)
+    return Samples(
+        images=images,
+        view_of=np.array(columns["view_of"], np.int32),
+        bearing=np.array(columns["bearing"], np.float32),
+        distance=distance,
+        phi_stay=np.zeros_like(go),
+        phi_go=go,
+        success=success,
+        success_cost=np.where(success > 0, 5 + 20 * (go[:, 1] == 1), np.nan).astype(np.float32),
+        failure_cost=distance / np.float32(2),
+        success_weight=draw.uniform(1, 50, len(success)).astype(np.float32),
+        failure_weight=draw.uniform(1, 50, len(success)).astype(np.float32),
+        metadata=METADATA,
+    )
+
+
+def _network(samples: Samples, widths) -> EstimatorNetwork:
+    return EstimatorNetwork(dataclasses.replace(network_config(samples, SHAPE), **widths))
+
+
+def _batch(samples: Samples, views: int, per_view: int, step: int = 0) -> Batch:
+    return Batches(samples, views, per_view, 0).training_batch(step)
+
+
+def _config(steps: int, **changes) -> TrainingConfig:
+    plain = {"mirror": 0.0, "brightness": 0.0, "colour": 0.0, "patience": 0}
+    return TrainingConfig(steps=steps, views_per_batch=4, samples_per_view=4, **{**plain, **changes})
+
+
+@pytest.mark.parametrize("weighting", [0.0, 0.4, 1.0])
+def test_the_loss_equals_the_formula_written_out(weighting):
+    samples = synthetic(3, 5, 1)
+    batch = _batch(samples, 3, 7)
+    network, scale = _network(samples, TINY), DataScale.of(samples)
+    draw = np.random.default_rng(0)
+    logit, success_cost, failure_cost = (draw.normal(2, 3, (3, 7)).astype(np.float32) for _ in range(3))
+    answers = Answers(
+        success_logit=jnp.asarray(logit), success_cost=jnp.asarray(success_cost), failure_cost=jnp.asarray(failure_cost)
+    )
+    sums = loss_sums(answers, batch, network.config, scale, weighting)
+    weights = np.where(samples.success == 1, samples.success_weight, samples.failure_weight).tolist()
+    mean, entropy, errors, brier, count = sum(weights) / len(weights), 0.0, 0.0, 0.0, 0
+    for i, k in itertools.product(range(3), range(7)):
+        if not bool(batch.mask[i, k]):
+            continue
+        p, count = 1 / (1 + math.exp(-float(logit[i, k]))), count + 1
+        happened = float(batch.success[i, k]) == 1
+        weight = float((batch.success_weight if happened else batch.failure_weight)[i, k]) / mean
+        entropy -= (weighting * weight + 1 - weighting) * math.log(p if happened else 1 - p)
+        brier += (p - float(happened)) ** 2
+        if happened:
+            errors += (float(success_cost[i, k] - batch.success_cost[i, k]) / network.config.success_cost_scale) ** 2
+        else:
+            errors += (float(failure_cost[i, k] - batch.failure_cost[i, k]) / network.config.failure_cost_scale) ** 2
+    assert count == 15
+    assert float(total_loss(sums, 0.3)) == pytest.approx((entropy + 0.3 * errors) / count, rel=1e-4)
+    evaluation = evaluation_of(sums, network.config, 0.3)
+    assert evaluation.brier == pytest.approx(brier / count, rel=1e-4)
+    prior = float(np.mean(samples.success))
+    assert evaluation.skill == pytest.approx(1 - brier / count / (prior * (1 - prior)), rel=1e-4)
+
+
+def test_scales_are_those_of_the_labels_that_count():
+    samples = synthetic(6, 8, 2)
+    config = network_config(samples, SHAPE)
+    won = samples.success == 1
+    assert config.success_cost_scale == pytest.approx(np.std(samples.success_cost[won]), rel=1e-5)
+    assert config.failure_cost_scale == pytest.approx(np.std(samples.failure_cost[~won]), rel=1e-5)
+    assert config.propositions == ("red", "green")
+    nothing = dataclasses.replace(samples, success=np.zeros_like(samples.success))
+    assert network_config(nothing, SHAPE).success_cost_scale == 1.0
+
+
+def test_costs_that_are_not_known_give_no_nan_gradient_and_padding_gives_none():
+    samples = synthetic(4, 3, 3)
+    samples = dataclasses.replace(samples, failure_cost=np.full_like(samples.failure_cost, np.nan))
+    network, scale = _network(samples, TINY), DataScale.of(samples)
+    params = network.init(jax.random.key(0))
+    batch = _batch(samples, 4, 5)
+    assert bool(jnp.any(jnp.isnan(batch.success_cost)))
+    assert not bool(jnp.all(batch.mask))
+
+    @jax.jit
+    def gradient(batch):
+        def loss(params):
+            pixels = batch.images.astype(jnp.float32) / jnp.float32(255)
+            answers = batch_answers(network, params, pixels, batch.bearing, batch)
+            return total_loss(loss_sums(answers, batch, network.config, scale, 1.0), 1.0)
+
+        return jax.grad(loss)(params)
+
+    found = gradient(batch)
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
+    padded = {
+        name: jnp.where(batch.mask, getattr(batch, name), jnp.float32(jnp.nan))
+        for name in ("success", "success_weight", "failure_weight", "success_cost")
+    }
+    other = gradient(dataclasses.replace(batch, **padded))
+    for one, two in zip(jax.tree.leaves(found), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+def test_mirroring_mirrors_the_image_and_negates_the_bearing_together():
+    samples = synthetic(4, 4, 4)
+    batch = _batch(samples, 4, 4)
+    pixels, bearing = augment(batch, jax.random.key(0), _config(1, mirror=1.0))
+    # XLA divides by 255 as it multiplies by its reciprocal: the last bit may differ from NumPy's.
+    clean = np.asarray(batch.images).astype(np.float32) / np.float32(255)
+    np.testing.assert_allclose(pixels, clean[:, :, ::-1], rtol=3e-7)
+    np.testing.assert_array_equal(bearing, -batch.bearing)
+    # The colour that a subgoal's bearing points at stays the same: looked up by the definition of the bearing.
+    for image, angles in ((np.asarray(batch.images) / 255, batch.bearing), (pixels, bearing)):
+        columns = np.floor((np.asarray(angles) + math.pi) / (2 * math.pi) * SHAPE[1]).astype(int) % SHAPE[1]
+        red = np.asarray(image)[np.arange(4)[:, None], 34, columns, 0] > 0.5
+        np.testing.assert_array_equal(red, (np.asarray(batch.phi_go)[..., 0] == 1) == (np.asarray(batch.success) == 1))
+    same, kept = augment(batch, jax.random.key(0), _config(1))
+    np.testing.assert_array_equal(kept, batch.bearing)
+    np.testing.assert_allclose(same, clean, rtol=3e-7)
+
+
+def test_gains_change_pixels_within_their_range_and_per_panorama():
+    batch = _batch(synthetic(4, 4, 4), 4, 4)
+    clean = np.asarray(batch.images).astype(np.float32) / 255
+    pixels, _ = augment(batch, jax.random.key(1), _config(1, brightness=0.2))
+    assert float(jnp.min(pixels)) >= 0
+    assert float(jnp.max(pixels)) <= 1
+    gains = (np.asarray(pixels) / np.maximum(clean, 1e-3))[:, 0, 0]
+    assert len(np.unique(gains[:, 0].round(4))) == 4
+    np.testing.assert_allclose(gains[:, 0], gains[:, 1], rtol=1e-4)
+
+
+def test_the_order_is_a_function_of_seed_and_step_and_covers_an_epoch():
+    samples = synthetic(11, 6, 5)
+    samples = dataclasses.replace(samples, distance=np.arange(66, dtype=np.float32))  # names every sample
+    batches, again = Batches(samples, 3, 4, 7), Batches(samples, 3, 4, 7)
+    assert batches.per_epoch == 3
+    epochs = []
+    for epoch in range(2):
+        seen = [np.asarray(batches.training_batch(3 * epoch + step).distance).astype(int) for step in range(3)]
+        views = [set((rows // 6).tolist()) for block in seen for rows in block]
+        assert all(len(view) == 1 for view in views)
+        assert len(set.union(*views)) == 9
+        assert all(len(set(rows.tolist())) == 4 for block in seen for rows in block)
+        epochs.append(np.concatenate(seen))
+    assert not np.array_equal(*epochs)
+    for step in (5, 0, 3):
+        one, other = batches.training_batch(step), again.training_batch(step)
+        pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+        assert all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+    other = Batches(samples, 3, 4, 8).training_batch(0)
+    assert not np.array_equal(other.distance, batches.training_batch(0).distance)
+
+
+def test_evaluation_sees_every_sample_once():
+    samples = synthetic(5, 7, 6)
+    samples = dataclasses.replace(samples, distance=np.arange(35, dtype=np.float32))
+    seen = [np.asarray(b.distance)[np.asarray(b.mask)] for b in Batches(samples, 2, 3, 0).evaluation_batches()]
+    assert sorted(np.concatenate(seen).tolist()) == list(range(35))
+
+
+def test_the_learning_rate_rises_and_ends_at_zero():
+    schedule = learning_rate_schedule(_config(100, learning_rate=0.5, warmup=0.1))
+    rates = [float(jnp.asarray(schedule(step))) for step in range(101)]
+    assert rates[0] == 0
+    assert max(rates) == rates[10] == pytest.approx(0.5)
+    assert rates[100] == pytest.approx(0, abs=1e-6)
+    assert all(a < b for a, b in itertools.pairwise(rates[:11]))
+    assert all(a > b for a, b in itertools.pairwise(rates[10:]))
+
+
+def test_it_learns_64_samples_whose_label_needs_picture_bearing_and_phi():
+    samples = synthetic(16, 4, 8)
+    network = _network(samples, WIDTHS)
+    config = TrainingConfig(
+        steps=300, views_per_batch=16, samples_per_view=4, learning_rate=4e-3, weighting=0.5, patience=0,
+        mirror=0.0, brightness=0.0, colour=0.0, average_decay=0.9,
+    )  # fmt: skip
+    step = make_train_step(network, config, DataScale.of(samples))
+    state, batch = initial_state(network, config), _batch(samples, 16, 4)
+    for _ in range(config.steps):
+        state, _ = step(state, batch)
+    pixels = batch.images.astype(jnp.float32) / jnp.float32(255)
+    answers = batch_answers(network, state.average, pixels, batch.bearing, batch)
+    evaluation = evaluation_of(
+        loss_sums(answers, batch, network.config, DataScale.of(samples), 1.0), network.config, config.cost_share
+    )
+    assert evaluation.skill > 0.95
+    assert evaluation.success_rmse < 0.3 * network.config.success_cost_scale
+    assert evaluation.failure_rmse < 0.3 * network.config.failure_cost_scale
+
+
+def test_a_loss_that_is_not_finite_stops_with_the_step():
+    samples = synthetic(4, 4, 9)
+    samples.distance[:] = np.inf
+    network = _network(synthetic(4, 4, 9), TINY)
+    with pytest.raises(TrainingError, match="loss of step 1 is nan"):
+        train(network, samples, samples, _config(2))
+
+
+def test_data_that_do_not_belong_together_are_refused():
+    samples = synthetic(4, 4, 9)
+    metadata = dataclasses.replace(METADATA, propositions=("red", "blue"))
+    with pytest.raises(TrainingError, match=r"propositions.*blue"):
+        train(_network(samples, TINY), samples, dataclasses.replace(samples, metadata=metadata), _config(2))
+
+
+def test_patience_ends_training_and_the_best_is_kept():
+    samples = synthetic(4, 4, 9)
+    # A learning rate of nearly nothing: the first evaluation stays the best to within the improvement of rounding.
+    config = _config(50, learning_rate=1e-30, patience=3)
+    losses = []
+    done = train(
+        _network(samples, TINY), samples, samples, config, on_evaluation=lambda p: losses.append(p.validation.loss)
+    )
+    assert (done.reason, done.best_step, done.steps, len(losses)) == ("patience", 1, 4, 4)
+    assert done.best_loss == pytest.approx(losses[0])
+
+
+def test_a_time_budget_ends_training_with_an_evaluation():
+    samples = synthetic(4, 4, 9)
+    seen = []
+    done = train(_network(samples, TINY), samples, samples, _config(2), budget_seconds=0.001, on_evaluation=seen.append)
+    # The budget is over before the first step: nothing is trained, or one step and its evaluation.
+    assert done.reason == "time"
+    assert [progress.step for progress in seen] == list(range(1, done.steps + 1))
+    assert done.steps < 2
+
+
+def _trial(folder: str) -> None:
+    """The training of the test below, in a process of its own: prints a line per step, writes the parameters."""
+    samples, validation = synthetic(9, 5, 10), synthetic(3, 5, 11)
+
+    def tell(step: int, loss: float) -> None:
+        print(f"step {step} {loss!r}", flush=True)
+        time.sleep(0.02)  # so that the kill comes in the middle
+
+    config = _config(40, mirror=0.5, brightness=0.1, colour=0.1, average_decay=0.9, checkpoint_steps=3)
+    done = train(
+        _network(samples, TINY),
+        samples,
+        validation,
+        config,
+        folder=Path(folder) / "checkpoints",
+        on_start=lambda step: print(f"start {step}", flush=True),
+        on_step=tell,
+    )
+    np.savez(f"{folder}/done.npz", *(np.asarray(leaf) for leaf in jax.tree.leaves(done.params)), str(done.best_step))
+
+
+def _environment(folder: Path) -> dict[str, str]:
+    """Variables with which the processes of one test share what they compile."""
+    cache = {"JAX_COMPILATION_CACHE_DIR": str(folder / "cache"), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    return {**os.environ, **cache}
+
+
+def _start(folder: Path) -> subprocess.Popen[str]:
+    code = f"from tests.test_training import _trial; _trial({str(folder)!r})"
+    folder.mkdir(exist_ok=True)
+    return subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=ROOT, env=_environment(folder.parent)
+    )
+
+
+def test_killed_and_resumed_it_reaches_the_same_parameters_bit_for_bit(tmp_path):
+    straight, broken = tmp_path / "straight", tmp_path / "broken"
+    output, _ = _start(straight).communicate(timeout=400)
+    assert output.startswith("start 0")
+    process = _start(broken)
+    assert process.stdout is not None
+    for _ in range(random.Random().randint(8, 30)):
+        process.stdout.readline()
+    time.sleep(random.random() * 0.05)
+    process.send_signal(signal.SIGKILL)
+    process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGKILL
+    assert not (broken / "done.npz").exists()
+    saved = checkpoint_steps(broken / "checkpoints")
+    output_again, _ = _start(broken).communicate(timeout=400)
+    assert output_again.startswith(f"start {saved[-1]}\n")
+    assert 0 < saved[-1] < 40
+    # Every later step had the same loss, and the end is the same.
+    assert output_again.splitlines()[1:] == output.splitlines()[saved[-1] + 1 :]
+    with np.load(straight / "done.npz") as one, np.load(broken / "done.npz") as other:
+        assert one.files == other.files
+        assert len(one.files) > 20
+        for name in one.files:
+            np.testing.assert_array_equal(one[name], other[name])
+
+
+def test_resuming_with_other_options_or_data_names_the_difference(tmp_path):
+    samples = synthetic(4, 4, 9)
+    network = _network(samples, TINY)
+    train(network, samples, samples, _config(2), folder=tmp_path)
+    with pytest.raises(CheckpointError, match=r"training\.learning_rate is 0\.002 in the file and 0\.1 here"):
+        train(network, samples, samples, _config(2, learning_rate=0.1), folder=tmp_path)
+    renamed = dataclasses.replace(network.config, propositions=("red", "blue"))
+    with pytest.raises(CheckpointError, match=r"network\.propositions .*green.*blue"):
+        train(EstimatorNetwork(renamed), samples, samples, _config(2), folder=tmp_path)
+
+
+def test_the_command_writes_an_estimator_and_resumes(tmp_path):
+    from potlp_jax.learning.dataset import write_shard
+
+    for name, seed in (("training", 12), ("validation", 13)):
+        samples = synthetic(4, 5, seed)
+        views = {key: [0] * 4 for key in ("world", "step", "row", "column")}
+        views |= {"view": list(range(4)), "format": ["png"] * 4, "image": samples.images}
+        plain = ("bearing", "distance", "success_cost", "failure_cost", "success_weight", "failure_weight")
+        columns = {key: getattr(samples, key).tolist() for key in plain}
+        columns |= {key: getattr(samples, key).tolist() for key in ("phi_stay", "phi_go")}
+        columns |= {key: [0] * 20 for key in ("outcome_class", "row", "column")}
+        columns |= {"view": samples.view_of.tolist(), "task": ["F red"] * 20}
+        columns |= {"success_probability": samples.success.tolist()}
+        write_shard(tmp_path / name, 0, views, columns, METADATA)
+    command = [sys.executable, "-m", "train.fit", str(tmp_path / "training"), "--validation", tmp_path / "validation"]
+    command += ["--out", str(tmp_path / "out"), "--epochs", "2", "--views-per-batch", "2", "--samples-per-view", "2"]
+    for expected in ("epoch   2.0", "ended by planned"):
+        done = subprocess.run(
+            command, capture_output=True, text=True, cwd=ROOT, timeout=400, env=_environment(tmp_path)
+        )
+        assert done.returncode == 0, done.stderr
+        assert expected in done.stdout
+    params, config, metadata = load_estimator(tmp_path / "out" / "estimator.npz")
+    assert config.propositions == ("red", "green")
+    assert metadata["figures"]["step"] == metadata["best_step"]
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(params))
+    assert (tmp_path / "out" / "log.csv").read_text().count("\n") == 3
+    assert (tmp_path / "out" / "curves.png").stat().st_size > 1000
+    assert list((tmp_path / "out" / "tensorboard").iterdir())
+    refused = subprocess.run([*command, "--seed", "1"], capture_output=True, text=True, cwd=ROOT)
+    assert refused.returncode == 1
+    assert "'seed': 0" in refused.stderr

@@ -1,0 +1,107 @@
+"""The memory of panoramas: against a list of all looks, and what happens when it is full."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from potlp_jax.learning.views import NO_LOOK, look_of_subgoals, no_views, places_of_looks, remember
+from potlp_jax.types import Status
+from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
+from potlp_jax.world.grid import BeliefMap, belief_from_numpy
+from potlp_jax.world.sensing import SensorConfig, visible
+from tests.reference.sensing import visible as reference_visible
+
+FEATURES = (1, 2, 3)
+remember_jit = jax.jit(remember)
+
+
+def some_belief(rng: np.random.Generator, shape: tuple[int, int] = (12, 16)) -> BeliefMap:
+    cells = rng.choice([BeliefMap.UNKNOWN, BeliefMap.FREE, BeliefMap.OCCUPIED], shape, p=[0.2, 0.65, 0.15])
+    return belief_from_numpy(cells.astype(np.int8), np.zeros(shape, np.int32))
+
+
+def free_cell(rng: np.random.Generator, belief: BeliefMap) -> np.ndarray:
+    cells = np.argwhere(np.asarray(belief.free))
+    return cells[rng.integers(len(cells))].astype(np.int32)
+
+
+def subgoals_of(belief: BeliefMap):
+    everywhere = jnp.ones(belief.cells.shape, bool)
+    return find_subgoals(belief, everywhere, jnp.zeros(belief.cells.shape), FrontierConfig(max_subgoals=8, min_size=1))
+
+
+def test_line_of_sight_runs_through_known_free_cells():
+    rng = np.random.default_rng(0)
+    belief = some_belief(rng)
+    cell = free_cell(rng, belief)
+    views = remember_jit(no_views(4, FEATURES, 12, 16), jnp.zeros(FEATURES), belief, jnp.asarray(cell))
+    opaque = ~np.asarray(belief.free)
+    seen = np.zeros(opaque.shape, bool)
+    for at in reference_visible(opaque.tolist(), (int(cell[0]), int(cell[1])), 28.0):
+        seen[at] = True
+    np.testing.assert_array_equal(np.asarray(views.look_of_cell) == 0, seen & ~opaque)
+
+
+def test_every_subgoal_is_shown_by_the_last_look_at_its_frontier():
+    """Against a list that forgets nothing."""
+    rng = np.random.default_rng(1)
+    views, looks = no_views(32, FEATURES, 12, 16), []
+    belief = some_belief(rng)
+    for number in range(12):
+        cell = free_cell(rng, belief)
+        features = jnp.full(FEATURES, number, jnp.float32)
+        views = remember_jit(views, features, belief, jnp.asarray(cell))
+        seen = visible(~belief.free, jnp.asarray(cell), SensorConfig(range_cells=28.0))
+        looks.append((cell, np.asarray(seen)))
+        subgoals = subgoals_of(belief)
+        found = look_of_subgoals(views, subgoals)
+        for s in range(int(subgoals.mask.sum())):
+            component = np.asarray(subgoals.component) == s
+            showing = [n for n, (_, sight) in enumerate(looks) if np.any(sight & component)]
+            expected = showing[-1] if showing else number
+            assert int(found[s]) == expected
+            place = int(places_of_looks(views, found)[s])
+            np.testing.assert_array_equal(views.cells[place], looks[expected][0])
+            assert float(views.features[place].min()) == float(views.features[place].max()) == expected
+        assert np.all(np.asarray(found)[~np.asarray(subgoals.mask)] == NO_LOOK)
+    assert int(views.status) == 0
+
+
+def corridor(known: int) -> BeliefMap:
+    """A corridor of 12 cells, free up to ``known`` from the left, the rest unobserved; walls above and below."""
+    cells = np.full((3, 14), BeliefMap.OCCUPIED, np.int8)
+    cells[1, 1:13] = BeliefMap.UNKNOWN
+    cells[1, 1 : known + 1] = BeliefMap.FREE
+    return belief_from_numpy(cells, np.zeros(cells.shape, np.int32))
+
+
+def test_what_no_frontier_refers_to_makes_room():
+    """Three places, eight looks along a corridor whose end was seen from each: only the last is needed."""
+    views = no_views(3, FEATURES, 3, 14)
+    for number in range(8):
+        belief = corridor(number + 2)
+        views = remember_jit(views, jnp.full(FEATURES, number, jnp.float32), belief, jnp.array([1, number + 1]))
+        subgoals = subgoals_of(belief)
+        assert int(look_of_subgoals(views, subgoals)[0]) == number
+    assert int(views.status) == 0
+    assert sorted(np.asarray(views.look).tolist()) == [5, 6, 7]
+
+
+def test_a_full_memory_is_flagged():
+    """Frontiers in three niches, each seen from inside its niche alone; there is room for two panoramas."""
+    cells = np.full((5, 13), BeliefMap.OCCUPIED, np.int8)
+    niches = (1, 6, 11)
+    for column in niches:
+        cells[1, column], cells[2, column] = BeliefMap.UNKNOWN, BeliefMap.FREE
+    belief = belief_from_numpy(cells, np.zeros(cells.shape, np.int32))
+    views = no_views(2, FEATURES, 5, 13)
+    flags = []
+    for column in niches:
+        views = remember_jit(views, jnp.zeros(FEATURES), belief, jnp.array([2, column]))
+        flags.append(int(views.status))
+    assert flags == [0, 0, Status.VIEW_OVERFLOW]
+    # The subgoal whose panorama is gone is estimated from the last one.
+    subgoals = subgoals_of(belief)
+    order = np.asarray(subgoals.cells)[:3, 1]
+    found = np.asarray(look_of_subgoals(views, subgoals))[:3]
+    assert {int(c): int(n) for c, n in zip(order, found, strict=True)} == {1: 2, 6: 1, 11: 2}
