@@ -15,9 +15,9 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	@touch $@
 
 demo: $(VENV)/installed  ## Fire-fighting task 1 on a handful of seeds with every policy: table and pictures in out/demo
-	$(BIN)/potlp compare firefighting --task 1 --policies known-map,baseline,optimistic,oracle --trials 5 --out out/demo
-	$(BIN)/potlp run firefighting --task 1 --policy oracle --seed 0 --out out/demo/oracle
-	@echo "Pictures: out/demo/oracle/trial.png, out/demo/oracle/trial.gif, out/demo/scatter.png"
+	$(BIN)/potlp compare firefighting --task 1 --policies known-map,baseline,optimistic,oracle,potlp --trials 5 --out out/demo
+	$(BIN)/potlp run firefighting --task 1 --seed 0 --out out/demo/potlp
+	@echo "Pictures: out/demo/potlp/trial.png, out/demo/potlp/trial.gif, out/demo/scatter.png"
 
 test: $(VENV)/installed  ## The whole suite
 	$(BIN)/python -m pytest -n 2 --dist loadfile

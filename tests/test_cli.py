@@ -35,7 +35,7 @@ def _json(result):
 def recorded(tmp_path_factory) -> Path:
     """A trial of the toy environment with everything that `potlp run` writes."""
     folder = tmp_path_factory.mktemp("run")
-    result = _potlp("run", "toy", "--task", "2", "--seed", "3", "--out", folder, *FAST)
+    result = _potlp("run", "toy", "-t", "2", "--policy", "oracle", "--seed", "3", "--out", folder, *FAST)
     assert result.exit_code == 0, result.output
     return folder
 
@@ -103,6 +103,8 @@ def test_max_positive_literals_reaches_the_task():
         (("run", "toy", "--split", "holiday"), "validation"),
         (("run", "toy", "--seed", "999999999999"), "--seed"),
         (("compare", "toy", "--policies", "oracle,clever"), "clever"),
+        (("run", "toy", "--policy", "potlp"), "no estimator is shipped for the propositions goal"),
+        (("run", "firefighting", "--estimator", "nowhere.npz"), "nowhere.npz"),
         (("explain", "nothing"), "FOLDER:INDEX"),
         (("explain", "nowhere/trial.json:0"), "nowhere/trial.json"),
     ],
@@ -138,12 +140,22 @@ def test_run_writes_record_picture_and_animation(recorded):
 
 def test_run_as_json_is_the_summary(recorded, tmp_path):
     data = _json(
-        _potlp("run", "toy", "-t", "2", "--seed", "3", "--out", tmp_path / "new", "--no-animation", "--json", *FAST)
+        _potlp(
+            *("run", "toy", "-t", "2", "--policy", "oracle", "--seed", "3", "--out", tmp_path / "new"),
+            *("--no-animation", "--json", *FAST),
+        )
     )
     files = data.pop("files")
     assert data == load_trial(recorded / "trial.json").summary()
     assert [Path(file).name for file in files] == ["trial.json", "trial.png"]
     assert not (tmp_path / "new" / "trial.gif").exists()
+
+
+def test_without_an_estimator_the_default_policy_is_the_baseline():
+    result = _potlp("run", "toy", "-t", "2")
+    assert result.exit_code == 0
+    assert "no estimator is shipped for toy" in result.stderr
+    assert "baseline" in result.stdout
 
 
 def test_run_without_out_writes_nothing(tmp_path, monkeypatch):

@@ -256,7 +256,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("dataset", type=Path, help="folder made by train.collect")
     found.add_argument("--validation", type=Path, required=True, help="data set of other worlds")
     found.add_argument("--out", type=Path, required=True, help="folder for everything that is written")
-    found.add_argument("--epochs", type=int, default=20, help="passes over the panoramas, at most (default 20)")
+    found.add_argument("--epochs", type=int, default=10, help="passes over the panoramas, at most (default 10)")
     found.add_argument("--minutes", type=float, help="plan as many steps as fit into this time")
     found.add_argument("--seed", type=int, default=0, help="of parameters, order and augmentation (default 0)")
     for name, field in _OPTIONS.items():

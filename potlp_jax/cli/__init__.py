@@ -139,7 +139,7 @@ def task_command(
 
 [cyan]potlp run toy --task 1[/cyan]
 
-[cyan]potlp run firefighting --task 3 --policy oracle --seed 7 --out out/fire[/cyan]
+[cyan]potlp run firefighting --task 3 --seed 7 --out out/fire[/cyan]
 
 [cyan]potlp run firefighting --task "!fire U exit" --policy baseline --json[/cyan]
 
