@@ -44,7 +44,7 @@ from potlp_jax.trial_config import TrialConfig
 from potlp_jax.world.grid import World
 from potlp_jax.world.sensing import SensorConfig
 
-POLICIES = tuple(policy.value for policy in Policy)
+POLICIES = tuple(policy.value for policy in Policy if policy is not Policy.POTLP)
 WORLDS = {"firefighting": 155, "revealed": 125}
 FORMULAS = 180
 """A few of the random formulas ask for something in the first steps, which no floor offers."""

@@ -84,6 +84,17 @@ def test_converges_to_the_exact_solution(problems, solutions):
         assert int(plans.status[i]) == exact.status
 
 
+def test_finish_beyond_the_last_subgoal_in_the_last_state():
+    """There the finish action must not be taken for an attempt on the spot, which would pay no way back."""
+    formula = "F(a & F(b & F a))"
+    assert not task_of(formula).dfa.accepting[-1]
+    config = SearchConfig(simulations=2000, optimism=1.0)
+    problems = [random_problem(formula, 2, seed, unreachable=0.1) for seed in range(8)]
+    plans = plan_many(problems, keys(len(problems)), config)
+    for i, problem in enumerate(problems):
+        np.testing.assert_allclose(plans.value[i], solve_exact(problem).value, rtol=1e-5)
+
+
 def test_regret_is_small_at_the_default_budget(plans, solutions):
     actions = [int(action) for action in plans.action]
     regrets = [x.q_values[a] / x.value - 1.0 for a, x in zip(actions, solutions, strict=True) if a != NO_ACTION]

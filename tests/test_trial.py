@@ -10,8 +10,12 @@ import pytest
 
 from eval.audit import problems_of, satisfaction_is_promised
 from eval.formulas import random_tasks
+from potlp_jax import robot
+from potlp_jax import trial as trial_module
 from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.learning.estimator import TrainedEstimator, look
+from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning import policies
 from potlp_jax.planning.policies import DecisionConfig, MoveKind, Policy, decide
 from potlp_jax.planning.search_graph import SearchConfig
@@ -37,9 +41,21 @@ ROOMS_SHAPE = (ROOMS.config.largest, ROOMS.config.largest)
 TASKS = random_tasks(10, ROOMS.propositions, SIZES, seed=3)
 
 
+def _untrained(propositions):
+    """A small network of random parameters: promises hold whatever the estimates say."""
+    config = NetworkConfig(
+        propositions=propositions, first_widths=(4,) * 4, second_widths=(4,) * 8, dense_widths=(8,) * 4
+    )
+    params = EstimatorNetwork(config).init(jax.random.key(0))
+    return TrainedEstimator(params=params, config=config, metadata={}, name="untrained", digest="")
+
+
+UNTRAINED = _untrained(ROOMS.propositions)
+
+
 def _run(world, task, policy, seed, config=CONFIG):
     arrays = task.padded(SIZES)
-    return run_trial(world, task, policy, jax.random.key(seed), config, arrays=arrays)
+    return run_trial(world, task, policy, jax.random.key(seed), config, arrays=arrays, estimator=UNTRAINED)
 
 
 @pytest.mark.parametrize("policy", list(Policy))
@@ -51,6 +67,19 @@ def test_trials_keep_their_promises(policy):
         assert problems_of(trial, task) == []
         satisfied += trial.outcome is Outcome.SATISFIED
     assert satisfied >= len(TASKS) // 2
+
+
+def test_an_episode_compiles_nothing_new():
+    """After one trial of each policy, another world and another task run with the programs that are there."""
+    programs = (trial_module._decide, robot._follow, robot._observe, robot.photograph, look)
+
+    def run_all(number):
+        for policy in Policy:
+            world = ROOMS.generate(world_key(Split.VALIDATION, number, "rooms"))
+            _run(world, TASKS[number], policy, number)
+        return [program._cache_size() for program in programs]
+
+    assert run_all(0) == run_all(1)
 
 
 def test_one_compilation_for_all_worlds_and_tasks():
@@ -281,6 +310,6 @@ def test_an_oracle_without_estimator_is_refused():
 
 
 def test_policies_are_named_in_one_place():
-    assert {policy.value for policy in policies.Policy} == {"known-map", "baseline", "optimistic", "oracle"}
+    assert {policy.value for policy in policies.Policy} == {"known-map", "baseline", "optimistic", "oracle", "potlp"}
     with pytest.raises(ValueError, match="not a valid Policy"):
         _run(make_world(np.zeros((3, 3), bool), np.zeros((3, 3), np.int32), (1, 1)), TASKS[0], "wizard", 0)

@@ -35,8 +35,8 @@ class Rule:
     """The rule in a batch of problems.
 
     ``ways[r, p, a]`` is the way to action ``a`` from the spot ``p = place * Z + state``; ``spots`` where each action is
-    attempted. ``spends[r, a, b]``: if ``a`` fails, so does ``b``. ``after_success`` is what is guessed to be left
-    after each action's success, with what is then owed; 0 where that satisfies the task, and after finish.
+    attempted, -1 for finish. ``spends[r, a, b]``: if ``a`` fails, so does ``b``. ``after_success`` is what is guessed
+    to be left after each action's success, with what is then owed; 0 where that satisfies the task, and after finish.
     """
 
     ways: Float32[Array, "*R P A"]
@@ -132,7 +132,7 @@ def guess_outcomes(
     # The chain without an action begins where that action has failed instead of here.
     start = jnp.minimum(first, actions - 1)
     way_here = chain.cost[0] - gain[lanes, start]
-    spots = jnp.minimum(rule.spots, rule.ways.shape[1] - 1)
+    spots = jnp.maximum(rule.spots, 0)
     way_there = rule.ways[lanes[:, None], spots, start[:, None]] + rule.failure_cost
     way_there = jnp.where(rule.spots == rule.spots[lanes, start][:, None], 0.0, way_there)
     way_there = jnp.where(jnp.isinf(way_there), way_here[:, None], way_there)

@@ -24,10 +24,14 @@ from potlp_jax.planning.history import (
     terms_of_all,
 )
 from potlp_jax.planning.search_arrays import least_of_each, mix, pack_rows
+from potlp_jax.types import NO_STATE
 
 WINDOW: int = 8
 """Slots of the table of nodes that a history may be found in. Where all are taken the node is not entered: it is then
 not shared between orders, which costs simulations but no correctness."""
+
+NOWHERE: int = -1
+"""Spot of actions that are not attempted beyond a subgoal: finish, and padding."""
 
 UNTRIED: float = 1e18
 """Spread of an action that must be tried before others are tried again; finite, so that an action that is not
@@ -217,7 +221,8 @@ def prepare(structure: Any, leaves: Sequence[Array], seeds: UInt32[Array, "B 2"]
     problems = jax.tree.unflatten(structure, leaves)
     tables, root = jax.vmap(action_tables)(problems), jax.vmap(initial_history)(problems)
     rows, states = tables.actions, tables.accepting.shape[1]
-    where = rows.subgoal * states + rows.from_state
+    # Finish is attempted nowhere; S * Z + NO_STATE would be the last subgoal in the last state.
+    where = jnp.where(rows.from_state == NO_STATE, NOWHERE, rows.subgoal * states + rows.from_state)
     reach = jax.vmap(_reachable)(tables)
     terms = jax.vmap(terms_of_all)(tables, root)
     rule = make_rule(
