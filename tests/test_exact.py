@@ -33,14 +33,14 @@ def assert_equals_recursion(problem, remember=True):
     seed=st.integers(0, 10**6),
     backward=st.booleans(),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_equals_the_literal_recursion(formula, subgoals, seed, backward):
     unreachable = 0.5 if subgoals == 2 else 0.2
     assert_equals_recursion(random_problem(formula, subgoals, seed, unreachable=unreachable, backward=backward))
 
 
 @given(formula=st.sampled_from(FORMULAS), seed=st.integers(0, 10**6))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_equals_the_recursion_that_remembers_nothing(formula, seed):
     assert_equals_recursion(random_problem(formula, 1, seed), remember=False)
 
@@ -134,7 +134,7 @@ def test_reused_success_is_worth_it():
 
 
 @given(seed=st.integers(0, 10**6), formula=st.sampled_from(FORMULAS[:3]))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_dead_ends_are_never_better_than_success(seed, formula):
     """A dead end costs more than anything else could: raising its cost never lowers the value, and the value of a
     problem with a sure way is that of the sure way at most."""
@@ -158,7 +158,7 @@ def choose_from_the_start(monkeypatch):
 
 
 @given(formula=st.sampled_from(FORMULAS), subgoals=st.integers(1, 2), seed=st.integers(0, 10**6))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_best_first_search_equals_breadth_first_search(formula, subgoals, seed):
     problem = random_problem(formula, subgoals, seed, unreachable=0.2, backward=bool(seed % 2))
     expected = solve_exact(problem)
@@ -175,7 +175,7 @@ def test_best_first_search_equals_breadth_first_search(formula, subgoals, seed):
     seed=st.integers(0, 10**6),
     max_states=st.sampled_from([1, 20, 100]),
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_bounds_hold_the_optimum(formula, subgoals, seed, max_states):
     problem = random_problem(formula, subgoals, seed, unreachable=0.3, backward=bool(seed % 2))
     expected = solve_exact(problem)

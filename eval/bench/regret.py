@@ -5,9 +5,9 @@
 
 The truth - Q of every root action by Eq. 3 - is computed once and kept. Where the exact solution does not fit into the
 time allowed, V* is bounded by a certified interval, and regrets are measured against the best that is known: our own
-search with full optimism and BEST_KNOWN simulations; such instances are counted apart. The regret of a choice is its Q
-less the least Q, absolute and in % of V* less its dead-end part: what a dead end costs is a parameter, and would hide
-everything else where it is likely.
+search with BEST_KNOWN simulations, within the certified bounds of each action; such instances are counted apart. The
+regret of a choice is its Q less the least Q, absolute and in % of V* less its dead-end part: what a dead end costs is a
+parameter, and would hide everything else where it is likely.
 
 Rows of earlier runs into the same folder are kept where the new run does not repeat them.
 
@@ -45,7 +45,7 @@ import matplotlib.pyplot as plt
 GOAL_PERCENT = 1.0
 
 BEST_KNOWN = 10_000
-"""Simulations with full optimism that stand in for the exact solution where that is out of reach."""
+"""Simulations that stand in for the exact solution where that is out of reach."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,8 @@ def truth_of(problem: PlanningProblem, cache: Path, seconds: float) -> Truth:
     except ProblemTooLargeError:
         bounds = bound_exact(problem, seconds=seconds)
         found = _long_search(problem, jax.random.key(0))
-        truth = Truth(np.asarray(found, np.float64), bounds.lower, bounds.upper, bounds.dead_end_part, False)
+        best_known = np.clip(np.asarray(found, np.float64), bounds.q_lower, bounds.q_upper)
+        truth = Truth(best_known, bounds.lower, bounds.upper, bounds.dead_end_part, False)
     cache.parent.mkdir(parents=True, exist_ok=True)
     np.savez(cache, digest=digest, seconds=seconds, **asdict(truth))
     return truth
@@ -132,7 +133,7 @@ def _fingerprint(problem: PlanningProblem) -> str:
 
 @jax.jit
 def _long_search(problem: PlanningProblem, key: Any) -> Any:
-    config = SearchConfig(simulations=BEST_KNOWN, optimism=1.0, max_depth=48)
+    config = SearchConfig(simulations=BEST_KNOWN, optimism=0.5, max_depth=48)
     return plan_actions(problem, key, config).q_values
 
 
