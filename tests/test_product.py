@@ -9,18 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from potlp_jax import Task
+from potlp_jax.planning.paths import shortest_path
 from potlp_jax.planning.portals import CAPACITY, find_active_cells, portals_pay
 from potlp_jax.planning.product import (
-    DIAGONAL,
     LANES,
-    Wildcard,
     distance_table,
     grid_distances,
     one_letter_successors,
     product_distances,
     product_transitions,
-    shortest_path,
 )
+from potlp_jax.planning.sweeps import DIAGONAL, Wildcard
 from potlp_jax.task.task import TaskSizes
 from potlp_jax.types import NO_STATE
 from tests.reference import dijkstra

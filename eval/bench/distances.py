@@ -30,7 +30,8 @@ from scipy import ndimage
 from scipy.sparse.csgraph import dijkstra
 
 from potlp_jax.environments.rooms import Rooms, RoomsConfig
-from potlp_jax.planning.product import NEIGHBOURS, distance_table, product_distances, product_transitions
+from potlp_jax.planning.product import distance_table, product_distances, product_transitions
+from potlp_jax.planning.sweeps import NEIGHBOURS
 from potlp_jax.task.task import Task
 
 TASKS = {1: "1", 4: "F a & F b", 8: "F a & F b & F c"}

@@ -21,19 +21,18 @@ from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
 from potlp_jax.planning.estimates import Estimates, Estimator
 from potlp_jax.planning.history import ActionTerms, action_terms, initial_history
+from potlp_jax.planning.paths import KnownPath, shortest_path
 from potlp_jax.planning.pouct import Plan, plan_actions
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.product import (
-    KnownPath,
-    Wildcard,
     distance_table,
     grid_distances,
     one_letter_successors,
     product_distances,
     product_transitions,
-    shortest_path,
 )
 from potlp_jax.planning.search_graph import SearchConfig
+from potlp_jax.planning.sweeps import Wildcard
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_ACTION, NO_STATE, Status, status_array, status_if
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals

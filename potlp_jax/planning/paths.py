@@ -1,0 +1,102 @@
+"""Shortest paths through the product automaton, walked back from their targets along known distances."""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float32, Int32
+
+from potlp_jax.planning.sweeps import DIAGONAL, NEIGHBOURS, Wildcard
+
+
+@struct.dataclass(kw_only=True)
+class KnownPath:
+    """The beginning of a shortest path through known space.
+
+    ``cells[i]`` and ``states[i]`` for ``i <= length`` are the product states after ``i`` moves, the source included;
+    later entries repeat the last one. ``length`` counts the moves held here, at most K; ``cost`` is that of the whole
+    path to its target, ``inf`` (and ``length`` 0) where the target is out of reach.
+    """
+
+    cells: Int32[Array, "*batch K1 2"]
+    states: Int32[Array, "*batch K1"]
+    length: Int32[Array, "*batch"]
+    cost: Float32[Array, "*batch"]
+
+
+def shortest_path(
+    distances: Float32[Array, "H W Z"],
+    transitions: Int32[Array, "H W Z"],
+    free: Bool[Array, "H W"],
+    source_cell: Int32[Array, "2"],
+    source_state: Int32[Array, ""],
+    target_cell: Int32[Array, "2"],
+    target_state: Int32[Array, ""],
+    *,
+    horizon: int,
+    resolution: Float32[Array, ""],
+    wildcard: Wildcard | None = None,
+) -> KnownPath:
+    """First ``horizon`` moves of a shortest path, walked back from the target along ``distances`` from the source.
+
+    Ties between predecessors break by the order of ``NEIGHBOURS``, then by the lowest state.
+    """
+    cost = distances[target_cell[0], target_cell[1], target_state]
+    reachable = jnp.isfinite(cost)
+    predecessor = _Predecessor(distances, transitions, free, resolution, wildcard)
+    ring = horizon + 1
+
+    # The ring keeps the last entries written, which are those nearest the source.
+    def walk(carry):
+        count, cell, state, cells, states = carry
+        cell, state = predecessor(cell, state)
+        count = count + 1
+        slot = count % ring
+        return count, cell, state, cells.at[slot].set(cell), states.at[slot].set(state)
+
+    def unfinished(carry):
+        _, cell, state, _, _ = carry
+        return reachable & ~(jnp.all(cell == source_cell) & (state == source_state))
+
+    cells = jnp.broadcast_to(jnp.where(reachable, target_cell, source_cell)[None, :], (ring, 2))
+    states = jnp.broadcast_to(jnp.where(reachable, target_state, source_state)[None], (ring,))
+    start = (jnp.int32(0), target_cell, target_state, cells, states)
+    count, _, _, cells, states = jax.lax.while_loop(unfinished, walk, start)
+    length = jnp.minimum(count, horizon)
+    order = (count - jnp.minimum(jnp.arange(ring, dtype=jnp.int32), length)) % ring
+    return KnownPath(cells=cells[order], states=states[order], length=length, cost=cost)
+
+
+class _Predecessor:
+    """Finds the product state from which a shortest path enters a given one."""
+
+    def __init__(
+        self,
+        distances: Float32[Array, "H W Z"],
+        transitions: Int32[Array, "H W Z"],
+        free: Bool[Array, "H W"],
+        resolution: Float32[Array, ""],
+        wildcard: Wildcard | None,
+    ) -> None:
+        margin = ((1, 1), (1, 1))
+        self.distances = jnp.pad(distances, (*margin, (0, 0)), constant_values=jnp.inf)
+        self.free = jnp.pad(free, margin, constant_values=False)
+        self.transitions = transitions
+        self.wildcard = wildcard
+        self.offsets = jnp.asarray(NEIGHBOURS, jnp.int32)
+        lengths = [1.0 if 0 in offset else DIAGONAL for offset in NEIGHBOURS]
+        self.steps = jnp.asarray(lengths, jnp.float32) * resolution
+
+    def __call__(self, cell: Int32[Array, "2"], state: Int32[Array, ""]) -> tuple[Int32[Array, "2"], Int32[Array, ""]]:
+        states = self.transitions.shape[2]
+        leads = self.transitions[cell[0], cell[1]] == state
+        if self.wildcard is not None:
+            chosen = self.wildcard.successors[:, state] | (jnp.arange(states) == state)
+            leads = leads | (self.wildcard.cells[cell[0], cell[1]] & chosen)
+        neighbours = cell[None, :] + self.offsets + 1
+        beside = (
+            self.free[neighbours[:, 0], cell[1] + 1] & self.free[cell[0] + 1, neighbours[:, 1]]
+        )  # for a straight move one of the two is the neighbour, the other the cell itself
+        cost = self.distances[neighbours[:, 0], neighbours[:, 1]] + self.steps[:, None]
+        cost = jnp.where(beside[:, None] & leads[None, :], cost, jnp.inf)
+        best = jnp.argmin(cost.reshape(-1)).astype(jnp.int32)
+        return neighbours[best // states] - 1, best % states
