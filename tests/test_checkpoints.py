@@ -8,16 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from potlp_jax.learning import checkpoints
-from potlp_jax.learning.checkpoints import (
-    CheckpointError,
-    checkpoint_steps,
-    load_checkpoint,
-    load_estimator,
-    require_propositions,
-    save_checkpoint,
-    save_estimator,
-)
+from potlp_jax.learning import estimator_files
+from potlp_jax.learning.checkpoints import checkpoint_steps, load_checkpoint, save_checkpoint
+from potlp_jax.learning.estimator_files import CheckpointError, load_estimator, require_propositions, save_estimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 
 CONFIG = NetworkConfig(
@@ -161,14 +154,14 @@ def test_an_estimator_of_another_format_or_network_is_refused_by_name(tmp_path, 
     save_estimator(path, params, wider, {})
     with pytest.raises(CheckpointError, match=r"array\.second\.Dense_4\.bias is float32\[4\].*float32\[5\]"):
         load_estimator(path)
-    monkeypatch.setattr(checkpoints, "ESTIMATOR_FORMAT", "potlp-estimator-99")
+    monkeypatch.setattr(estimator_files, "ESTIMATOR_FORMAT", "potlp-estimator-99")
     save_estimator(path, params, CONFIG, {})
     monkeypatch.undo()
     with pytest.raises(CheckpointError, match="'potlp-estimator-99'"):
         load_estimator(path)
     with np.load(path) as file:
         arrays = {name: file[name] for name in file.files if name != "header"}
-    header = {"format": checkpoints.ESTIMATOR_FORMAT, "network": {"propositions": ["a"]}, "metadata": {}}
+    header = {"format": estimator_files.ESTIMATOR_FORMAT, "network": {"propositions": ["a"]}, "metadata": {}}
     np.savez(path, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
     with pytest.raises(CheckpointError, match="image_shape"):
         load_estimator(path)

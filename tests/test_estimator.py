@@ -10,8 +10,8 @@ import pytest
 
 from potlp_jax.environments import make
 from potlp_jax.environments.splits import world_key
-from potlp_jax.learning.checkpoints import CheckpointError, save_estimator
 from potlp_jax.learning.estimator import estimator_for, look, read_estimator, shipped_estimator
+from potlp_jax.learning.estimator_files import CheckpointError, save_estimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.policies import Policy
 from potlp_jax.records import load_trial

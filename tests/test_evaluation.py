@@ -16,8 +16,8 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from potlp_jax.cli import app
-from potlp_jax.learning.checkpoints import CheckpointError, save_estimator
 from potlp_jax.learning.dataset import DatasetMetadata, Samples, decode, encode, view_id, write_shard
+from potlp_jax.learning.estimator_files import CheckpointError, save_estimator
 from potlp_jax.learning.evaluation import (
     BINS,
     DISTANCE_BANDS,

@@ -58,10 +58,16 @@ def test_a_room_imports_only_from_rooms_above(path):
 
 def test_only_one_module_imports_each_heavy_neighbour():
     # Spot is imported where formulas become automata, typer by the command line alone.
-    for library, rooms in {"spot": {"task"}, "typer": {"cli"}, "matplotlib": {"view"}, "orbax": {"learning"}}.items():
+    for library, rooms in {"spot": {"task"}, "typer": {"cli"}, "matplotlib": {"view"}}.items():
         users = {
             path.relative_to(PACKAGE).with_suffix("").parts[0]
             for path in SOURCES
             if any(module.split(".")[0] == library for module in _imports(path))
         }
         assert users <= rooms, f"{library} is imported by {users - rooms}"
+
+
+def test_one_module_imports_orbax_and_one_the_modules_of_flax():
+    for prefix, module in {"orbax": "learning/checkpoints.py", "flax.linen": "learning/network.py"}.items():
+        users = [path for path in SOURCES if any(f"{name}.".startswith(f"{prefix}.") for name in _imports(path))]
+        assert [str(path.relative_to(PACKAGE)) for path in users] == [module]

@@ -297,7 +297,7 @@ def dataset_metadata(generator: Generator, environment: str, split: Split, confi
     return DatasetMetadata(
         propositions=generator.propositions,
         environment=environment,
-        generator=json.loads(json.dumps(dataclasses.asdict(getattr(generator, "config")), default=str)),  # noqa: B009
+        generator=json.loads(json.dumps(dataclasses.asdict(generator.config), default=str)),
         split=split.value,
         camera=camera,
         disturbance=disturbance,

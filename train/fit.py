@@ -29,20 +29,12 @@ import matplotlib.pyplot as plt
 from tensorboardX import SummaryWriter
 from tqdm import tqdm
 
-from potlp_jax.learning.checkpoints import CheckpointError, save_estimator
+from potlp_jax.learning.batches import TrainingError
 from potlp_jax.learning.dataset import DatasetError, Samples, decode, read_dataset
+from potlp_jax.learning.estimator_files import CheckpointError, save_estimator
+from potlp_jax.learning.loss import DataScale, network_config
 from potlp_jax.learning.network import EstimatorNetwork, NetworkError, operation_counts, parameter_count
-from potlp_jax.learning.training import (
-    DataScale,
-    Progress,
-    Trained,
-    TrainingConfig,
-    TrainingError,
-    network_config,
-    seconds_per_step,
-    steps_per_epoch,
-    train,
-)
+from potlp_jax.learning.training import Progress, Trained, TrainingConfig, seconds_per_step, steps_per_epoch, train
 
 # Of the time asked for: what validation, checkpoints and a busy machine may take.
 _RESERVE = 0.1

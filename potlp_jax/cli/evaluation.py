@@ -9,8 +9,9 @@ from rich.console import Console
 from potlp_jax.cli.estimator import finite
 from potlp_jax.cli.output import console, fail, note, output_folder, print_json, progress_bar, to_json
 from potlp_jax.environments.splits import Split
-from potlp_jax.learning.checkpoints import CheckpointError, load_estimator
+from potlp_jax.learning.batches import TrainingError
 from potlp_jax.learning.dataset import DatasetError, Samples, read_dataset
+from potlp_jax.learning.estimator_files import CheckpointError, load_estimator
 from potlp_jax.learning.evaluation import (
     ABLATIONS,
     INTACT,
@@ -26,7 +27,6 @@ from potlp_jax.learning.evaluation import (
     prior_of,
 )
 from potlp_jax.learning.network import EstimatorNetwork, NetworkError, Params
-from potlp_jax.learning.training import TrainingError
 from potlp_jax.view.estimator import (
     VARIANTS,
     ablation_table,

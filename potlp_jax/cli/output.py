@@ -74,7 +74,7 @@ def clear_errors(command: Callable[..., None]) -> Callable[..., None]:
 def _input_errors() -> tuple[type[Exception], ...]:
     """The errors that say what is wrong with an input; any other is a fault of the program and keeps its traceback."""
     from potlp_jax.environments.map_server import MapError
-    from potlp_jax.learning.checkpoints import CheckpointError
+    from potlp_jax.learning.estimator_files import CheckpointError
     from potlp_jax.records import RecordError
     from potlp_jax.task.formula import TaskError
     from potlp_jax.view.style import PictureError

@@ -1,7 +1,7 @@
 """What every family of worlds offers."""
 
 from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -17,11 +17,15 @@ class Generator(Protocol):
     Attributes:
         name: the family's name; it also separates the families' seeds.
         propositions: bit ``i`` of every letter of the family is ``propositions[i]``.
+        config: the parameters of the worlds, a frozen dataclass.
         tasks: formulas that belong to the family, by the number (or name) used on the command line.
     """
 
     @property
     def name(self) -> str: ...
+
+    @property
+    def config(self) -> Any: ...
 
     @property
     def propositions(self) -> tuple[str, ...]: ...

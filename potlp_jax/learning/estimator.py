@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float32, Int32, UInt8
 
-from potlp_jax.learning.checkpoints import CheckpointError, load_estimator, require_propositions
+from potlp_jax.learning.estimator_files import CheckpointError, load_estimator, require_propositions
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
 from potlp_jax.learning.views import Views, look_of_subgoals, no_views, places_of_looks, remember
 from potlp_jax.planning.estimates import Estimates

@@ -27,10 +27,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int8, Int64
 
-from potlp_jax.learning.checkpoints import require_propositions
+from potlp_jax.learning.batches import Batch, Batches, batch_answers
 from potlp_jax.learning.dataset import Samples, decode, encode
+from potlp_jax.learning.estimator_files import require_propositions
 from potlp_jax.learning.network import Answers, EstimatorNetwork, NetworkConfig, Params
-from potlp_jax.learning.training import Batch, Batches, batch_answers
 
 BINS: int = 10
 

@@ -1,29 +1,14 @@
-"""Training of the estimator: the loss, one pure step, and a loop that can be killed at any time.
-
-**Loss** (Stein, Bradley and Roy 2018, as Bradley et al. 2021 use it). For a sample with label y = P_S, predicted p, and
-weights w_S (what it costs to miss the success) and w_F (what a failure taken costs),
-
-    cross-entropy  -[y w_S log p + (1 - y) w_F log(1 - p)]
-    success cost   y (R_S - predicted R_S)^2 / success_cost_scale^2
-    failure cost   (1 - y) (R_F - predicted R_F)^2 / failure_cost_scale^2
-
-averaged over samples and summed, the last two times ``cost_share``. The scales are the standard deviations over the
-training data and stay in ``NetworkConfig``. The weights are divided by their mean over the training data. Weights that
-differ between successes and failures move p away from the frequency of success: p / (1 - p) is multiplied by w_S / w_F.
-``TrainingConfig.weighting`` mixes them with 1: at 1 the loss is the paper's, at 0 p is calibrated.
+"""Training of the estimator: one pure step, and a loop that can be killed at any time.
 
 **Order.** The batch of a step depends on (seed, step) alone: every epoch has its own permutation of the views and its
 own choice of samples. Augmentation depends on (key, step). So a training that is resumed from a checkpoint does what it
 would have done, bit for bit, on the same machine and versions.
-
-A batch is grouped: some panoramas, and several samples of each, so that the first stage runs once per panorama.
 """
 
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -33,17 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import struct
-from jaxtyping import Array, Bool, Float32, Int8, Int32, PRNGKeyArray, UInt8, UInt32
+from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
+from potlp_jax.learning.batches import Batch, Batches, TrainingError, batch_answers, prefetched
 from potlp_jax.learning.checkpoints import checkpoint_steps, load_checkpoint, save_checkpoint
-from potlp_jax.learning.dataset import Samples, decode
-from potlp_jax.learning.network import Answers, EstimatorNetwork, NetworkConfig, Params
-
-_PREFETCHED = 4
-
-
-class TrainingError(ValueError):
-    """The data cannot be trained on, or training has diverged; the message says what to do."""
+from potlp_jax.learning.dataset import Samples
+from potlp_jax.learning.loss import DataScale, Evaluation, Sums, evaluation_of, loss_sums, total_loss
+from potlp_jax.learning.network import EstimatorNetwork, Params
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,43 +76,6 @@ class TrainingConfig:
 
 
 @struct.dataclass(kw_only=True)
-class Batch:
-    """``G`` panoramas with ``K`` samples each; ``mask`` is True where a sample is real."""
-
-    images: UInt8[Array, "G rows columns 3"]
-    bearing: Float32[Array, "G K"]
-    distance: Float32[Array, "G K"]
-    phi_stay: Int8[Array, "G K P"]
-    phi_go: Int8[Array, "G K P"]
-    success: Float32[Array, "G K"]
-    """The true P_S."""
-    success_cost: Float32[Array, "G K"]
-    """The true R_S; NaN where P_S = 0."""
-    failure_cost: Float32[Array, "G K"]
-    """The true R_F; may be NaN where it is not known."""
-    success_weight: Float32[Array, "G K"]
-    failure_weight: Float32[Array, "G K"]
-    mask: Bool[Array, "G K"]
-
-
-@struct.dataclass(kw_only=True)
-class Sums:
-    """Sums over samples, from which losses and scores follow; sums of several batches add up."""
-
-    count: Float32[Array, ""]
-    cross_entropy: Float32[Array, ""]
-    """Weighted."""
-    success_error: Float32[Array, ""]
-    """Squared, in squared scales."""
-    failure_error: Float32[Array, ""]
-    successes: Float32[Array, ""]
-    failures: Float32[Array, ""]
-    brier: Float32[Array, ""]
-    prior_brier: Float32[Array, ""]
-    """Of the constant answer: the mean P_S of the training data."""
-
-
-@struct.dataclass(kw_only=True)
 class TrainState:
     """Everything that the rest of a training depends on."""
 
@@ -150,45 +94,6 @@ class TrainState:
     evaluations_since_best: Int32[Array, ""]
     sums: Sums
     """Of the training batches since the last evaluation."""
-
-
-@dataclasses.dataclass(frozen=True)
-class DataScale:
-    """Figures of the training data that the loss and the scores use.
-
-    Attributes:
-        mean_weight: mean over samples of the weight of what happened.
-        prior: mean P_S, the constant answer that the Brier skill compares with.
-    """
-
-    mean_weight: float
-    prior: float
-
-    @classmethod
-    def of(cls, samples: Samples) -> "DataScale":
-        """The figures of these samples. Raises TrainingError where there are none."""
-        if not len(samples.success):
-            raise TrainingError("the data set has no samples")
-        weight = samples.success * samples.success_weight + (1 - samples.success) * samples.failure_weight
-        return cls(float(np.mean(weight, dtype=np.float64)), float(np.mean(samples.success, dtype=np.float64)))
-
-
-@dataclasses.dataclass(frozen=True)
-class Evaluation:
-    """Scores over samples; losses as in this module's docstring, costs' errors in the unit of cost.
-
-    ``skill`` is ``1 - brier / brier of the constant prior``. Errors of a label that does not occur are NaN.
-    """
-
-    samples: int
-    loss: float
-    cross_entropy: float
-    success_loss: float
-    failure_loss: float
-    brier: float
-    skill: float
-    success_rmse: float
-    failure_rmse: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,88 +123,6 @@ class Trained:
     seconds: float
 
 
-def network_config(samples: Samples, image_shape: tuple[int, int]) -> NetworkConfig:
-    """A network for these samples: their propositions, and normalisers from their distances and costs."""
-    step = float(samples.metadata.resolution)
-    succeeded, failed = samples.success > 0, (samples.success < 1) & np.isfinite(samples.failure_cost)
-    return NetworkConfig(
-        propositions=tuple(samples.metadata.propositions),
-        image_shape=image_shape,
-        distance_scale=_spread(samples.distance, step),
-        success_cost_scale=_spread(samples.success_cost[succeeded], step),
-        failure_cost_scale=_spread(samples.failure_cost[failed], step),
-        step=step,
-    )
-
-
-def _spread(values: np.ndarray, least: float) -> float:
-    """Standard deviation, at least ``least``."""
-    return max(float(np.std(values, dtype=np.float64)), least) if len(values) else least
-
-
-def loss_sums(answers: Answers, batch: Batch, config: NetworkConfig, scale: DataScale, weighting: float) -> Sums:
-    """The sums over a batch; padding and costs that are not known count nothing."""
-    real = batch.mask.astype(jnp.float32)
-    success = jnp.where(batch.mask, batch.success, jnp.float32(0))
-    mean = jnp.float32(scale.mean_weight)
-    of_success = weighting * jnp.where(batch.mask, batch.success_weight, jnp.float32(0)) / mean + (1 - weighting)
-    of_failure = weighting * jnp.where(batch.mask, batch.failure_weight, jnp.float32(0)) / mean + (1 - weighting)
-    # softplus(-x) = -log sigmoid(x) and softplus(x) = -log(1 - sigmoid(x)), without overflow.
-    missed = success * of_success * jax.nn.softplus(-answers.success_logit)
-    taken = (1 - success) * of_failure * jax.nn.softplus(answers.success_logit)
-    probability = answers.success_probability
-    known_success = batch.mask & (success > 0) & jnp.isfinite(batch.success_cost)
-    known_failure = batch.mask & (success < 1) & jnp.isfinite(batch.failure_cost)
-    return Sums(
-        count=jnp.sum(real),
-        cross_entropy=jnp.sum(real * (missed + taken)),
-        success_error=_squared_errors(
-            answers.success_cost, batch.success_cost, known_success, success, config.success_cost_scale
-        ),
-        failure_error=_squared_errors(
-            answers.failure_cost, batch.failure_cost, known_failure, 1 - success, config.failure_cost_scale
-        ),
-        successes=jnp.sum(jnp.where(known_success, success, jnp.float32(0))),
-        failures=jnp.sum(jnp.where(known_failure, 1 - success, jnp.float32(0))),
-        brier=jnp.sum(real * (probability - success) ** 2),
-        prior_brier=jnp.sum(real * (jnp.float32(scale.prior) - success) ** 2),
-    )
-
-
-def _squared_errors(predicted: Array, true: Array, known: Array, share: Array, scale: float) -> Array:
-    # The label is replaced before the subtraction: a NaN behind `where` would still make the gradient NaN.
-    error = (predicted - jnp.where(known, true, jnp.float32(0))) / jnp.float32(scale)
-    return jnp.sum(jnp.where(known, share * error**2, jnp.float32(0)))
-
-
-def total_loss(sums: Sums, cost_share: float) -> Float32[Array, ""]:
-    """The loss that is minimised: all terms per sample."""
-    return (sums.cross_entropy + cost_share * (sums.success_error + sums.failure_error)) / jnp.maximum(
-        sums.count, jnp.float32(1)
-    )
-
-
-def evaluation_of(sums: Sums, config: NetworkConfig, cost_share: float) -> Evaluation:
-    """The scores that follow from sums."""
-    figures = {field.name: float(getattr(sums, field.name)) for field in dataclasses.fields(sums)}
-    count = max(figures["count"], 1.0)
-
-    def rmse(error: float, number: float, scale: float) -> float:
-        return scale * (error / number) ** 0.5 if number > 0 else float("nan")
-
-    return Evaluation(
-        samples=int(figures["count"]),
-        loss=float(total_loss(sums, cost_share)),
-        cross_entropy=figures["cross_entropy"] / count,
-        success_loss=figures["success_error"] / count,
-        failure_loss=figures["failure_error"] / count,
-        brier=figures["brier"] / count,
-        skill=1 - figures["brier"] / figures["prior_brier"] if figures["prior_brier"] > 0 else float("nan"),
-        success_rmse=rmse(figures["success_error"], figures["successes"], config.success_cost_scale),
-        failure_rmse=rmse(figures["failure_error"], figures["failures"], config.failure_cost_scale),
-    )
-
-
 def augment(
     batch: Batch, key: PRNGKeyArray, config: TrainingConfig
 ) -> tuple[Float32[Array, "G rows columns 3"], Float32[Array, "G K"]]:
@@ -319,20 +142,6 @@ def augment(
         gain = gain + config.colour * jax.random.normal(of_colour, (views, 1, 1, 3))
         pixels = jnp.clip(pixels * jnp.exp(gain), 0, 1)
     return pixels, bearing
-
-
-def batch_answers(
-    network: EstimatorNetwork,
-    params: Params,
-    pixels: Float32[Array, "G rows columns 3"],
-    bearing: Float32[Array, "G K"],
-    batch: Batch,
-) -> Answers:
-    """The network's answers for a batch: the first stage once per panorama."""
-    features = network.encode_pixels(params, pixels)
-    repeated = jnp.broadcast_to(features[:, None], (*bearing.shape, *features.shape[1:]))
-    centred, residual = network.centre(repeated, bearing)
-    return network.answer(params, centred, residual, batch.distance, batch.phi_stay, batch.phi_go)
 
 
 def learning_rate_schedule(config: TrainingConfig) -> optax.Schedule:
@@ -427,85 +236,6 @@ def make_evaluate_step(
         return loss_sums(answers, batch, network.config, scale, weighting)
 
     return evaluate_step
-
-
-class Batches:
-    """The batches of a data set, each a function of its number.
-
-    Args:
-        samples: the data; views without samples are never drawn.
-        views, samples_per_view: shape of a batch.
-        seed: of the order.
-    """
-
-    def __init__(self, samples: Samples, views: int, samples_per_view: int, seed: int) -> None:
-        if not len(samples.view_of):
-            raise TrainingError("the data set has no samples")
-        self._samples = samples
-        self._seed = seed
-        self._order = np.argsort(samples.view_of, kind="stable")
-        self._views, first, counts = np.unique(samples.view_of[self._order], return_index=True, return_counts=True)
-        self._members = [self._order[start : start + count] for start, count in zip(first, counts, strict=True)]
-        self.views = min(views, len(self._views))
-        self.samples_per_view = samples_per_view
-        self.per_epoch = len(self._views) // self.views
-        self._permutation = functools.lru_cache(2)(
-            lambda epoch: np.random.default_rng((seed, epoch)).permutation(len(self._views))
-        )
-
-    def training_batch(self, step: int) -> Batch:
-        """The batch of this step; an epoch's last views that fill no batch are left out of that epoch."""
-        epoch, index = divmod(step, self.per_epoch)
-        chosen = self._permutation(epoch)[index * self.views : (index + 1) * self.views]
-        return self._batch([(view, self._choice(epoch, view)) for view in chosen.tolist()])
-
-    def evaluation_batches(self) -> Iterator[Batch]:
-        """Every sample once, in a fixed order; a view with many samples comes several times."""
-        size = self.samples_per_view
-        groups = [
-            (view, members[start : start + size])
-            for view, members in enumerate(self._members)
-            for start in range(0, len(members), size)
-        ]
-        blocks = [groups[start : start + self.views] for start in range(0, len(groups), self.views)]
-        return prefetched(lambda index: self._batch(blocks[index]), 0, len(blocks))
-
-    def _choice(self, epoch: int, view: int) -> Int32[np.ndarray, " k"] | np.ndarray:
-        members = self._members[view]
-        if len(members) <= self.samples_per_view:
-            return members
-        random = np.random.default_rng((self._seed, epoch, view, 1))
-        return random.choice(members, self.samples_per_view, replace=False)
-
-    def _batch(self, groups: list[tuple[int, np.ndarray]]) -> Batch:
-        index = np.zeros((self.views, self.samples_per_view), np.int64)
-        mask = np.zeros(index.shape, bool)
-        for row, (_, members) in enumerate(groups):
-            index[row, : len(members)] = members
-            mask[row, : len(members)] = True
-        images = [decode(self._samples.images[self._views[view]]) for view, _ in groups]
-        images += [np.zeros_like(images[0])] * (self.views - len(groups))
-        columns = {
-            name: jnp.asarray(getattr(self._samples, name)[index])
-            for name in Batch.__dataclass_fields__
-            if name not in ("images", "mask")
-        }
-        return Batch(images=jnp.asarray(np.stack(images)), mask=jnp.asarray(mask), **columns)
-
-
-def prefetched(make: Callable[[int], Batch], start: int, stop: int) -> Iterator[Batch]:
-    """``make(start)``, ..., ``make(stop - 1)`` in this order, made a few ahead in another thread."""
-    with ThreadPoolExecutor(1, thread_name_prefix="decode") as pool:
-        pending = [pool.submit(make, number) for number in range(start, min(start + _PREFETCHED, stop))]
-        try:
-            for number in range(start, stop):
-                batch = pending.pop(0).result()
-                if number + _PREFETCHED < stop:
-                    pending.append(pool.submit(make, number + _PREFETCHED))
-                yield batch
-        finally:
-            for future in pending:
-                future.cancel()
 
 
 def check_data(training: Samples, validation: Samples) -> None:

@@ -1,0 +1,164 @@
+"""The loss of the estimator (Stein, Bradley and Roy 2018, as Bradley et al. 2021 use it).
+
+For a sample with label y = P_S, predicted p, and weights w_S (what it costs to miss the success) and w_F (what a
+failure taken costs),
+
+    cross-entropy  -[y w_S log p + (1 - y) w_F log(1 - p)]
+    success cost   y (R_S - predicted R_S)^2 / success_cost_scale^2
+    failure cost   (1 - y) (R_F - predicted R_F)^2 / failure_cost_scale^2
+
+averaged over samples and summed, the last two times ``cost_share``. The scales are the standard deviations over the
+training data and stay in ``NetworkConfig``. The weights are divided by their mean over the training data. Weights that
+differ between successes and failures move p away from the frequency of success: p / (1 - p) is multiplied by w_S / w_F.
+``TrainingConfig.weighting`` mixes them with 1: at 1 the loss is the paper's, at 0 p is calibrated.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float32
+
+from potlp_jax.learning.batches import Batch, TrainingError
+from potlp_jax.learning.dataset import Samples
+from potlp_jax.learning.network import Answers, NetworkConfig
+
+
+@struct.dataclass(kw_only=True)
+class Sums:
+    """Sums over samples, from which losses and scores follow; sums of several batches add up."""
+
+    count: Float32[Array, ""]
+    cross_entropy: Float32[Array, ""]
+    """Weighted."""
+    success_error: Float32[Array, ""]
+    """Squared, in squared scales."""
+    failure_error: Float32[Array, ""]
+    successes: Float32[Array, ""]
+    failures: Float32[Array, ""]
+    brier: Float32[Array, ""]
+    prior_brier: Float32[Array, ""]
+    """Of the constant answer: the mean P_S of the training data."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DataScale:
+    """Figures of the training data that the loss and the scores use.
+
+    Attributes:
+        mean_weight: mean over samples of the weight of what happened.
+        prior: mean P_S, the constant answer that the Brier skill compares with.
+    """
+
+    mean_weight: float
+    prior: float
+
+    @classmethod
+    def of(cls, samples: Samples) -> "DataScale":
+        """The figures of these samples. Raises TrainingError where there are none."""
+        if not len(samples.success):
+            raise TrainingError("the data set has no samples")
+        weight = samples.success * samples.success_weight + (1 - samples.success) * samples.failure_weight
+        return cls(float(np.mean(weight, dtype=np.float64)), float(np.mean(samples.success, dtype=np.float64)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """Scores over samples; losses as in this module's docstring, costs' errors in the unit of cost.
+
+    ``skill`` is ``1 - brier / brier of the constant prior``. Errors of a label that does not occur are NaN.
+    """
+
+    samples: int
+    loss: float
+    cross_entropy: float
+    success_loss: float
+    failure_loss: float
+    brier: float
+    skill: float
+    success_rmse: float
+    failure_rmse: float
+
+
+def network_config(samples: Samples, image_shape: tuple[int, int]) -> NetworkConfig:
+    """A network for these samples: their propositions, and normalisers from their distances and costs."""
+    step = float(samples.metadata.resolution)
+    succeeded, failed = samples.success > 0, (samples.success < 1) & np.isfinite(samples.failure_cost)
+    return NetworkConfig(
+        propositions=tuple(samples.metadata.propositions),
+        image_shape=image_shape,
+        distance_scale=_spread(samples.distance, step),
+        success_cost_scale=_spread(samples.success_cost[succeeded], step),
+        failure_cost_scale=_spread(samples.failure_cost[failed], step),
+        step=step,
+    )
+
+
+def _spread(values: np.ndarray, least: float) -> float:
+    """Standard deviation, at least ``least``."""
+    return max(float(np.std(values, dtype=np.float64)), least) if len(values) else least
+
+
+def loss_sums(answers: Answers, batch: Batch, config: NetworkConfig, scale: DataScale, weighting: float) -> Sums:
+    """The sums over a batch; padding and costs that are not known count nothing."""
+    real = batch.mask.astype(jnp.float32)
+    success = jnp.where(batch.mask, batch.success, jnp.float32(0))
+    mean = jnp.float32(scale.mean_weight)
+    of_success = weighting * jnp.where(batch.mask, batch.success_weight, jnp.float32(0)) / mean + (1 - weighting)
+    of_failure = weighting * jnp.where(batch.mask, batch.failure_weight, jnp.float32(0)) / mean + (1 - weighting)
+    # softplus(-x) = -log sigmoid(x) and softplus(x) = -log(1 - sigmoid(x)), without overflow.
+    missed = success * of_success * jax.nn.softplus(-answers.success_logit)
+    taken = (1 - success) * of_failure * jax.nn.softplus(answers.success_logit)
+    probability = answers.success_probability
+    known_success = batch.mask & (success > 0) & jnp.isfinite(batch.success_cost)
+    known_failure = batch.mask & (success < 1) & jnp.isfinite(batch.failure_cost)
+    return Sums(
+        count=jnp.sum(real),
+        cross_entropy=jnp.sum(real * (missed + taken)),
+        success_error=_squared_errors(
+            answers.success_cost, batch.success_cost, known_success, success, config.success_cost_scale
+        ),
+        failure_error=_squared_errors(
+            answers.failure_cost, batch.failure_cost, known_failure, 1 - success, config.failure_cost_scale
+        ),
+        successes=jnp.sum(jnp.where(known_success, success, jnp.float32(0))),
+        failures=jnp.sum(jnp.where(known_failure, 1 - success, jnp.float32(0))),
+        brier=jnp.sum(real * (probability - success) ** 2),
+        prior_brier=jnp.sum(real * (jnp.float32(scale.prior) - success) ** 2),
+    )
+
+
+def _squared_errors(predicted: Array, true: Array, known: Array, share: Array, scale: float) -> Array:
+    # The label is replaced before the subtraction: a NaN behind `where` would still make the gradient NaN.
+    error = (predicted - jnp.where(known, true, jnp.float32(0))) / jnp.float32(scale)
+    return jnp.sum(jnp.where(known, share * error**2, jnp.float32(0)))
+
+
+def total_loss(sums: Sums, cost_share: float) -> Float32[Array, ""]:
+    """The loss that is minimised: all terms per sample."""
+    return (sums.cross_entropy + cost_share * (sums.success_error + sums.failure_error)) / jnp.maximum(
+        sums.count, jnp.float32(1)
+    )
+
+
+def evaluation_of(sums: Sums, config: NetworkConfig, cost_share: float) -> Evaluation:
+    """The scores that follow from sums."""
+    figures = {field.name: float(getattr(sums, field.name)) for field in dataclasses.fields(sums)}
+    count = max(figures["count"], 1.0)
+
+    def rmse(error: float, number: float, scale: float) -> float:
+        return scale * (error / number) ** 0.5 if number > 0 else float("nan")
+
+    return Evaluation(
+        samples=int(figures["count"]),
+        loss=float(total_loss(sums, cost_share)),
+        cross_entropy=figures["cross_entropy"] / count,
+        success_loss=figures["success_error"] / count,
+        failure_loss=figures["failure_error"] / count,
+        brier=figures["brier"] / count,
+        skill=1 - figures["brier"] / figures["prior_brier"] if figures["prior_brier"] > 0 else float("nan"),
+        success_rmse=rmse(figures["success_error"], figures["successes"], config.success_cost_scale),
+        failure_rmse=rmse(figures["failure_error"], figures["failures"], config.failure_cost_scale),
+    )
