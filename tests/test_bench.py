@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from potlp_jax.bench.looking import measure_looking
 from potlp_jax.bench.memory import tree_memory
 from potlp_jax.bench.planner import as_dict, make_scene, mean_depth, measure_decision, measure_distances
 from potlp_jax.bench.timing import Timing, compile_call, environment, measure, timed_runs
@@ -20,6 +21,8 @@ from potlp_jax.cache import SWITCH, cache_folder, enable_compilation_cache, mach
 from potlp_jax.cli import app
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.environments.toy import Toy
+from potlp_jax.learning.estimator import TrainedEstimator
+from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.families import family_problem
 from potlp_jax.planning.policies import DecisionConfig
 from potlp_jax.planning.pouct import search_tree
@@ -138,6 +141,31 @@ def test_phases_of_a_decision_and_distances(scene):
         assert json.loads(json.dumps(as_dict(row), allow_nan=False))["run_s"] > 0
 
 
+def test_phases_of_looking_and_asking(scene):
+    propositions = Toy().propositions
+    config = NetworkConfig(
+        propositions=propositions, first_widths=(4,) * 4, second_widths=(4,) * 8, dense_widths=(8,) * 4
+    )
+    params = EstimatorNetwork(config).init(jax.random.key(0))
+    trained = TrainedEstimator(params=params, config=config, metadata={}, name="tiny", digest="")
+    decision = DecisionConfig(frontiers=FrontierConfig(max_subgoals=2), search=QUICK)
+    rows = measure_looking(scene, trained, decision, repeats=1)
+    assert [row.phase for row in rows] == [
+        "render",
+        "first stage",
+        "remember",
+        "ways to subgoals",
+        "estimates",
+        "whole",
+    ]
+
+
+def test_looking_needs_an_estimator():
+    told = _potlp("bench", "--parts", "looking", "--environment", "toy", "--repeats", 1)
+    assert told.exit_code == 2
+    assert "no estimator is shipped" in told.stderr
+
+
 def test_environment_says_where_it_was_measured():
     told = environment()
     assert told["jax"] == jax.__version__
@@ -205,6 +233,8 @@ hits = []
 jax.monitoring.register_event_listener(lambda event, **_: hits.append(event.endswith("/cache_hits")))
 folder = enable_compilation_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+from potlp_jax.learning.estimator import TrainedEstimator
+from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.families import family_problem
 from potlp_jax.planning.pouct import plan_actions
 from potlp_jax.planning.search_graph import SearchConfig

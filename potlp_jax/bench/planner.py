@@ -156,7 +156,7 @@ def measure_distances(scene: Scene, sources: int, repeats: int) -> DistanceRow:
 
     ``reached`` is the share of product states that the average source reaches.
     """
-    world = _world_of(scene)
+    world = world_of(scene)
     known = BeliefMap.revealed(world)
     moves = product_transitions(scene.task, known.letters, known.free)
     # As in a decision: nothing is left to do after acceptance.
@@ -186,7 +186,8 @@ def _spread(mask: Bool[np.ndarray, "H W"], first: Int32[np.ndarray, "2"], count:
     return np.concatenate([first[None], cells[drawn]]).astype(np.int32)
 
 
-def _world_of(scene: Scene) -> World:
+def world_of(scene: Scene) -> World:
+    """The world that the scene is in. Raises ValueError where its estimator is not the true map's."""
     if not isinstance(scene.estimator, TrueMapEstimator):
         raise ValueError("the scene's estimator is not the true map's: there is no world to measure distances in")
     return scene.estimator.world
@@ -201,6 +202,21 @@ class PhaseRow:
     timing: Timing
 
 
+class Phases:
+    """Measures one phase after the other; each may be fed with what those before it returned."""
+
+    def __init__(self, repeats: int) -> None:
+        self.rows: list[PhaseRow] = []
+        self._repeats = repeats
+
+    def measure(self, name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Add a row for the phase and return what it computes."""
+        call = compile_call(function, *arguments)
+        timing = call.timing(self._repeats)
+        self.rows.append(PhaseRow(phase=name, per_s=1.0 / timing.run_s, timing=timing))
+        return call.run()
+
+
 def measure_decision(scene: Scene, config: DecisionConfig, repeats: int) -> list[PhaseRow]:
     """The phases of PO-TLP's decision in their order, each fed with the results of those before, then the whole.
 
@@ -211,15 +227,8 @@ def measure_decision(scene: Scene, config: DecisionConfig, repeats: int) -> list
     * path: the way to the target
     """
     key = jax.random.key(0)
-    rows: list[PhaseRow] = []
-
-    def phase(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        call = compile_call(function, *arguments)
-        timing = call.timing(repeats)
-        rows.append(PhaseRow(phase=name, per_s=1.0 / timing.run_s, timing=timing))
-        return call.run()
-
-    situation = phase(
+    phases = Phases(repeats)
+    situation = phases.measure(
         "assess",
         lambda belief, cell, state, task: assess(belief, cell, state, task, config.frontiers),
         scene.belief,
@@ -227,7 +236,7 @@ def measure_decision(scene: Scene, config: DecisionConfig, repeats: int) -> list
         scene.state,
         scene.task,
     )
-    estimates = phase(
+    estimates = phases.measure(
         "estimates",
         lambda estimator, belief, subgoals, task: estimator(belief, subgoals, task),
         scene.estimator,
@@ -235,10 +244,10 @@ def measure_decision(scene: Scene, config: DecisionConfig, repeats: int) -> list
         situation.subgoals,
         scene.task,
     )
-    problem = phase(
+    problem = phases.measure(
         "travel", lambda situation, estimates: planning_problem(situation, estimates, config), situation, estimates
     )
-    phase("search", lambda problem, key: plan_actions(problem, key, config.search), problem, key)
+    phases.measure("search", lambda problem, key: plan_actions(problem, key, config.search), problem, key)
 
     def whole(scene: Scene, key: Array) -> Move:
         return decide(
@@ -252,11 +261,10 @@ def measure_decision(scene: Scene, config: DecisionConfig, repeats: int) -> list
             config=config,
         )
 
-    call = compile_call(whole, scene, key)
-    timing, move = call.timing(repeats), call.run()
-    phase("path", lambda situation, move: _path(situation, move, config), situation, move)
-    rows.append(PhaseRow(phase="whole", per_s=1.0 / timing.run_s, timing=timing))
-    return rows
+    move = phases.measure("whole", whole, scene, key)
+    phases.measure("path", lambda situation, move: _path(situation, move, config), situation, move)
+    *parts, all_of_it, path = phases.rows
+    return [*parts, path, all_of_it]
 
 
 def _path(situation: Situation, move: Move, config: DecisionConfig) -> Any:

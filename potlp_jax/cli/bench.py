@@ -6,6 +6,7 @@ from typing import Any
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
+from potlp_jax.bench.looking import measure_looking
 from potlp_jax.bench.planner import (
     DistanceRow,
     PhaseRow,
@@ -22,10 +23,11 @@ from potlp_jax.bench.timing import environment as describe_environment
 from potlp_jax.cli.inputs import read_environment_task, trial_config
 from potlp_jax.cli.output import console, fail, package_version, print_json, progress_bar
 from potlp_jax.environments import make
+from potlp_jax.learning.estimator import estimator_for
 from potlp_jax.planning.families import FAMILIES
 from potlp_jax.planning.policies import DecisionConfig
 
-PARTS = ("search", "distances", "decision")
+PARTS = ("search", "distances", "decision", "looking")
 
 
 def run_bench(
@@ -37,6 +39,7 @@ def run_bench(
     environment: str,
     task_name: str,
     size: int,
+    world: int,
     sources: int,
     repeats: int,
     core: int | None,
@@ -54,11 +57,13 @@ def run_bench(
         bar = progress.add_task("compiling and measuring", total=None)
         if "search" in chosen:
             rows["search"] = [measure_search(family, subgoals, batch, decision.search, repeats) for batch in counts]
-        if "distances" in chosen or "decision" in chosen:
+        if set(chosen) - {"search"}:
             progress.update(bar, description="looking around in a world")
-            scene = _scene(environment, task_name, size)
+            generator = make(environment)
+            task = read_environment_task(generator, task_name)
+            scene = make_scene(make_world(environment, size, world), task)
             progress.update(bar, description="compiling and measuring")
-            rows |= _measure_scene(scene, chosen, decision, sources, repeats)
+            rows |= _measure_scene(scene, task.propositions, chosen, decision, sources, repeats)
     where = describe_environment()
     if json:
         print_json({"potlp_jax": package_version(), "environment": where, "rows": _plain(rows)})
@@ -67,20 +72,23 @@ def run_bench(
 
 
 def _measure_scene(
-    scene: Scene, chosen: list[str], decision: DecisionConfig, sources: int, repeats: int
+    scene: Scene,
+    propositions: tuple[str, ...],
+    chosen: list[str],
+    decision: DecisionConfig,
+    sources: int,
+    repeats: int,
 ) -> dict[str, list[Any]]:
     rows: dict[str, list[Any]] = {}
+    # First of all, so that a missing one is told before the long measurements.
+    trained = estimator_for(propositions) if "looking" in chosen else None
     if "distances" in chosen:
         rows["distances"] = [measure_distances(scene, sources, repeats)]
     if "decision" in chosen:
         rows["decision"] = measure_decision(scene, decision, repeats)
+    if trained is not None:
+        rows["looking"] = measure_looking(scene, trained, decision, repeats)
     return rows
-
-
-def _scene(environment: str, task_name: str, size: int) -> Scene:
-    generator = make(environment)
-    task = read_environment_task(generator, task_name)
-    return make_scene(make_world(environment, size), task)
 
 
 def _read_parts(text: str) -> list[str]:
@@ -126,7 +134,9 @@ def _print(rows: dict[str, list[Any]], where: dict[str, Any]) -> None:
     if "distances" in rows:
         out.print(_distance_table(rows["distances"]))
     if "decision" in rows:
-        out.print(_decision_table(rows["decision"]))
+        out.print(_phase_table("one decision, by phase", rows["decision"]))
+    if "looking" in rows:
+        out.print(_phase_table("looking and asking the trained network, by phase", rows["looking"]))
     out.print("medians; compile is what XLA took, run is one call after a warm-up", style="dim")
 
 
@@ -171,8 +181,8 @@ def _distance_table(rows: list[DistanceRow]) -> Table:
     return table
 
 
-def _decision_table(rows: list[PhaseRow]) -> Table:
-    table = _table("one decision, by phase", "phase", "run", "per second", "working memory", "trace", "compile")
+def _phase_table(title: str, rows: list[PhaseRow]) -> Table:
+    table = _table(title, "phase", "run", "per second", "working memory", "trace", "compile")
     for row in rows:
         memory = row.timing.memory
         table.add_row(
@@ -182,7 +192,7 @@ def _decision_table(rows: list[PhaseRow]) -> Table:
             "-" if memory is None else _bytes(memory["temporaries"]),
             _seconds(row.timing.trace_s),
             _seconds(row.timing.compile_s),
-            end_section=row.phase == "path",
+            end_section=row is rows[-2],
         )
     return table
 

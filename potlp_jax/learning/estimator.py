@@ -48,7 +48,7 @@ class NetworkEstimator:
         network = EstimatorNetwork(self.config)
         places = places_of_looks(self.views, look_of_subgoals(self.views, subgoals))
         poses = self.views.cells[places]
-        distance = _distances(belief, poses, subgoals)
+        distance = self.distances(belief, subgoals)
         angle = jax.vmap(bearing)(poses, subgoals.cells)
         classes = task.class_mask.shape[0]
 
@@ -76,6 +76,14 @@ class NetworkEstimator:
             success_cost=success_cost * belief.resolution,
             failure_cost=failure_cost * belief.resolution,
         )
+
+    def distances(self, belief: BeliefMap, subgoals: Subgoals) -> Float32[Array, " S"]:
+        """From where each subgoal was seen to the subgoal through known space, letters ignored, in cells.
+
+        0 where masked, or where known space does not lead there.
+        """
+        poses = self.views.cells[places_of_looks(self.views, look_of_subgoals(self.views, subgoals))]
+        return _distances(belief, poses, subgoals)
 
     def look(
         self, panorama: UInt8[Array, "rows columns 3"], belief: BeliefMap, cell: Int32[Array, "2"]
