@@ -1,4 +1,4 @@
-"""The network inside a decision: against asking pair by pair; padding, records and replays; which estimator is used."""
+"""The network inside a decision: against asking pair by pair; padding, records, replays; what was seen, drawn."""
 
 import dataclasses
 import math
@@ -8,17 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from potlp_jax.cli.explain import explain_decision
 from potlp_jax.environments import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.learning.estimator import estimator_for, look, read_estimator, shipped_estimator
 from potlp_jax.learning.estimator_files import CheckpointError, save_estimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.policies import Policy
-from potlp_jax.records import load_trial
+from potlp_jax.records import ActionRecord, load_trial
 from potlp_jax.replay import panorama_at, replay_decision
 from potlp_jax.task.task import Task
 from potlp_jax.trial import run_trial
 from potlp_jax.trial_config import TrialConfig
+from potlp_jax.view.panoramas import draw_panoramas
 from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
 from potlp_jax.world.grid import BeliefMap
 from potlp_jax.world.panorama import Disturbance, render
@@ -35,11 +37,16 @@ def generator():
 
 
 @pytest.fixture(scope="module")
-def trained(generator, tmp_path_factory):
+def trained_file(generator, tmp_path_factory):
     config = NetworkConfig(propositions=generator.propositions, **TINY)
     path = tmp_path_factory.mktemp("estimator") / "tiny.npz"
     save_estimator(path, EstimatorNetwork(config).init(jax.random.key(3)), config, {})
-    return read_estimator(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def trained(trained_file):
+    return read_estimator(trained_file)
 
 
 @pytest.fixture(scope="module")
@@ -146,3 +153,69 @@ def test_which_estimator_is_used(trained, generator):
     with pytest.raises(CheckpointError, match="no estimator is shipped"):
         estimator_for(("other",))
     assert shipped_estimator(("other",)) is None
+
+
+ROWS, COLUMNS = 8, 64
+RED = np.array([255, 0, 0], np.uint8)
+
+
+def _action(index, subgoal):
+    return ActionRecord(
+        index=index,
+        subgoal=subgoal,
+        cell=(0, 0),
+        from_state=0,
+        to_state=1,
+        success_probability=0.625,
+        success_cost=12.0,
+        failure_cost=34.0,
+        distance=5.0,
+        q_value=56.0 + index,
+        visits=3,
+    )
+
+
+def _panorama(origin, cell):
+    """Grey, with a red column where the cell is; columns run from -pi to pi of atan2(rows, columns)."""
+    image = np.full((ROWS, COLUMNS, 3), 128, np.uint8)
+    angle = np.arctan2(cell[0] - origin[0], cell[1] - origin[1])
+    image[:, int(np.floor((angle + np.pi) / (2 * np.pi) * COLUMNS)) % COLUMNS] = RED
+    return image
+
+
+def test_each_subgoal_is_shown_in_the_centre_of_the_panorama_that_its_estimates_come_from(trial):
+    first, last = trial.decisions[0], trial.decisions[-1]
+    seen_from = {0: first.cell, last.index: last.cell}
+    cells = ((first.cell[0] - 3, first.cell[1]), (last.cell[0] + 2, last.cell[1] - 2))
+    decision = dataclasses.replace(
+        last,
+        subgoals=cells,
+        looks=(0, last.index),
+        actions=tuple(_action(index, 0) for index in range(8)),
+        choice=1,
+    )
+    panoramas = {look: _panorama(seen_from[look], cell) for look, cell in zip(decision.looks, cells, strict=True)}
+    figure = draw_panoramas(trial, decision, panoramas)
+    pictures = [axes for axes in figure.axes if axes.images]
+    assert len(pictures) == 2
+    for axes in pictures:
+        red = np.all(np.asarray(axes.images[0].get_array()) == RED, axis=-1).all(axis=0)
+        assert np.flatnonzero(red).tolist() in ([COLUMNS // 2 - 1], [COLUMNS // 2])
+    assert pictures[0].get_title(loc="left").startswith("chosen: s0")
+    assert "at decision 0" in pictures[0].get_title(loc="left")
+    assert pictures[1].get_title(loc="left").startswith("s1")
+    assert "seen now" in pictures[1].get_title(loc="left")
+    told = [axes.texts[0].get_text() for axes in figure.axes if not axes.images]
+    assert "0.62" in told[0]
+    assert "and 2 more" in told[0]
+    assert told[1] == "nothing can be tried here"
+
+
+def test_explain_writes_the_panoramas_beside_the_tree(trial, trained_file, tmp_path, capsys):
+    trial.save(tmp_path / "trial.json")
+    index = next(decision.index for decision in trial.decisions if decision.actions)
+    explain_decision(f"{tmp_path}:{index}", tmp_path / "tree.png", 2, trained_file, json=False)
+    told = capsys.readouterr().out
+    for name in ("tree.png", "tree-panoramas.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+        assert name in told.replace("\n", "")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 
 from potlp_jax.planning import exact_search
@@ -33,7 +33,7 @@ def assert_equals_recursion(problem, remember=True):
     seed=st.integers(0, 10**6),
     backward=st.booleans(),
 )
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_equals_the_literal_recursion(formula, subgoals, seed, backward):
     unreachable = 0.5 if subgoals == 2 else 0.2
     assert_equals_recursion(random_problem(formula, subgoals, seed, unreachable=unreachable, backward=backward))
@@ -157,11 +157,19 @@ def choose_from_the_start(monkeypatch):
     monkeypatch.setattr(exact_search, "_BATCH", 1)
 
 
+def _optimum(problem):
+    """The optimum, where it is found within a second or two; another example is drawn where it is not."""
+    try:
+        return solve_exact(problem, max_states=10_000)
+    except ProblemTooLargeError:
+        reject()
+
+
 @given(formula=st.sampled_from(FORMULAS), subgoals=st.integers(1, 2), seed=st.integers(0, 10**6))
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 def test_best_first_search_equals_breadth_first_search(formula, subgoals, seed):
     problem = random_problem(formula, subgoals, seed, unreachable=0.2, backward=bool(seed % 2))
-    expected = solve_exact(problem)
+    expected = _optimum(problem)
     with pytest.MonkeyPatch.context() as patch:
         choose_from_the_start(patch)
         found = solve_exact(problem)
@@ -178,7 +186,7 @@ def test_best_first_search_equals_breadth_first_search(formula, subgoals, seed):
 @settings(max_examples=20, deadline=None)
 def test_bounds_hold_the_optimum(formula, subgoals, seed, max_states):
     problem = random_problem(formula, subgoals, seed, unreachable=0.3, backward=bool(seed % 2))
-    expected = solve_exact(problem)
+    expected = _optimum(problem)
     with pytest.MonkeyPatch.context() as patch:
         choose_from_the_start(patch)
         bounds = bound_exact(problem, max_states=max_states, tolerance=0.0)

@@ -13,6 +13,7 @@ from tests.reference.sensing import visible as reference_visible
 
 FEATURES = (1, 2, 3)
 remember_jit = jax.jit(remember)
+visible_jit = jax.jit(visible, static_argnames="config")
 
 
 def some_belief(rng: np.random.Generator, shape: tuple[int, int] = (12, 16)) -> BeliefMap:
@@ -25,6 +26,7 @@ def free_cell(rng: np.random.Generator, belief: BeliefMap) -> np.ndarray:
     return cells[rng.integers(len(cells))].astype(np.int32)
 
 
+@jax.jit
 def subgoals_of(belief: BeliefMap):
     everywhere = jnp.ones(belief.cells.shape, bool)
     return find_subgoals(belief, everywhere, jnp.zeros(belief.cells.shape), FrontierConfig(max_subgoals=8, min_size=1))
@@ -51,7 +53,7 @@ def test_every_subgoal_is_shown_by_the_last_look_at_its_frontier():
         cell = free_cell(rng, belief)
         features = jnp.full(FEATURES, number, jnp.float32)
         views = remember_jit(views, features, belief, jnp.asarray(cell))
-        seen = visible(~belief.free, jnp.asarray(cell), SensorConfig(range_cells=28.0))
+        seen = visible_jit(~belief.free, jnp.asarray(cell), config=SensorConfig(range_cells=28.0))
         looks.append((cell, np.asarray(seen)))
         subgoals = subgoals_of(belief)
         found = look_of_subgoals(views, subgoals)
