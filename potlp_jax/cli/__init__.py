@@ -6,9 +6,10 @@ when a command runs, so that help is quick.
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.cli.output import clear_errors, package_version
@@ -296,13 +297,15 @@ def export_command(
 
 [cyan]potlp bench --parts decision --environment firefighting --json[/cyan]
 
+[cyan]potlp bench --parts looking --environment firefighting --world 1[/cyan] - what the camera and the network add
+
 [dim]Compiled anew for every measurement: the cache of compiled programs is left out.[/dim]
 """,
 )
 @clear_errors
 def bench_command(
     parts: Annotated[
-        str, typer.Option("--parts", help="search, distances, decision; joined by commas.")
+        str, typer.Option("--parts", help="search, distances, decision, looking; joined by commas.")
     ] = "search,distances,decision",
     family: Annotated[str, typer.Option(help="Family of benchmark problems for the search.")] = "three-single",
     subgoals: Annotated[int, typer.Option(min=1, help="Subgoals of the problems for the search.")] = 8,
@@ -313,6 +316,7 @@ def bench_command(
     ] = "rooms",
     task: TaskName = "1",
     size: Annotated[int, typer.Option(min=21, help="Cells a side of a floor of rooms.")] = 64,
+    world: Annotated[int, typer.Option(min=0, help="Number of the world, of those for validation.")] = 0,
     sources: Annotated[int, typer.Option(min=1, help="Places from which to measure distances.")] = 16,
     repeats: Annotated[int, typer.Option(min=1, help="Timed runs, of which the median is shown.")] = 5,
     core: Annotated[int | None, typer.Option(min=0, help="Stay on this core, with one thread.")] = None,
@@ -321,7 +325,9 @@ def bench_command(
     """Measure the planner on this machine: times of compiling and running, throughput, memory."""
     from potlp_jax.cli.bench import run_bench
 
-    run_bench(parts, family, subgoals, batches, simulations, environment, task, size, sources, repeats, core, json)
+    run_bench(
+        parts, family, subgoals, batches, simulations, environment, task, size, world, sources, repeats, core, json
+    )
 
 
 @estimator_app.command(
@@ -372,6 +378,75 @@ def estimator_info_command(checkpoint: Estimator, json: Json = False) -> None:
     from potlp_jax.cli.estimator import show_estimator
 
     show_estimator(checkpoint, json)
+
+
+class _RunByDefault(TyperGroup):
+    """A group whose first command runs where none is named: `potlp sweep FILE.yaml`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if args and not args[0].startswith("-") and args[0] not in self.commands:
+            args = [next(iter(self.commands)), *args]
+        return super().parse_args(ctx, args)
+
+
+sweep_app = typer.Typer(
+    name="sweep",
+    cls=_RunByDefault,
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    help="Run many paired trials; show or export their results. [cyan]potlp sweep FILE.yaml --out DIR[/cyan] runs.",
+)
+app.add_typer(sweep_app)
+SweepFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a sweep, as --out named it.")]
+
+
+@sweep_app.command(
+    "run",
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp sweep eval/sweeps/validation.yaml --out out/validation[/cyan]
+
+[cyan]potlp sweep mine.yaml --out out/mine --processes 1[/cyan]
+
+[dim]Killed or interrupted, the same command again continues; several may run on one folder. docs/sweeps.md describes
+the file.[/dim]
+""",
+)
+@clear_errors
+def sweep_run_command(
+    file: Annotated[Path, typer.Argument(metavar="FILE.yaml", help="What to run: docs/sweeps.md.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")],
+    processes: Annotated[
+        int | None, typer.Option(min=1, help="Workers, each on a core of its own; default: one per core.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Run environments × tasks × policies × worlds, or what is missing of it."""
+    from potlp_jax.cli.sweep import sweep
+
+    sweep(file, out, processes, json)
+
+
+@sweep_app.command("show")
+@clear_errors
+def sweep_show_command(folder: SweepFolder, json: Json = False) -> None:
+    """Show the tables of what is finished."""
+    from potlp_jax.cli.sweep import show_sweep
+
+    show_sweep(folder, json)
+
+
+@sweep_app.command("export")
+@clear_errors
+def sweep_export_command(
+    folder: SweepFolder,
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write: .csv or .parquet.")],
+) -> None:
+    """Write one line per finished trial to a file."""
+    from potlp_jax.cli.sweep import export_sweep
+
+    export_sweep(folder, out)
 
 
 def main() -> None:

@@ -29,9 +29,9 @@ def read_environment_task(generator: Generator, text: str) -> Task:
     if formula.strip().isdigit():
         known = ", ".join(f"{number} ({entry})" for number, entry in generator.tasks.items()) or "none"
         fail(f"the environment has no task {text}; it has: {known}. Or give a formula.")
-    # What ships is read without Spot.
-    shipped = [name for name, entry in shipped_tasks().items() if entry == formula]
-    return read_task(shipped[0] if shipped else formula, generator.propositions)
+    if formula in generator.tasks.values():
+        return Task.of_formula(formula, generator.propositions)
+    return read_task(formula, generator.propositions)
 
 
 def read_policy(name: str) -> Policy:

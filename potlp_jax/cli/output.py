@@ -76,11 +76,13 @@ def _input_errors() -> tuple[type[Exception], ...]:
     from potlp_jax.environments.map_server import MapError
     from potlp_jax.learning.estimator_files import CheckpointError
     from potlp_jax.records import RecordError
+    from potlp_jax.sweep.specification import SpecificationError
+    from potlp_jax.sweep.store import StoreError
     from potlp_jax.task.formula import TaskError
     from potlp_jax.view.style import PictureError
     from potlp_jax.world.grid import WorldError
 
-    return TaskError, WorldError, MapError, RecordError, PictureError, CheckpointError
+    return TaskError, WorldError, MapError, RecordError, PictureError, CheckpointError, SpecificationError, StoreError
 
 
 def progress_bar() -> Progress:

@@ -164,6 +164,18 @@ class Task:
         return cls.from_hoa(texts[name])
 
     @classmethod
+    def of_formula(cls, text: str, propositions: Sequence[str]) -> "Task":
+        """The task of a formula over Sigma: without Spot where a task that ships has this very formula.
+
+        Raises:
+            TaskError: as ``from_formula``.
+        """
+        for hoa in _shipped_hoa().values():
+            if read_hoa(hoa).name == text:
+                return cls.from_hoa(hoa, propositions)
+        return cls.from_formula(text, propositions)
+
+    @classmethod
     def _compile(
         cls, text: str, propositions: tuple[str, ...], automaton: HoaAutomaton, max_positive_literals: int | None
     ) -> "Task":

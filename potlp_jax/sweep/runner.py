@@ -1,0 +1,300 @@
+"""Runs a sweep: workers, one pinned to each core, take trials from the store until none is left.
+
+Each worker looks at the store, claims a block of work of one kind and writes a row as soon as a trial has ended. It
+needs nothing else, so workers may be killed, started again, or belong to several commands on one store.
+"""
+
+import dataclasses
+import multiprocessing
+import os
+import subprocess
+import time
+import zlib
+from collections.abc import Callable, Sequence
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from potlp_jax.environments import Generator, make
+from potlp_jax.environments.splits import MAX_INDEX, world_key
+from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, read_estimator
+from potlp_jax.planning.policies import Policy
+from potlp_jax.records import Outcome, Trial
+from potlp_jax.sweep.specification import Cell, Specification, configuration_hash
+from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store
+from potlp_jax.task.task import Task, TaskArrays, TaskSizes
+from potlp_jax.trial import run_trial
+from potlp_jax.world.grid import World, WorldError
+
+RESULTS: str = "results.sqlite"
+"""Name of the store in a sweep's folder."""
+
+IMPOSSIBLE_IN_A_ROW: int = 100
+"""Worlds after which a task is taken to be impossible in all of them."""
+
+BLOCK: int = 8
+"""Trials, or worlds to look at, that a worker claims at once."""
+
+WAIT: float = 0.3
+"""Seconds between looks at the store while there is nothing to claim."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """Where a sweep stands: trials done of all, and since when."""
+
+    done: int
+    total: int
+
+
+class Sweep:
+    """A specification with its store: what is to be done, and how one piece of it is."""
+
+    def __init__(self, specification: Specification, folder: Path) -> None:
+        self.specification = specification
+        self.store = Store(folder / RESULTS)
+        self.store.agree({"specification": specification.to_dict(), "estimator": self._estimator_identity()})
+
+    @property
+    def total(self) -> int:
+        """Trials in all."""
+        return len(self.specification.cells) * len(self.specification.policies) * self.specification.worlds
+
+    def finished(self) -> bool:
+        """Whether every trial has a row."""
+        return self.store.count() == self.total
+
+    def step(self) -> bool:
+        """Do one block of work; returns whether there was any that no other process works on.
+
+        Raises:
+            WorldError: a task is impossible in too many worlds in a row.
+        """
+        for cell in self.specification.cells:
+            known = self.store.possible(cell.environment, cell.task)
+            worlds = self._worlds(known)
+            if len(worlds) < self.specification.worlds:
+                looked = self.store.claim(self._unknown_worlds(cell, known, len(worlds)), BLOCK)
+                if looked:
+                    self.store.set_possible(
+                        cell.environment,
+                        cell.task,
+                        {item.world: self._is_possible(cell, item.world) for item in looked},
+                    )
+                    return True
+            for policy in self.specification.policies:
+                wanted = [Item(cell.environment, cell.task, policy.value, world) for world in worlds]
+                claimed = self.store.claim(wanted, BLOCK)
+                for item in claimed:
+                    self.store.finish([self.run(item)])
+                if claimed:
+                    return True
+        return False
+
+    def _worlds(self, known: dict[int, bool]) -> list[int]:
+        """The first worlds in which the task is possible, as far as that is known without a gap."""
+        found: list[int] = []
+        for world in range(self.specification.first_world, MAX_INDEX + 1):
+            if world not in known or len(found) == self.specification.worlds:
+                break
+            if known[world]:
+                found.append(world)
+        return found
+
+    def _unknown_worlds(self, cell: Cell, known: dict[int, bool], found: int) -> list[Item]:
+        """The next worlds to look at: as many as are missing."""
+        missing = self.specification.worlds - found
+        last = max(known, default=self.specification.first_world - 1)
+        tail = [known.get(world, True) for world in range(last - IMPOSSIBLE_IN_A_ROW + 1, last + 1)]
+        if not any(tail):
+            raise WorldError(
+                f"{cell.environment}: the task {cell.task!r} is impossible in {IMPOSSIBLE_IN_A_ROW} worlds in a row, "
+                f"up to number {last}; check it"
+            )
+        after = range(self.specification.first_world, min(last + missing, MAX_INDEX) + 1)
+        return [Item(cell.environment, cell.task, POSSIBLE, world) for world in after if world not in known]
+
+    def _is_possible(self, cell: Cell, world: int) -> bool:
+        trial = self.trial(Item(cell.environment, cell.task, Policy.KNOWN_MAP.value, world))
+        return trial.outcome is Outcome.SATISFIED
+
+    def run(self, item: Item) -> Row:
+        """The row of one trial."""
+        start = time.perf_counter()
+        trial = self.trial(item)
+        return Row(
+            item=item,
+            outcome=trial.outcome.value,
+            cost=trial.cost,
+            budget=_budget(trial.world, self.specification.config.budget_factor),
+            steps=len(trial.path) - 1,
+            decisions=len(trial.decisions),
+            fallbacks=sum(decision.fallback for decision in trial.decisions),
+            status=trial.status,
+            key=_words(self._key(item.world)),
+            path=path_digest(trial.path),
+            configuration=configuration_hash(self.specification.config),
+            versions=trial.versions,
+            commit=source_commit(),
+            seconds=time.perf_counter() - start,
+        )
+
+    def trial(self, item: Item) -> Trial:
+        """The whole record of a trial, run or made again."""
+        policy = Policy(item.policy)
+        task, arrays = self._tasks[item.environment, item.task]
+        return run_trial(
+            _world(item.environment, self.specification.split.value, item.world),
+            task,
+            policy,
+            self._key(item.world),
+            self.specification.config,
+            environment=f"{item.environment}/{self.specification.split.value}",
+            seed=item.world,
+            arrays=arrays,
+            estimator=self._estimator if policy is Policy.POTLP else None,
+        )
+
+    def _key(self, world: int) -> jax.Array:
+        """Of all trials in a world: it makes no world, and folded by name it serves planning and sensing."""
+        return jax.random.fold_in(jax.random.key(self.specification.seed), world)
+
+    @cached_property
+    def _tasks(self) -> dict[tuple[str, str], tuple[Task, TaskArrays]]:
+        """Tasks by environment and formula, padded per environment to one size: one compilation serves all."""
+        tasks = {
+            (cell.environment, cell.task): Task.of_formula(cell.task, _generator(cell.environment).propositions)
+            for cell in self.specification.cells
+        }
+        sizes: dict[str, TaskSizes] = {}
+        for (environment, _), task in tasks.items():
+            sizes[environment] = sizes.get(environment, task.sizes).union(task.sizes)
+        return {key: (task, task.padded(sizes[key[0]])) for key, task in tasks.items()}
+
+    @cached_property
+    def _estimator(self) -> TrainedEstimator | None:
+        path = self.specification.estimator
+        return None if path is None else read_estimator(path)
+
+    def _estimator_identity(self) -> str | None:
+        """Of the network, so that a store never mixes two. Raises CheckpointError where there is none for a task."""
+        if Policy.POTLP not in self.specification.policies:
+            return None
+        environments = {cell.environment for cell in self.specification.cells}
+        found = [estimator_for(_generator(name).propositions, self._estimator) for name in sorted(environments)]
+        return ", ".join(dict.fromkeys(estimator.identity for estimator in found))
+
+
+def run_sweep(
+    specification: Specification,
+    folder: Path,
+    processes: int,
+    report: Callable[[Progress], None] = lambda progress: None,
+) -> None:
+    """Run what is missing of a sweep, with as many pinned processes; returns when every trial has a row.
+
+    ``report`` is called now and then with the progress.
+
+    Raises:
+        StoreError: the folder holds another sweep.
+        RuntimeError: a worker ended with an error, which it has printed.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    sweep = Sweep(specification, folder)
+    try:
+        if processes == 1:
+            _work_here(sweep, report)
+        else:
+            _work_in_processes(sweep, folder, processes, report)
+    finally:
+        sweep.store.close()
+
+
+def _work_here(sweep: Sweep, report: Callable[[Progress], None]) -> None:
+    while not sweep.finished():
+        if not sweep.step():
+            time.sleep(WAIT)
+        report(Progress(sweep.store.count(), sweep.total))
+
+
+def _work_in_processes(sweep: Sweep, folder: Path, processes: int, report: Callable[[Progress], None]) -> None:
+    context = multiprocessing.get_context("spawn")
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
+    workers = [
+        context.Process(target=_work, args=(sweep.specification, folder, cores[number % len(cores)]), daemon=True)
+        for number in range(processes)
+    ]
+    try:
+        for worker in workers:
+            worker.start()
+        while any(worker.is_alive() for worker in workers):
+            report(Progress(sweep.store.count(), sweep.total))
+            if any(worker.exitcode for worker in workers):
+                break
+            time.sleep(WAIT)
+    finally:
+        for worker in workers:
+            worker.terminate()
+            worker.join()
+    if not sweep.finished():
+        raise RuntimeError("a worker of the sweep ended with an error; what is finished is kept")
+    report(Progress(sweep.total, sweep.total))
+
+
+def _work(specification: Specification, folder: Path, core: int | None) -> None:
+    """A worker: works until nothing is left, or the process that started it is gone."""
+    if core is not None:
+        # Before XLA starts, which then uses one thread.
+        os.sched_setaffinity(0, {core})
+    from potlp_jax.cache import enable_compilation_cache
+
+    enable_compilation_cache()
+    sweep, parent = Sweep(specification, folder), multiprocessing.parent_process()
+    while not sweep.finished():
+        if parent is not None and not parent.is_alive():
+            return
+        if not sweep.step():
+            time.sleep(WAIT)
+
+
+@lru_cache(maxsize=8)
+def _generator(environment: str) -> Generator:
+    return make(environment)
+
+
+@lru_cache(maxsize=BLOCK)
+def _world(environment: str, split: str, world: int) -> World:
+    """The worlds of a block, which every policy visits."""
+    generator = _generator(environment)
+    return generator.generate(world_key(split, world, generator.name))
+
+
+def _budget(world: World, factor: float) -> float:
+    return factor * float(np.sum(np.asarray(world.extent))) * float(world.resolution)
+
+
+def _words(key: jax.Array) -> tuple[int, int]:
+    first, second = np.asarray(jax.random.key_data(key)).tolist()
+    return int(first), int(second)
+
+
+def path_digest(path: Sequence[tuple[int, int]]) -> str:
+    """Eight hexadecimal digits that tell paths apart."""
+    return f"{zlib.crc32(np.asarray(path, np.int32).tobytes()):08x}"
+
+
+@lru_cache(maxsize=1)
+def source_commit() -> str:
+    """The commit that the package was run from, with ``+`` where files were changed; empty outside of a repository."""
+    folder = Path(__file__).parent
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    try:
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--", str(folder)) else "")
+    except (OSError, subprocess.CalledProcessError):
+        return ""

@@ -1,0 +1,224 @@
+"""What a sweep runs: environments × tasks × policies × worlds, with settings, read from a YAML file.
+
+    environments: [firefighting]
+    tasks: [1, 2, 3, 4]            # numbers of the environment's tasks, or formulas
+    policies: [known-map, baseline, oracle, potlp]
+    worlds: 200                    # per environment and task; impossible ones are redrawn
+    split: validation              # optional, as are all below
+    first_world: 0
+    estimator: out/fit/estimator.npz
+    settings:                      # any field of potlp_jax.trial_config.TrialConfig
+      replan_distance: 4
+      decision: {search: {simulations: 300}}
+
+``known-map`` and ``baseline`` always run: savings are measured between them.
+"""
+
+import dataclasses
+import hashlib
+import json
+import types
+import typing
+from collections.abc import Mapping
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from potlp_jax.environments import make
+from potlp_jax.environments.splits import MAX_INDEX, Split
+from potlp_jax.planning.policies import Policy
+from potlp_jax.task.task import Task
+from potlp_jax.trial_config import TrialConfig
+
+
+class SpecificationError(ValueError):
+    """A specification cannot be used: names the file, the entry and what to do."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """One cell of the sweep's grid: ``worlds`` trials of every policy. ``task`` is a formula."""
+
+    environment: str
+    task: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Specification:
+    """A checked specification.
+
+    Attributes:
+        cells: environments × tasks, in the order of the file.
+        policies: known map and baseline first.
+        worlds: worlds per cell in which the task is possible.
+        split, first_world: from which worlds they are taken, in increasing order.
+        estimator: file of the trained network; None for the shipped one.
+        config: settings of every trial.
+        seed: of the trials' keys (not of the worlds).
+    """
+
+    cells: tuple[Cell, ...]
+    policies: tuple[Policy, ...]
+    worlds: int
+    split: Split = Split.VALIDATION
+    first_world: int = 0
+    estimator: Path | None = None
+    config: TrialConfig = TrialConfig()
+    seed: int = 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able; equal specifications give equal dictionaries."""
+        return {
+            "cells": [dataclasses.asdict(cell) for cell in self.cells],
+            "policies": [policy.value for policy in self.policies],
+            "worlds": self.worlds,
+            "split": self.split.value,
+            "first_world": self.first_world,
+            "estimator": None if self.estimator is None else str(self.estimator),
+            "settings": dataclasses.asdict(self.config),
+            "seed": self.seed,
+        }
+
+
+def configuration_hash(config: TrialConfig) -> str:
+    """Twelve hexadecimal digits that tell settings apart."""
+    text = json.dumps(dataclasses.asdict(config), sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def read_specification(path: Path) -> Specification:
+    """Read and check a specification.
+
+    Raises:
+        SpecificationError: the file or one of its entries is wrong.
+        TaskError, WorldError: a formula or an environment is.
+    """
+    return specification_from_dict(_read_yaml(path), str(path), path.parent)
+
+
+def _read_yaml(path: Path) -> Mapping[str, Any]:
+    try:
+        data = yaml.safe_load(path.read_text("utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise SpecificationError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(data, Mapping):
+        raise SpecificationError(f"{path}: give a mapping with environments, tasks, policies and worlds")
+    return data
+
+
+_REQUIRED = ("environments", "tasks", "policies", "worlds")
+_OPTIONAL = ("split", "first_world", "estimator", "settings", "seed")
+
+
+def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = Path()) -> Specification:
+    """Check the entries of a specification; ``where`` names it in messages, ``folder`` is where its files are."""
+    for name in data:
+        if name not in (*_REQUIRED, *_OPTIONAL):
+            raise SpecificationError(f"{where}: unknown entry {name!r}; known: {', '.join((*_REQUIRED, *_OPTIONAL))}")
+    for name in _REQUIRED:
+        if name not in data:
+            raise SpecificationError(f"{where}: {name} is missing")
+    policies = _policies(_list(data, "policies", where), where)
+    environments = [str(name) for name in _list(data, "environments", where)]
+    cells = [
+        Cell(environment, _formula(environment, task, where))
+        for environment in environments
+        for task in _list(data, "tasks", where)
+    ]
+    for cell in cells:
+        if cells.count(cell) > 1:
+            raise SpecificationError(f"{where}: {cell.environment} with {cell.task!r} is there twice")
+    estimator = data.get("estimator")
+    if estimator is not None and not isinstance(estimator, str):
+        raise SpecificationError(f"{where}: estimator: give the name of a file, found {estimator!r}")
+    return Specification(
+        cells=tuple(cells),
+        policies=policies,
+        worlds=_number(data, "worlds", 1, where),
+        split=_split(data.get("split", Split.VALIDATION.value), where),
+        first_world=_number(data, "first_world", 0, where, default=0),
+        estimator=None if estimator is None else folder / estimator,
+        config=_settings(TrialConfig, data.get("settings", {}), f"{where}: settings"),
+        seed=_number(data, "seed", 0, where, default=0),
+    )
+
+
+def _list(data: Mapping[str, Any], name: str, where: str) -> list[Any]:
+    value = data[name]
+    if not isinstance(value, list) or not value:
+        raise SpecificationError(f"{where}: {name}: give a list such as [{_EXAMPLES[name]}], found {value!r}")
+    return value
+
+
+_EXAMPLES = {"environments": "firefighting", "tasks": "1, 2", "policies": "baseline, oracle, potlp"}
+
+
+def _number(data: Mapping[str, Any], name: str, least: int, where: str, default: int | None = None) -> int:
+    value = data.get(name, default)
+    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= MAX_INDEX:
+        raise SpecificationError(f"{where}: {name}: give a whole number of at least {least}, found {value!r}")
+    return value
+
+
+def _policies(names: list[Any], where: str) -> tuple[Policy, ...]:
+    known = [policy.value for policy in Policy]
+    for name in names:
+        if name not in known:
+            raise SpecificationError(f"{where}: policies: unknown policy {name!r}; choose from: {', '.join(known)}")
+    return tuple(dict.fromkeys([Policy.KNOWN_MAP, Policy.BASELINE, *map(Policy, names)]))
+
+
+def _split(name: Any, where: str) -> Split:
+    known = [split.value for split in Split]
+    if name not in known:
+        raise SpecificationError(f"{where}: split: unknown split {name!r}; choose from: {', '.join(known)}")
+    return Split(name)
+
+
+def _formula(environment: str, task: Any, where: str) -> str:
+    """The formula of a task that is given by number, or as a formula. Raises for formulas that are no task."""
+    generator = make(environment)
+    text = str(task)
+    formula = generator.tasks.get(text, text)
+    if text.isdecimal() and formula == text:
+        known = ", ".join(generator.tasks) or "none"
+        raise SpecificationError(f"{where}: tasks: {environment} has no task {text}; it has: {known}")
+    Task.of_formula(formula, generator.propositions)
+    return formula
+
+
+def _settings(kind: Any, data: Any, where: str) -> Any:
+    """A frozen configuration from a mapping of some of its fields; everything else keeps its default."""
+    if not isinstance(data, Mapping):
+        raise SpecificationError(f"{where}: give a mapping, found {data!r}")
+    hints = typing.get_type_hints(kind)
+    for name in data:
+        if name not in hints:
+            raise SpecificationError(f"{where}: unknown field {name!r}; known: {', '.join(hints)}")
+    values = {name: _setting(hints[name], value, f"{where}.{name}") for name, value in data.items()}
+    try:
+        return kind(**values)
+    except ValueError as error:
+        raise SpecificationError(f"{where}: {error}") from error
+
+
+def _setting(hint: Any, value: Any, where: str) -> Any:
+    if dataclasses.is_dataclass(hint):
+        return _settings(hint, value, where)
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        known = [entry.value for entry in hint]
+        if value not in known:
+            raise SpecificationError(f"{where}: choose from: {', '.join(map(str, known))}; found {value!r}")
+        return hint(value)
+    if typing.get_origin(hint) is tuple:
+        value = tuple(value) if isinstance(value, list) else value
+        hint = tuple
+    allowed = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+    if float in allowed and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if not isinstance(value, tuple(allowed)) or (isinstance(value, bool) and bool not in allowed):
+        names = " or ".join("null" if kind is type(None) else kind.__name__ for kind in allowed)
+        raise SpecificationError(f"{where}: give a {names}, found {value!r}")
+    return value

@@ -1,0 +1,280 @@
+"""Results of a sweep in one SQLite file: one row a trial, written whole or not at all, shared by several processes.
+
+Work is handed out as claims. A claim belongs to a process and is void once that process is gone (or, of another host,
+once it is ``LEASE`` seconds old), so what a killed process had begun is begun again by another, and
+two processes on one store do not run the same trial. Should they all the same, the first row stays.
+"""
+
+import contextlib
+import dataclasses
+import json
+import os
+import socket
+import sqlite3
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+FORMAT = "potlp-sweep-1"
+LEASE: float = 600.0
+"""Seconds after which a claim of another host is void."""
+
+PATIENCE: float = 60.0
+"""Seconds to wait for another process that is writing."""
+
+
+class StoreError(ValueError):
+    """A store cannot be used: names the file, what is wrong, and what to do."""
+
+
+POSSIBLE: str = "possible"
+"""What stands for the policy where the work is to find out whether the task is possible in a world."""
+
+
+@dataclasses.dataclass(frozen=True, order=True)
+class Item:
+    """One trial of a sweep; ``task`` is a formula, ``world`` the number of a world of the sweep's split."""
+
+    environment: str
+    task: str
+    policy: str
+    world: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """The result of one trial. Costs are in units of the resolution; ``seconds`` is the wall time it took.
+
+    ``key`` holds the words of the trial's key; ``path`` is a digest of the cells that were entered, in order.
+    """
+
+    item: Item
+    outcome: str
+    cost: float
+    budget: float
+    steps: int
+    decisions: int
+    fallbacks: int
+    status: int
+    key: tuple[int, int]
+    path: str
+    configuration: str
+    versions: Mapping[str, str]
+    commit: str
+    seconds: float
+
+
+_SCHEMA = """
+CREATE TABLE facts (name TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE worlds (
+    environment TEXT NOT NULL, task TEXT NOT NULL, world INTEGER NOT NULL, possible INTEGER NOT NULL,
+    PRIMARY KEY (environment, task, world)
+) WITHOUT ROWID;
+CREATE TABLE trials (
+    environment TEXT NOT NULL, task TEXT NOT NULL, policy TEXT NOT NULL, world INTEGER NOT NULL,
+    outcome TEXT NOT NULL, cost REAL NOT NULL, budget REAL NOT NULL, steps INTEGER NOT NULL,
+    decisions INTEGER NOT NULL, fallbacks INTEGER NOT NULL, status INTEGER NOT NULL, key TEXT NOT NULL,
+    path TEXT NOT NULL, configuration TEXT NOT NULL, versions TEXT NOT NULL, "commit" TEXT NOT NULL,
+    seconds REAL NOT NULL,
+    PRIMARY KEY (environment, task, policy, world)
+) WITHOUT ROWID;
+CREATE TABLE claims (
+    environment TEXT NOT NULL, task TEXT NOT NULL, policy TEXT NOT NULL, world INTEGER NOT NULL,
+    host TEXT NOT NULL, process INTEGER NOT NULL, started REAL NOT NULL, claimed REAL NOT NULL,
+    PRIMARY KEY (environment, task, policy, world)
+) WITHOUT ROWID;
+"""
+
+
+class Store:
+    """The store in a file, which is made where there is none. One object per process and thread."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        try:
+            self._connection = sqlite3.connect(file, timeout=PATIENCE, isolation_level=None)
+            self._connection.execute("PRAGMA journal_mode=WAL")
+            self._connection.execute("PRAGMA synchronous=FULL")
+            with self._transaction():
+                self._prepare()
+        except sqlite3.DatabaseError as error:
+            raise StoreError(f"{file}: not a store of results ({error}); choose another folder") from error
+
+    def _prepare(self) -> None:
+        tables = {name for (name,) in self._connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if not tables:
+            for statement in _SCHEMA.split(";\n"):
+                self._connection.execute(statement)
+            self._connection.execute("INSERT INTO facts VALUES ('format', ?)", (FORMAT,))
+        found = (
+            dict(self._connection.execute("SELECT name, value FROM facts")) if not tables or "facts" in tables else {}
+        )
+        if found.get("format") != FORMAT:
+            raise StoreError(
+                f"{self.file}: its format is {found.get('format')!r}, this version reads {FORMAT!r}; "
+                "choose another folder"
+            )
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._connection.close()
+
+    @contextlib.contextmanager
+    def _transaction(self) -> Iterator[None]:
+        """All or nothing; other processes wait."""
+        self._connection.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+        except BaseException:
+            self._connection.execute("ROLLBACK")
+            raise
+        self._connection.execute("COMMIT")
+
+    def agree(self, facts: Mapping[str, Any]) -> None:
+        """Write down what the sweep is, or compare with what is written.
+
+        Raises:
+            StoreError: the store was begun with something else; the message names the entries.
+        """
+        with self._transaction():
+            written = self.facts()
+            for name, value in facts.items():
+                text = json.dumps(value, sort_keys=True)
+                if name not in written:
+                    self._connection.execute("INSERT INTO facts VALUES (?, ?)", (name, text))
+                elif json.dumps(written[name], sort_keys=True) != text:
+                    raise StoreError(
+                        f"{self.file}: was begun with another {name}: {_difference(written[name], value)}. "
+                        "Give the sweep a folder of its own, or the specification that this one was begun with"
+                    )
+
+    def facts(self) -> dict[str, Any]:
+        """What ``agree`` wrote."""
+        rows = self._connection.execute("SELECT name, value FROM facts WHERE name <> 'format'").fetchall()
+        return {name: json.loads(value) for name, value in rows}
+
+    def set_possible(self, environment: str, task: str, possible: Mapping[int, bool]) -> None:
+        """Write down in which worlds a task is possible, and give up the claims on finding out."""
+        with self._transaction():
+            for world, is_possible in possible.items():
+                self._connection.execute(
+                    "INSERT OR IGNORE INTO worlds VALUES (?, ?, ?, ?)", (environment, task, world, int(is_possible))
+                )
+                self._give_up(Item(environment, task, POSSIBLE, world))
+
+    def possible(self, environment: str, task: str) -> dict[int, bool]:
+        """In which worlds a task is possible, of those that were looked at, by number."""
+        rows = self._connection.execute(
+            "SELECT world, possible FROM worlds WHERE environment = ? AND task = ? ORDER BY world", (environment, task)
+        )
+        return {world: bool(possible) for world, possible in rows}
+
+    def claim(self, items: Sequence[Item], count: int) -> list[Item]:
+        """Up to ``count`` of the items, in their order, that have no row and that no living process has claimed."""
+        with self._transaction():
+            taken = self.done() | self._claimed()
+            free = [item for item in items if item not in taken][:count]
+            now = time.time()
+            self._connection.executemany(
+                "INSERT OR REPLACE INTO claims VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+                [(*_key(item), socket.gethostname(), os.getpid(), process_start(os.getpid()), now) for item in free],
+            )
+        return free
+
+    def finish(self, rows: Iterable[Row]) -> None:
+        """Write rows and give up their claims, all or nothing. A row that is there stays."""
+        with self._transaction():
+            for row in rows:
+                values = {**{field.name: getattr(row, field.name) for field in dataclasses.fields(row)}}
+                del values["item"]
+                values |= {"key": json.dumps(row.key), "versions": json.dumps(dict(row.versions), sort_keys=True)}
+                marks = ", ".join("?" * (4 + len(values)))
+                self._connection.execute(
+                    f"INSERT OR IGNORE INTO trials VALUES ({marks})", (*_key(row.item), *values.values())
+                )
+                self._give_up(row.item)
+
+    def rows(self, environment: str | None = None, task: str | None = None) -> list[Row]:
+        """Finished trials, in order of environment, task, policy and world."""
+        names = ", ".join(f'"{field.name}"' for field in dataclasses.fields(Row) if field.name != "item")
+        found = self._connection.execute(
+            f"SELECT environment, task, policy, world, {names} FROM trials "
+            "WHERE environment = coalesce(?, environment) AND task = coalesce(?, task) "
+            "ORDER BY environment, task, policy, world",
+            (environment, task),
+        )
+        return [_row(entry) for entry in found]
+
+    def _give_up(self, item: Item) -> None:
+        self._connection.execute(
+            "DELETE FROM claims WHERE environment = ? AND task = ? AND policy = ? AND world = ?", _key(item)
+        )
+
+    def count(self) -> int:
+        """Finished trials."""
+        return self._connection.execute("SELECT count(*) FROM trials").fetchone()[0]
+
+    def done(self) -> set[Item]:
+        """What is finished: trials, and worlds of which it is known whether the task is possible there."""
+        trials = self._connection.execute("SELECT environment, task, policy, world FROM trials").fetchall()
+        worlds = self._connection.execute("SELECT environment, task, world FROM worlds").fetchall()
+        found = {Item(*row) for row in trials}
+        return found | {Item(environment, task, POSSIBLE, world) for environment, task, world in worlds}
+
+    def _claimed(self) -> set[Item]:
+        claims = self._connection.execute("SELECT * FROM claims").fetchall()
+        return {Item(*claim[:4]) for claim in claims if _alive(*claim[4:])}
+
+
+def _key(item: Item) -> tuple[str, str, str, int]:
+    return item.environment, item.task, item.policy, item.world
+
+
+def _row(entry: tuple[Any, ...]) -> Row:
+    names = [field.name for field in dataclasses.fields(Row) if field.name != "item"]
+    values = dict(zip(names, entry[4:], strict=True))
+    values |= {"key": tuple(json.loads(values["key"])), "versions": json.loads(values["versions"])}
+    return Row(item=Item(*entry[:4]), **values)
+
+
+def _alive(host: str, process: int, started: float, claimed: float) -> bool:
+    """Whether the owner of a claim still works on it."""
+    if host == socket.gethostname():
+        return process_start(process) == started
+    return time.time() - claimed < LEASE
+
+
+def process_start(process: int) -> float | None:
+    """When a process of this host was started, in the system's own units; None where there is none.
+
+    A number of a process is used again some day; with its start it is not. Where the system does not tell starts, 0
+    stands for any.
+    """
+    if not Path("/proc/self/stat").exists():
+        try:
+            os.kill(process, 0)
+        except ProcessLookupError:
+            return None
+        except PermissionError:
+            return 0.0
+        return 0.0
+    try:
+        stat = Path(f"/proc/{process}/stat").read_text()
+    except FileNotFoundError:
+        return None
+    # The name, in brackets, may hold anything.
+    state, *fields = stat.rpartition(")")[2].split()
+    return None if state == "Z" else float(fields[18])
+
+
+def _difference(written: Any, given: Any) -> str:
+    if isinstance(written, Mapping) and isinstance(given, Mapping):
+        names = sorted(name for name in written.keys() | given.keys() if written.get(name) != given.get(name))
+        return ", ".join(f"{name} was {_short(written.get(name))}, is {_short(given.get(name))}" for name in names)
+    return f"was {_short(written)}, is {_short(given)}"
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value, default=str)
+    return text if len(text) <= 80 else f"{text[:77]}..."

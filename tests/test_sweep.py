@@ -1,0 +1,333 @@
+"""Sweeps: the specification's errors, the store under several processes and kills, rows, tables and export."""
+
+import csv
+import dataclasses
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import pytest
+from typer.testing import CliRunner
+
+from potlp_jax.cli import app
+from potlp_jax.environments import make
+from potlp_jax.environments.splits import world_key
+from potlp_jax.planning.policies import Policy
+from potlp_jax.sweep.runner import RESULTS, Sweep, path_digest, run_sweep
+from potlp_jax.sweep.specification import SpecificationError, read_specification, specification_from_dict
+from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store, StoreError, process_start
+from potlp_jax.task.task import Task
+from potlp_jax.trial import run_trial
+
+SMALL = {"environments": ["toy"], "tasks": [2], "policies": ["optimistic"], "worlds": 3, "first_world": 5}
+
+
+def _specification(**changes):
+    return specification_from_dict({**SMALL, **changes}, "here")
+
+
+def _row(item, cost=1.0):
+    return Row(
+        item=item,
+        outcome="satisfied",
+        cost=cost,
+        budget=100.0,
+        steps=3,
+        decisions=2,
+        fallbacks=0,
+        status=0,
+        key=(0, 2**32 - 1),
+        path="00000000",
+        configuration="abc",
+        versions={"jax": "1"},
+        commit="",
+        seconds=0.5,
+    )
+
+
+ITEMS = [Item("toy", "F goal", "baseline", world) for world in range(10)]
+
+
+def test_known_map_and_baseline_always_run_and_numbers_become_formulas():
+    specification = _specification()
+    assert specification.policies == (Policy.KNOWN_MAP, Policy.BASELINE, Policy.OPTIMISTIC)
+    assert [cell.task for cell in specification.cells] == [make("toy").tasks["2"]]
+
+
+def test_settings_reach_every_depth():
+    specification = _specification(settings={"replan_distance": 7, "decision": {"search": {"simulations": 9}}})
+    assert specification.config.replan_distance == 7.0
+    assert specification.config.decision.search.simulations == 9
+    assert specification.config.budget_factor == _specification().config.budget_factor
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"worlds": 0}, "worlds: give a whole number of at least 1, found 0"),
+        ({"worlds": True}, "worlds"),
+        ({"polices": ["baseline"]}, "unknown entry 'polices'"),
+        ({"policies": ["best"]}, "unknown policy 'best'; choose from"),
+        ({"policies": "baseline"}, "policies: give a list"),
+        ({"split": "exam"}, "unknown split 'exam'"),
+        ({"tasks": [17]}, "toy has no task 17"),
+        ({"tasks": [1, "F goal"]}, "is there twice"),
+        ({"environments": ["mars"]}, "mars"),
+        ({"tasks": ["F ("]}, "F \\("),
+        ({"settings": {"replan": 3}}, "settings: unknown field 'replan'"),
+        ({"settings": {"decision": {"search": {"simulations": "many"}}}}, "settings.decision.search.simulations"),
+        ({"settings": {"decision": {"frontiers": {"max_subgoals": 0}}}}, "settings.decision.frontiers: .*at least 1"),
+        ({"settings": {"revealed": 1}}, "settings.revealed: give a bool"),
+        ({"settings": {"decision": {"search": {"mode": "guess"}}}}, "settings.decision.search.mode: choose from"),
+    ],
+)
+def test_wrong_entries_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        _specification(**changes)
+
+
+def test_files_that_are_no_specification_are_named(tmp_path):
+    for text, message in (("[1, 2", "not YAML"), ("- a", "give a mapping"), ("worlds: 3", "environments is missing")):
+        (tmp_path / "sweep.yaml").write_text(text)
+        with pytest.raises(SpecificationError, match=rf"sweep\.yaml: .*{message}"):
+            read_specification(tmp_path / "sweep.yaml")
+
+
+def test_rows_come_back_as_they_were_written(tmp_path):
+    store = Store(tmp_path / "a.sqlite")
+    row = _row(ITEMS[0], cost=0.1 + 0.2)
+    store.finish([row])
+    assert Store(tmp_path / "a.sqlite").rows() == [row]
+    store.finish([dataclasses.replace(row, cost=9.0)])
+    assert store.rows() == [row]
+    assert store.count() == 1
+
+
+def test_an_item_is_claimed_once_until_it_is_finished_or_its_owner_is_gone(tmp_path):
+    store = Store(tmp_path / "a.sqlite")
+    assert store.claim(ITEMS, 3) == ITEMS[:3]
+    assert Store(tmp_path / "a.sqlite").claim(ITEMS, 2) == ITEMS[3:5]
+    store.finish([_row(ITEMS[0])])
+    assert store.claim(ITEMS[:2], 5) == []
+    context = multiprocessing.get_context("spawn")
+    other = context.Process(target=_claim_and_die, args=(tmp_path / "a.sqlite",))
+    other.start()
+    other.join()
+    assert other.exitcode == -signal.SIGKILL
+    assert store.claim(ITEMS, 10) == ITEMS[5:]
+
+
+def _claim_and_die(file):
+    assert Store(file).claim(ITEMS, 2) == ITEMS[5:7]
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_worlds_are_claimed_like_trials(tmp_path):
+    store = Store(tmp_path / "a.sqlite")
+    worlds = [Item("toy", "F goal", POSSIBLE, world) for world in range(4)]
+    assert store.claim(worlds, 2) == worlds[:2]
+    store.set_possible("toy", "F goal", {0: True, 1: False})
+    assert store.claim(worlds, 9) == worlds[2:]
+    assert store.possible("toy", "F goal") == {0: True, 1: False}
+    assert store.count() == 0
+
+
+def test_a_process_that_takes_over_a_number_is_another():
+    assert process_start(os.getpid()) == process_start(os.getpid())
+    assert process_start(2**22 + 1) is None
+
+
+def test_a_store_of_another_sweep_is_refused_by_name(tmp_path):
+    Sweep(_specification(), tmp_path)
+    Sweep(_specification(), tmp_path)
+    with pytest.raises(StoreError, match="worlds was 3, is 4"):
+        Sweep(_specification(worlds=4), tmp_path)
+
+
+def test_other_files_are_no_store(tmp_path):
+    (tmp_path / "a").write_text("something else, and long enough to be looked at as a header of a file" * 20)
+    with pytest.raises(StoreError, match="not a store"):
+        Store(tmp_path / "a")
+    old = Store(tmp_path / "b")
+    old._connection.execute("UPDATE facts SET value = 'potlp-sweep-0' WHERE name = 'format'")
+    old.close()
+    with pytest.raises(StoreError, match=r"'potlp-sweep-0'.*'potlp-sweep-1'"):
+        Store(tmp_path / "b")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A sweep in one process."""
+    folder = tmp_path_factory.mktemp("sweep")
+    reports = []
+    run_sweep(_specification(), folder, 1, reports.append)
+    assert reports[-1].done == reports[-1].total == 9
+    return folder
+
+
+def _rows(folder):
+    """Rows without what differs between runs."""
+    store = Store(folder / RESULTS)
+    rows = [dataclasses.replace(row, seconds=0.0) for row in store.rows()]
+    store.close()
+    return rows
+
+
+def test_a_row_is_what_a_single_trial_gives(finished):
+    toy = make("toy")
+    task = Task.from_formula(toy.tasks["2"], propositions=toy.propositions)
+    rows = _rows(finished)
+    assert len(rows) == 9
+    for row in rows:
+        world = toy.generate(world_key("validation", row.item.world, "toy"))
+        key = jax.random.fold_in(jax.random.key(0), row.item.world)
+        trial = run_trial(world, task, row.item.policy, key)
+        assert (row.outcome, row.cost, row.steps) == (trial.outcome, trial.cost, len(trial.path) - 1)
+        assert row.path == path_digest(trial.path)
+        assert row.decisions == len(trial.decisions)
+
+
+def test_a_finished_sweep_has_nothing_left_to_do(finished):
+    before = _rows(finished)
+    run_sweep(_specification(), finished, 1)
+    assert _rows(finished) == before
+
+
+MANY_KILLS = """
+import os, random, signal, sys, time
+from pathlib import Path
+from potlp_jax.environments.splits import Split
+from potlp_jax.planning.policies import Policy
+from potlp_jax.sweep.runner import RESULTS, Sweep
+from potlp_jax.sweep.specification import Cell, Specification
+from potlp_jax.sweep.store import Row, Store
+
+def run(self, item):
+    time.sleep(0.002)
+    return Row(item, "satisfied", item.world / 7, 9.0, 1, 1, 0, 0, (1, 2), "p", "c", {}, "", 0.0)
+
+Sweep.run = run
+Sweep._is_possible = lambda self, cell, world: world % 3 != 1
+specification = Specification(
+    cells=(Cell("toy", "F goal"), Cell("toy", "F hazard")),
+    policies=(Policy.KNOWN_MAP, Policy.BASELINE, Policy.ORACLE),
+    worlds=40,
+)
+folder, draw, kills, processes = Path(sys.argv[1]), random.Random(5), 0, []
+def start():
+    pid = os.fork()
+    if pid:
+        return pid
+    sweep = Sweep(specification, folder)
+    while not sweep.finished():
+        sweep.step() or time.sleep(0.01)
+    os._exit(0)
+while kills < 60:
+    processes = processes or [start(), start()]
+    time.sleep(draw.random() * 0.05)
+    victim = processes.pop(draw.randrange(2))
+    os.kill(victim, signal.SIGKILL)
+    kills += os.WIFSIGNALED(os.waitpid(victim, 0)[1])
+    processes.append(start())
+    if Sweep(specification, folder).finished():
+        break
+for process in processes:
+    os.waitpid(process, 0)
+print(kills)
+"""
+
+
+def test_killed_many_times_at_random_moments_nothing_is_lost_and_nothing_is_there_twice(tmp_path):
+    # The work is a stand-in, so that hundreds of trials and tens of kills take seconds; two workers share the store.
+    done = subprocess.run([sys.executable, "-c", MANY_KILLS, str(tmp_path)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) >= 8
+    possible = [world for world in range(60) if world % 3 != 1][:40]
+    expected = [
+        (task, policy, world, world / 7)
+        for task in ("F goal", "F hazard")
+        for policy in ("baseline", "known-map", "oracle")
+        for world in possible
+    ]
+    rows = _rows(tmp_path)
+    assert [(row.item.task, row.item.policy, row.item.world, row.cost) for row in rows] == expected
+    assert not Store(tmp_path / RESULTS)._connection.execute("SELECT * FROM claims").fetchall()
+
+
+WORKER = """
+import sys
+from pathlib import Path
+from potlp_jax.sweep.runner import run_sweep
+from potlp_jax.sweep.specification import read_specification
+if __name__ == "__main__":
+    run_sweep(read_specification(Path(sys.argv[1])), Path(sys.argv[2]), int(sys.argv[3]))
+"""
+
+
+@pytest.fixture
+def command(tmp_path):
+    """Runs the sweep in a process of its own; its arguments but the number of workers."""
+    (tmp_path / "sweep.yaml").write_text(json.dumps(SMALL))
+    (tmp_path / "worker.py").write_text(WORKER)
+    return [sys.executable, str(tmp_path / "worker.py"), str(tmp_path / "sweep.yaml"), str(tmp_path / "out")]
+
+
+def test_killed_after_its_first_trials_it_goes_on_in_two_workers(finished, command, tmp_path):
+    process = subprocess.Popen([*command, "1"])
+    while not (tmp_path / "out" / RESULTS).exists() or not Store(tmp_path / "out" / RESULTS).count():
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    before = _rows(tmp_path / "out")
+    assert 1 <= len(before) < 9
+    assert subprocess.run([*command, "2"]).returncode == 0
+    assert _rows(tmp_path / "out") == _rows(finished)
+
+
+def _potlp(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def test_the_command_runs_and_shows_the_tables(finished, tmp_path):
+    specification = tmp_path / "sweep.yaml"
+    specification.write_text(json.dumps(SMALL))
+    told = _potlp("sweep", specification, "--out", finished, "--processes", 1, "--json")
+    assert told.exit_code == 0, told.stderr
+    (cell,) = json.loads(told.stdout)["cells"]
+    assert cell["satisfied"]["pairs"] == 3
+    shown = _potlp("sweep", "show", finished)
+    assert "!hazard U goal" in shown.stdout
+    assert "optimistic" in shown.stdout
+
+
+def test_export_has_a_line_per_trial(finished, tmp_path):
+    assert _potlp("sweep", "export", finished, "--out", tmp_path / "a.csv").exit_code == 0
+    with (tmp_path / "a.csv").open() as file:
+        read = list(csv.DictReader(file))
+    assert [(row["policy"], int(row["world"]), float(row["cost"])) for row in read] == [
+        (row.item.policy, row.item.world, row.cost) for row in _rows(finished)
+    ]
+    pandas = pytest.importorskip("pandas")
+    assert _potlp("sweep", "export", finished, "--out", tmp_path / "a.parquet").exit_code == 0
+    assert pandas.read_parquet(tmp_path / "a.parquet")["cost"].tolist() == [row.cost for row in _rows(finished)]
+
+
+def test_wrong_folders_and_names_are_refused(finished, tmp_path):
+    told = _potlp("sweep", "show", tmp_path)
+    assert told.exit_code == 2
+    assert "begin one with" in told.stderr
+    told = _potlp("sweep", "export", finished, "--out", tmp_path / "a.xlsx")
+    assert told.exit_code == 2
+    assert ".csv or .parquet" in told.stderr
+
+
+def test_a_task_that_is_impossible_everywhere_ends_the_sweep(tmp_path, monkeypatch):
+    monkeypatch.setattr("potlp_jax.sweep.runner.IMPOSSIBLE_IN_A_ROW", 3)
+    with pytest.raises(ValueError, match="impossible in 3 worlds in a row, up to number 7"):
+        run_sweep(_specification(tasks=["F (goal & hazard)"], policies=["baseline"]), tmp_path, 1)
