@@ -1,6 +1,9 @@
 """Strict modes for every test: no silent rank promotion, no silent dtype promotion."""
 
+import atexit
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import jax
@@ -13,6 +16,15 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 # The same examples in every run; HYPOTHESIS_PROFILE=default draws new ones.
 settings.register_profile("same", derandomize=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
+
+
+# Within one run the same program is compiled once, whichever test needs it first: the process that begins the run makes
+# a cache for itself and its workers, and takes it away.
+_CACHE = "POTLP_TEST_CACHE"
+if _CACHE not in os.environ:
+    os.environ[_CACHE] = tempfile.mkdtemp(prefix="potlp-tests-")
+    atexit.register(shutil.rmtree, os.environ[_CACHE], ignore_errors=True)
+jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
 
 
 @pytest.fixture(scope="session")

@@ -9,6 +9,7 @@ import potlp_jax
 
 ORDER = (
     "types",
+    "cache",
     "task",
     "world",
     "environments",
@@ -22,7 +23,6 @@ ORDER = (
     "sweep",
     "view",
     "bench",
-    "cache",
     "cli",
 )
 PACKAGE = Path(potlp_jax.__file__).parent

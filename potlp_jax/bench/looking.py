@@ -1,13 +1,14 @@
 """PO-TLP's decision with a trained network by phase: what looking and asking cost, beside what planning costs."""
 
-import jax
-from jaxtyping import Array
+import dataclasses
 
-from potlp_jax.bench.planner import PhaseRow, Phases, Scene, world_of
+import jax
+
+from potlp_jax.bench.planner import PhaseRow, Phases, Scene, measure_decision, world_of
 from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork
 from potlp_jax.learning.views import remember
-from potlp_jax.planning.policies import DecisionConfig, Move, Policy, assess, decide
+from potlp_jax.planning.policies import DecisionConfig, Policy, assess
 from potlp_jax.robot import photograph
 from potlp_jax.world.panorama import CameraConfig, Disturbance
 
@@ -15,14 +16,13 @@ from potlp_jax.world.panorama import CameraConfig, Disturbance
 def measure_looking(
     scene: Scene, trained: TrainedEstimator, config: DecisionConfig, repeats: int, camera: CameraConfig = CameraConfig()
 ) -> list[PhaseRow]:
-    """The phases that the network adds to a decision, in their order, then looking and deciding as a whole.
+    """The phases of looking, in their order, then those of the decision (``measure_decision``) with what was seen.
 
     * render: the panorama, in the simulator
     * first stage: the network's features of the panorama, once per look
     * remember: which cells are in sight, and a place in memory
-    * ways to subgoals: their distances from where the panoramas were taken, part of the next
+    * ways to subgoals: their distances from where the panoramas were taken, part of the estimates
     * estimates: the second stage, for every subgoal and outcome class
-    * whole: all of that, and the planning of ``measure_decision``
     """
     world, key = world_of(scene), jax.random.key(0)
     network = EstimatorNetwork(trained.config)
@@ -44,22 +44,5 @@ def measure_looking(
         scene.belief,
         subgoals,
     )
-    phases.measure(
-        "estimates",
-        lambda estimator, belief, subgoals, task: estimator(belief, subgoals, task),
-        estimator,
-        scene.belief,
-        subgoals,
-        scene.task,
-    )
-
-    def whole(scene: Scene, estimator: NetworkEstimator, key: Array) -> tuple[Move, NetworkEstimator]:
-        image = photograph(world_of(scene), scene.cell, key, camera, Disturbance())
-        estimator = estimator.look(image, scene.belief, scene.cell)
-        move = decide(
-            scene.belief, scene.cell, scene.state, scene.task, estimator, key, policy=Policy.POTLP, config=config
-        )
-        return move, estimator
-
-    phases.measure("whole", whole, scene, blind, key)
-    return phases.rows
+    seeing = dataclasses.replace(scene, estimator=estimator)
+    return [*phases.rows, *measure_decision(seeing, config, repeats, Policy.POTLP)]

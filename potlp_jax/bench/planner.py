@@ -217,11 +217,13 @@ class Phases:
         return call.run()
 
 
-def measure_decision(scene: Scene, config: DecisionConfig, repeats: int) -> list[PhaseRow]:
+def measure_decision(
+    scene: Scene, config: DecisionConfig, repeats: int, policy: Policy = Policy.ORACLE
+) -> list[PhaseRow]:
     """The phases of PO-TLP's decision in their order, each fed with the results of those before, then the whole.
 
     * assess: distances from the robot, frontiers, subgoals
-    * estimates: the true map's answers for every subgoal and outcome class
+    * estimates: the answers of the scene's estimator (the true map's) for every subgoal and outcome class
     * travel: distances between subgoals, as a planning problem
     * search: PO-UCT
     * path: the way to the target
@@ -257,7 +259,7 @@ def measure_decision(scene: Scene, config: DecisionConfig, repeats: int) -> list
             scene.task,
             scene.estimator,
             key,
-            policy=Policy.ORACLE,
+            policy=policy,
             config=config,
         )
 

@@ -247,6 +247,32 @@ def explain_command(
 
 
 @app.command(
+    "view",
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp view out/fire[/cyan] - out/fire/replay.html, opened in the browser
+
+[cyan]potlp view out/fire/trial.json --out page.html --no-open[/cyan]
+
+[dim]The page is one file. Arrow keys go by steps, Page Up and Page Down by decisions.[/dim]
+""",
+)
+@clear_errors
+def view_command(
+    trial: Annotated[Path, typer.Argument(metavar="TRIAL", help="Folder or file that `potlp run --out` wrote.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Page to write; default: replay.html beside it.")
+    ] = None,
+    open_it: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")] = True,
+) -> None:
+    """Replay a trial in the browser: the map as it was revealed, the actions and panoramas of every decision."""
+    from potlp_jax.cli.view import view_trial
+
+    view_trial(trial, out, open_it)
+
+
+@app.command(
     "export",
     epilog="""
 [bold]Examples[/bold]

@@ -136,7 +136,7 @@ def _print(rows: dict[str, list[Any]], where: dict[str, Any]) -> None:
     if "decision" in rows:
         out.print(_phase_table("one decision, by phase", rows["decision"]))
     if "looking" in rows:
-        out.print(_phase_table("looking and asking the trained network, by phase", rows["looking"]))
+        out.print(_phase_table("looking, and one decision with the trained network, by phase", rows["looking"]))
     out.print("medians; compile is what XLA took, run is one call after a warm-up", style="dim")
 
 

@@ -1,0 +1,240 @@
+"use strict";
+// Shows one recorded trial: the map as it was known at every step, and what the robot thought at its last decision.
+// `data` is what view/replay_page.py writes.
+
+function mountReplay(root, data) {
+  const seen = decodeIntegers(data.first_seen);
+  const occupied = Uint8Array.from(atob(data.occupied), (letter) => letter.charCodeAt(0));
+  const [rows, columns] = data.extent;
+  const scale = Math.max(2, Math.min(24, Math.floor(1100 / columns), Math.floor(640 / rows)));
+  const last = data.path.length - 1;
+  let step = 0;
+
+  root.classList.add("replay");
+  root.innerHTML = `
+    <p class="facts"></p>
+    <div class="scroll"><canvas class="map" role="img"></canvas></div>
+    <div class="controls">
+      <button type="button" data-go="decision-back" title="Page Up">◀ decision</button>
+      <button type="button" data-go="step-back" title="Left arrow" aria-label="one step back">◁</button>
+      <input type="range" min="0" max="${last}" value="0" aria-label="step of the trial">
+      <button type="button" data-go="step-on" title="Right arrow" aria-label="one step on">▷</button>
+      <button type="button" data-go="decision-on" title="Page Down">decision ▶</button>
+      <span class="where" aria-live="polite"></span>
+    </div>
+    <ul class="legend"></ul>
+    <h2 class="decision"></h2>
+    <div class="scroll"><table class="actions"></table></div>
+    <div class="views"></div>`;
+  const part = (name) => root.querySelector(name);
+  const canvas = part("canvas"), slider = part("input");
+  canvas.width = columns * scale;
+  canvas.height = rows * scale;
+  part(".facts").textContent = data.facts;
+  part(".legend").append(...legend());
+
+  function legend() {
+    const entries = data.propositions.map((name, bit) => [name, data.area_colours[bit]]);
+    for (const [state, name] of data.state_names.entries()) entries.push([name, data.state_colours[state]]);
+    return entries.map(([name, colour]) => {
+      const item = document.createElement("li"), box = document.createElement("i");
+      box.style.background = colour;
+      item.append(box, name);
+      return item;
+    });
+  }
+
+  function colour(name) {
+    return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  }
+
+  function cellBox(context, [row, column], size = 1) {
+    const side = scale * size;
+    context.rect((column + 0.5) * scale - side / 2, (row + 0.5) * scale - side / 2, side, side);
+  }
+
+  function line(context, cells, style, width, dash = []) {
+    context.beginPath();
+    for (const [row, column] of cells) context.lineTo((column + 0.5) * scale, (row + 0.5) * scale);
+    context.strokeStyle = style;
+    context.lineWidth = width;
+    context.setLineDash(dash);
+    context.lineJoin = context.lineCap = "round";
+    context.stroke();
+    context.setLineDash([]);
+  }
+
+  function drawCells(context) {
+    const paint = { free: colour("--free"), wall: colour("--wall"), unseen: colour("--unseen"), unseenWall: colour("--unseen-wall") };
+    for (let row = 0; row < rows; row++) {
+      for (let column = 0; column < columns; column++) {
+        const index = row * data.width + column;
+        const known = seen[index] >= 0 && seen[index] <= step;
+        context.fillStyle = occupied[index] ? (known ? paint.wall : paint.unseenWall) : known ? paint.free : paint.unseen;
+        context.fillRect(column * scale, row * scale, scale, scale);
+      }
+    }
+    for (const [row, column, letter] of data.letters) {
+      const index = row * data.width + column;
+      const known = seen[index] >= 0 && seen[index] <= step;
+      const bits = data.propositions.map((_, bit) => bit).filter((bit) => (letter >> bit) & 1);
+      bits.forEach((bit, place) => {
+        context.globalAlpha = known ? 1 : 0.35;
+        context.fillStyle = data.area_colours[bit];
+        context.fillRect(column * scale + (place * scale) / bits.length, row * scale, scale / bits.length, scale);
+      });
+      context.globalAlpha = 1;
+    }
+  }
+
+  function drawPath(context) {
+    for (let first = 0; first < step; ) {
+      let end = first + 1;
+      while (end < step && data.states[end] === data.states[first]) end++;
+      line(context, data.path.slice(first, end + 1), data.state_colours[data.states[first]], Math.max(2, scale / 2.5));
+      first = end;
+    }
+  }
+
+  function drawPlan(context, decision) {
+    if (!decision) return;
+    line(context, decision.path, colour("--chosen"), Math.max(1, scale / 5), [scale, scale]);
+    const chosen = decision.actions.find((action) => action.chosen);
+    context.font = `600 ${Math.max(11, scale * 2)}px system-ui, sans-serif`;
+    decision.subgoals.forEach((cell, number) => {
+      const mine = chosen && chosen.subgoal === number;
+      context.beginPath();
+      cellBox(context, cell, 2.2);
+      context.fillStyle = mine ? colour("--chosen") : "#0072B2";
+      context.fill();
+      context.lineWidth = 3;
+      context.strokeStyle = colour("--paper");
+      const [x, y] = [(cell[1] + 1.8) * scale, (cell[0] - 0.6) * scale];
+      context.strokeText(`s${number}`, x, y);
+      context.fillText(`s${number}`, x, y);
+    });
+  }
+
+  function drawRobot(context) {
+    context.beginPath();
+    const [row, column] = data.path[step];
+    context.arc((column + 0.5) * scale, (row + 0.5) * scale, Math.max(4, scale), 0, 2 * Math.PI);
+    context.fillStyle = "#FFD400";
+    context.fill();
+    context.lineWidth = 2;
+    context.strokeStyle = "#222222";
+    context.stroke();
+  }
+
+  function decisionNumber() {
+    let number = -1;
+    data.decisions.forEach((decision, index) => { if (decision.step <= step) number = index; });
+    return number;
+  }
+
+  function showActions(decision) {
+    const table = part(".actions");
+    table.replaceChildren();
+    if (!decision || !decision.actions.length) return;
+    const head = table.createTHead().insertRow();
+    for (const name of ["action", "P_S", "R_S", "R_F", "way", "Q", "visits"]) {
+      const cell = document.createElement("th");
+      cell.scope = "col";
+      cell.textContent = name;
+      head.append(cell);
+    }
+    const body = table.createTBody();
+    for (const action of decision.actions) {
+      const row = body.insertRow();
+      if (action.chosen) row.className = "chosen";
+      const numbers = [action.success_probability.toFixed(3)];
+      for (const name of ["success_cost", "failure_cost", "distance", "q_value"]) numbers.push(action[name].toFixed(1));
+      for (const text of [(action.chosen ? "▸ " : "") + action.name, ...numbers, String(action.visits)]) row.insertCell().textContent = text;
+    }
+  }
+
+  function showViews(decision) {
+    const views = part(".views");
+    views.replaceChildren();
+    if (!decision) return;
+    const chosen = decision.actions.find((action) => action.chosen);
+    decision.looks.forEach((look, number) => {
+      const source = data.panoramas[look];
+      if (!source) return;
+      const figure = document.createElement("figure"), image = document.createElement("img"), text = document.createElement("figcaption");
+      const mine = chosen && chosen.subgoal === number;
+      if (mine) figure.className = "chosen-view";
+      rolled(source, turn(data.decisions[look].cell, decision.subgoals[number])).then((url) => { image.src = url; });
+      text.textContent = `s${number} is in the middle${mine ? ", chosen" : ""}; seen ${look === decision.index ? "now" : `at decision ${look}`}`;
+      image.alt = `panorama in which subgoal ${number} is in the middle`;
+      figure.append(image, text);
+      views.append(figure);
+    });
+  }
+
+  // Columns run from -pi to pi of the bearing (world/panorama.py).
+  function turn(from, to) {
+    return Math.atan2(to[0] - from[0], to[1] - from[1]) / (2 * Math.PI);
+  }
+
+  function show() {
+    slider.value = step;
+    const number = decisionNumber(), decision = data.decisions[number], context = canvas.getContext("2d");
+    drawCells(context);
+    drawPath(context);
+    drawPlan(context, decision);
+    drawRobot(context);
+    const state = data.state_names[data.states[step]];
+    part(".where").textContent = `step ${step} of ${last}, decision ${number < 0 ? "-" : number} of ${data.decisions.length - 1}, ${state}`;
+    canvas.setAttribute("aria-label", `map after step ${step}: robot at row ${data.path[step][0]}, column ${data.path[step][1]}, ${state}`);
+    part(".decision").textContent = decision ? decision.text : "";
+    showActions(decision);
+    showViews(decision);
+  }
+
+  function go(where) {
+    const number = decisionNumber(), steps = data.decisions.map((decision) => decision.step);
+    if (where === "step-back") step = Math.max(0, step - 1);
+    if (where === "step-on") step = Math.min(last, step + 1);
+    if (where === "decision-on") step = steps[number + 1] ?? last;
+    if (where === "decision-back") step = (steps[number] < step ? steps[number] : steps[number - 1]) ?? 0;
+    if (where === "start") step = 0;
+    if (where === "end") step = last;
+    show();
+  }
+
+  root.addEventListener("click", (event) => {
+    const button = event.target.closest("button[data-go]");
+    if (button) go(button.dataset.go);
+  });
+  slider.addEventListener("input", () => { step = Number(slider.value); show(); });
+  const keys = { ArrowLeft: "step-back", ArrowRight: "step-on", PageUp: "decision-back", PageDown: "decision-on", Home: "start", End: "end" };
+  root.tabIndex = -1;
+  root.addEventListener("keydown", (event) => {
+    const where = keys[event.key];
+    if (!where) return;
+    event.preventDefault();
+    go(where);
+  });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", show);
+  show();
+  slider.focus({ preventScroll: true });
+}
+
+function decodeIntegers(text) {
+  const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  return new Int32Array(bytes.buffer);
+}
+
+// The image moved by a fraction of its width, so that what is there comes to the middle.
+async function rolled(source, fraction) {
+  const image = new Image();
+  image.src = source;
+  await image.decode();
+  const canvas = document.createElement("canvas");
+  canvas.width = image.width;
+  canvas.height = image.height;
+  const shift = -Math.round(fraction * image.width), context = canvas.getContext("2d");
+  for (const turn of [-1, 0, 1]) context.drawImage(image, shift + turn * image.width, 0);
+  return canvas.toDataURL("image/png");
+}

@@ -1,0 +1,135 @@
+"""A trial as one page that a browser opens: the map as it was revealed, and what was weighed at each decision."""
+
+import base64
+import html
+import io
+import json
+from collections.abc import Mapping
+from importlib import resources
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from potlp_jax.records import Decision, Trial
+from potlp_jax.task.task import Task
+from potlp_jax.view.decisions import action_name, describe_decision, rank_actions
+from potlp_jax.view.maps import map_extent
+from potlp_jax.view.style import area_colour, state_colour
+
+_JPEG_QUALITY: int = 80
+
+
+def replay_page(trial: Trial, panoramas: Mapping[int, UInt8[np.ndarray, "rows columns 3"]]) -> str:
+    """A self-contained page. ``panoramas`` are by number of the decision at which they were taken; may be empty."""
+    title = f"{trial.environment or 'trial'}: {trial.task_text}"
+    data = embed_json(replay_data(trial, panoramas))
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{html.escape(title)}</title>
+<style>{page_style()}</style>
+</head>
+<body>
+<h1><code>{html.escape(trial.task_text)}</code></h1>
+<main id="replay"></main>
+<script type="application/json" id="data">{data}</script>
+<script>{replay_script()}
+mountReplay(document.getElementById("replay"), JSON.parse(document.getElementById("data").textContent));</script>
+</body>
+</html>
+"""
+
+
+def embed_json(data: Any) -> str:
+    """JSON that may stand within a script element, whatever texts it holds."""
+    return json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def page_style() -> str:
+    """The style sheet of replays, for light and dark screens."""
+    return _text("replay.css")
+
+
+def replay_script() -> str:
+    """Defines ``mountReplay(element, data)``."""
+    return _text("replay.js")
+
+
+def _text(name: str) -> str:
+    return resources.files("potlp_jax.view").joinpath("data", name).read_text("utf-8")
+
+
+def replay_data(trial: Trial, panoramas: Mapping[int, UInt8[np.ndarray, "rows columns 3"]]) -> dict[str, Any]:
+    """What ``mountReplay`` shows, JSON-able."""
+    task = Task.from_hoa(trial.task_hoa, trial.propositions)
+    letters = np.asarray(trial.world.letters)
+    labelled = np.argwhere(letters > 0)
+    return {
+        "facts": _facts(trial),
+        "extent": list(map_extent(trial.world)),
+        "width": int(letters.shape[1]),
+        "occupied": _base64(np.asarray(trial.world.occupied, np.uint8)),
+        "first_seen": _base64(np.asarray(trial.first_seen, "<i4")),
+        "letters": [[int(row), int(column), int(letters[row, column])] for row, column in labelled],
+        "propositions": list(trial.propositions),
+        "area_colours": [area_colour(bit) for bit in range(len(trial.propositions))],
+        "state_names": [_state_name(task, state) for state in range(task.dfa.num_states)],
+        "state_colours": [state_colour(state) for state in range(task.dfa.num_states)],
+        "path": [list(cell) for cell in trial.path],
+        "states": list(trial.states),
+        "decisions": [_decision(trial, decision) for decision in trial.decisions],
+        "panoramas": {number: _jpeg(image) for number, image in panoramas.items()},
+    }
+
+
+def _facts(trial: Trial) -> str:
+    world = "" if trial.seed is None else f", world {trial.seed}"
+    return (
+        f"{trial.environment or 'no named environment'}{world}; policy {trial.policy}: {trial.outcome} at cost "
+        f"{trial.cost:.1f} after {len(trial.path) - 1} steps and {len(trial.decisions)} decisions"
+    )
+
+
+def _state_name(task: Task, state: int) -> str:
+    kind = ", satisfied" if task.dfa.accepting[state] else ", violated" if task.dfa.trap[state] else ""
+    return f"state {state}{kind}"
+
+
+def _decision(trial: Trial, decision: Decision) -> dict[str, Any]:
+    return {
+        "index": decision.index,
+        "step": decision.step,
+        "cell": list(decision.cell),
+        "text": describe_decision(trial, decision),
+        "subgoals": [list(cell) for cell in decision.subgoals],
+        "looks": list(decision.looks),
+        "path": [list(cell) for cell in decision.path],
+        "actions": [
+            {
+                "name": action_name(action),
+                "subgoal": action.subgoal,
+                "chosen": action.index == decision.choice,
+                "success_probability": action.success_probability,
+                "success_cost": action.success_cost,
+                "failure_cost": action.failure_cost,
+                "distance": action.distance,
+                "q_value": action.q_value,
+                "visits": action.visits,
+            }
+            for action in rank_actions(decision)
+        ],
+    }
+
+
+def _base64(array: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
+
+
+def _jpeg(image: UInt8[np.ndarray, "rows columns 3"]) -> str:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "JPEG", quality=_JPEG_QUALITY)
+    return f"data:image/jpeg;base64,{base64.b64encode(buffer.getvalue()).decode()}"

@@ -1,0 +1,142 @@
+"""The page of a trial: what it holds, and, where there is a browser, what it shows and how it is moved through."""
+
+import base64
+import dataclasses
+import json
+import re
+import shutil
+import subprocess
+
+import jax
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from potlp_jax.cli import app
+from potlp_jax.environments import make
+from potlp_jax.environments.splits import world_key
+from potlp_jax.planning.policies import Policy
+from potlp_jax.task.task import Task
+from potlp_jax.trial import run_trial
+from potlp_jax.trial_config import TrialConfig
+from potlp_jax.view.replay_page import replay_data, replay_page
+from potlp_jax.world.sensing import SensorConfig
+
+NEAR = TrialConfig(sensor=SensorConfig(range_cells=4.0))
+BROWSER = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
+
+
+@pytest.fixture(scope="module")
+def trial():
+    """A baseline's trial that looked once: no planner has to be compiled for it."""
+    toy = make("toy")
+    task = Task.from_formula(toy.tasks["2"], propositions=toy.propositions)
+    walked = run_trial(toy.generate(world_key("validation", 1, "toy")), task, Policy.BASELINE, jax.random.key(0), NEAR)
+    first = dataclasses.replace(walked.decisions[0], looks=(0,) * len(walked.decisions[0].subgoals))
+    return dataclasses.replace(walked, decisions=(first, *walked.decisions[1:]))
+
+
+@pytest.fixture(scope="module")
+def panoramas():
+    image = np.full((16, 64, 3), 200, np.uint8)
+    image[:, :8] = (0, 0, 255)
+    return {0: image}
+
+
+def test_the_data_hold_the_whole_trial(trial, panoramas):
+    data = json.loads(json.dumps(replay_data(trial, panoramas)))
+    seen = np.frombuffer(base64.b64decode(data["first_seen"]), "<i4").reshape(trial.first_seen.shape)
+    np.testing.assert_array_equal(seen, trial.first_seen)
+    occupied = np.frombuffer(base64.b64decode(data["occupied"]), np.uint8).reshape(seen.shape)
+    np.testing.assert_array_equal(occupied, np.asarray(trial.world.occupied))
+    letters = np.zeros(seen.shape, np.int32)
+    for row, column, letter in data["letters"]:
+        letters[row, column] = letter
+    np.testing.assert_array_equal(letters, np.asarray(trial.world.letters))
+    assert [tuple(cell) for cell in data["path"]] == list(trial.path)
+    assert data["states"] == list(trial.states)
+    assert len(data["decisions"]) == len(trial.decisions)
+    assert len(data["state_names"]) == len(data["state_colours"]) > max(trial.states)
+
+
+def test_no_text_ends_the_script(trial, panoramas):
+    hostile = dataclasses.replace(trial, environment="</script><script>alert(1)</script>", task_text="a < b & </h1>")
+    page = replay_page(hostile, panoramas)
+    assert page.count("<script") == page.count("</script>") == 2
+    assert "alert(1)</script>" not in page
+    assert "a &lt; b &amp; &lt;/h1&gt;" in page
+
+
+def test_the_page_needs_nothing_from_elsewhere(trial, panoramas):
+    page = replay_page(trial, panoramas)
+    assert not re.findall(r"""(?:src|href)\s*=\s*["'](?!data:)""", page)
+    assert "http" not in page
+
+
+def test_view_writes_the_page_beside_the_record(trial, tmp_path):
+    blind = dataclasses.replace(
+        trial, decisions=tuple(dataclasses.replace(decision, looks=()) for decision in trial.decisions)
+    )
+    blind.save(tmp_path / "trial.json")
+    told = CliRunner().invoke(app, ["view", str(tmp_path), "--no-open"])
+    assert told.exit_code == 0, told.stderr
+    assert (tmp_path / "replay.html").read_text("utf-8") == replay_page(blind, {})
+    told = CliRunner().invoke(app, ["view", str(tmp_path), "--no-open", "--out", str(tmp_path / "page.png")])
+    assert told.exit_code == 2
+    assert ".html" in told.stderr
+
+
+TOUR = """<script>
+const shown = [];
+const note = () => shown.push(document.querySelector(".where").textContent.trim());
+const press = (key) => {
+  document.querySelector("input").dispatchEvent(new KeyboardEvent("keydown", {key, bubbles: true}));
+  note();
+};
+note();
+for (const key of ["ArrowRight", "PageDown", "PageUp", "End", "ArrowRight", "ArrowLeft"]) press(key);
+document.querySelector('[data-go="step-on"]').click(); note();
+press("Home");
+const context = document.querySelector("canvas").getContext("2d");
+const colours = new Set();
+const pixels = context.getImageData(0, 0, context.canvas.width, context.canvas.height).data;
+for (let i = 0; i < pixels.length; i += 4) colours.add(`${pixels[i]},${pixels[i + 1]},${pixels[i + 2]}`);
+addEventListener("load", () => setTimeout(() => {
+  const images = [...document.querySelectorAll("figure img")].map((image) => image.src.slice(0, 15));
+  const result = document.createElement("pre");
+  result.id = "result";
+  result.textContent = JSON.stringify({shown, colours: [...colours], images, focus: document.activeElement.tagName});
+  document.body.append(result);
+}, 500));
+</script></body>"""
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed to look at the page with")
+def test_a_browser_shows_the_trial_and_keys_move_through_it(trial, panoramas, tmp_path):
+    page = tmp_path / "page.html"
+    page.write_text(replay_page(trial, panoramas).replace("</body>", TOUR), "utf-8")
+    assert BROWSER is not None
+    done = subprocess.run(
+        [
+            *(BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-quic"),
+            *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+            *(f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=5000", "--dump-dom", page.as_uri()),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    found = re.search(r'<pre id="result">(.*?)</pre>', done.stdout, re.DOTALL)
+    assert found is not None, done.stderr[-2000:]
+    result = json.loads(found[1].replace("&amp;", "&").replace("&lt;", "<").replace("&gt;", ">"))
+    last, decisions = len(trial.path) - 1, [decision.step for decision in trial.decisions]
+    steps = [int(re.match(r"step (\d+) of", text)[1]) for text in result["shown"]]
+    following = next((step for step in decisions if step > 1), last)
+    before = max((step for step in decisions if step < following), default=0)
+    assert steps == [0, 1, following, before, last, last, last - 1, last, 0]
+    assert "255,212,0" in result["colours"]
+    assert len(result["images"]) == len(trial.decisions[0].subgoals)
+    assert set(result["images"]) <= {"data:image/png;"}
+    assert result["focus"] == "INPUT"
