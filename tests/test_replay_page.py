@@ -4,8 +4,6 @@ import base64
 import dataclasses
 import json
 import re
-import shutil
-import subprocess
 
 import jax
 import numpy as np
@@ -21,11 +19,9 @@ from potlp_jax.trial import run_trial
 from potlp_jax.trial_config import TrialConfig
 from potlp_jax.view.replay_page import replay_data, replay_page
 from potlp_jax.world.sensing import SensorConfig
+from tests.reference.browser import BROWSER, dump_page
 
 NEAR = TrialConfig(sensor=SensorConfig(range_cells=4.0))
-BROWSER = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-)
 
 
 @pytest.fixture(scope="module")
@@ -117,20 +113,7 @@ addEventListener("load", () => setTimeout(() => {
 def test_a_browser_shows_the_trial_and_keys_move_through_it(trial, panoramas, tmp_path):
     page = tmp_path / "page.html"
     page.write_text(replay_page(trial, panoramas).replace("</body>", TOUR), "utf-8")
-    assert BROWSER is not None
-    done = subprocess.run(
-        [
-            *(BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-quic"),
-            *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-            *(f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=5000", "--dump-dom", page.as_uri()),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    found = re.search(r'<pre id="result">(.*?)</pre>', done.stdout, re.DOTALL)
-    assert found is not None, done.stderr[-2000:]
-    result = json.loads(found[1].replace("&amp;", "&").replace("&lt;", "<").replace("&gt;", ">"))
+    result = dump_page(page, tmp_path / "profile")
     last, decisions = len(trial.path) - 1, [decision.step for decision in trial.decisions]
     steps = [int(re.match(r"step (\d+) of", text)[1]) for text in result["shown"]]
     following = next((step for step in decisions if step > 1), last)

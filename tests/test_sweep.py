@@ -5,6 +5,7 @@ import dataclasses
 import json
 import multiprocessing
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -23,6 +24,8 @@ from potlp_jax.sweep.specification import SpecificationError, read_specification
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store, StoreError, process_start
 from potlp_jax.task.task import Task
 from potlp_jax.trial import run_trial
+from potlp_jax.view.report_page import Cell, report_page
+from tests.reference.browser import BROWSER, dump_page
 
 SMALL = {"environments": ["toy"], "tasks": [2], "policies": ["optimistic"], "worlds": 3, "first_world": 5}
 
@@ -304,6 +307,50 @@ def test_the_command_runs_and_shows_the_tables(finished, tmp_path):
     shown = _potlp("sweep", "show", finished)
     assert "!hazard U goal" in shown.stdout
     assert "optimistic" in shown.stdout
+
+
+def test_the_report_holds_tables_plots_and_replays_of_the_trials_as_they_were(finished, tmp_path):
+    page = tmp_path / "report.html"
+    told = _potlp("report", finished, "--out", page, "--replays", 1)
+    assert told.exit_code == 0, told.stderr
+    text = page.read_text("utf-8")
+    assert text.count("<svg") == 3
+    assert "!hazard U goal" in text
+    assert not re.findall(r"""<(?:img|script|link)[^>]*(?:src|href)\s*=\s*["'](?!data:)""", text)
+    data = re.findall(r'<script type="application/json" id="replay-0-\d">(.*?)</script>', text)
+    rows = [row for row in _rows(finished) if row.item.policy == "optimistic"]
+    paths = {path_digest([tuple(cell) for cell in json.loads(entry)["path"]]) for entry in data}
+    assert len(data) == 2
+    assert paths <= {row.path for row in rows}
+
+
+def test_a_report_without_replays_runs_nothing_again(finished, tmp_path, monkeypatch):
+    monkeypatch.delattr("potlp_jax.sweep.runner.run_trial")
+    told = _potlp("report", finished, "--out", tmp_path / "report.html", "--replays", 0)
+    assert told.exit_code == 0, told.stderr
+    assert 'id="replay-' not in (tmp_path / "report.html").read_text("utf-8")
+
+
+def test_where_the_loss_is():
+    costs = {"known-map": 10.0, "baseline": 30.0, "oracle": 12.0, "potlp": 17.0}
+    rows = {policy: dataclasses.replace(_row(Item("toy", "F goal", policy, 0)), cost=c) for policy, c in costs.items()}
+    page = report_page("a", [], list(costs), [Cell("toy", "F goal", [rows], [])])
+    assert "Of 20.0 that could be saved in a world, potlp saves 13.0 (65.0 %)" in page
+    assert "The estimator costs 5.0 (25.0 %" in page
+    assert "planner 2.0 (10.0 %" in page
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed to look at the page with")
+def test_a_browser_opens_a_replay_and_closes_it(finished, tmp_path):
+    page = tmp_path / "report.html"
+    assert _potlp("report", finished, "--out", page, "--replays", 1).exit_code == 0
+    tour = """<script>
+const button = document.querySelector("button[data-replay]"), shown = [];
+for (let i = 0; i < 2; i++) { button.click(); shown.push(document.querySelectorAll("canvas").length); }
+document.body.append(Object.assign(document.createElement("pre"), {id: "result", textContent: JSON.stringify(shown)}));
+</script></body>"""
+    page.write_text(page.read_text("utf-8").replace("</body>", tour), "utf-8")
+    assert dump_page(page, tmp_path / "profile") == [1, 0]
 
 
 def test_export_has_a_line_per_trial(finished, tmp_path):

@@ -5,15 +5,14 @@ import dataclasses
 import json as json_module
 import os
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from potlp_jax.cli.output import console, fail, note, output_folder, print_json, progress_bar
 from potlp_jax.environments.splits import Split
+from potlp_jax.sweep.results import compare_pairs, pair_rows
 from potlp_jax.sweep.runner import RESULTS, Progress, run_sweep
 from potlp_jax.sweep.specification import read_specification
-from potlp_jax.sweep.statistics import Comparison, TrialResult
 from potlp_jax.sweep.store import Row, Store
 from potlp_jax.view.comparisons import loss_lines, outcome_table, savings_table
 
@@ -86,8 +85,9 @@ def show_sweep(folder: Path, json: bool) -> None:
     store = open_store(folder)
     specification = store.facts()["specification"]
     comparisons = {
-        (cell["environment"], cell["task"]): compare_rows(
-            store.rows(cell["environment"], cell["task"]), specification["policies"]
+        (cell["environment"], cell["task"]): compare_pairs(
+            pair_rows(store.rows(cell["environment"], cell["task"]), specification["policies"]),
+            specification["policies"],
         )
         for cell in specification["cells"]
     }
@@ -114,19 +114,6 @@ def show_sweep(folder: Path, json: bool) -> None:
             out.print(outcome_table(comparison))
         for line in loss_lines(comparison):
             out.print(line, markup=False)
-
-
-def compare_rows(rows: Sequence[Row], policies: Sequence[str]) -> Comparison:
-    """The paired comparison over the worlds in which every policy has a row."""
-    by_world: dict[int, dict[str, Row]] = {}
-    for row in rows:
-        by_world.setdefault(row.item.world, {})[row.item.policy] = row
-    pairs = [found for _, found in sorted(by_world.items()) if len(found) == len(policies)]
-    return Comparison.from_results({policy: [_result(pair[policy]) for pair in pairs] for policy in policies})
-
-
-def _result(row: Row) -> TrialResult:
-    return TrialResult(cost=row.cost, outcome=row.outcome, budget=row.budget, status=row.status)
 
 
 def export_sweep(folder: Path, file: Path) -> None:

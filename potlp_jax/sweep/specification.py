@@ -30,7 +30,7 @@ from potlp_jax.environments import make
 from potlp_jax.environments.splits import MAX_INDEX, Split
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
-from potlp_jax.trial_config import TrialConfig
+from potlp_jax.trial_config import TrialConfig, trial_config_from_dict
 
 
 class SpecificationError(ValueError):
@@ -80,6 +80,20 @@ class Specification:
             "settings": dataclasses.asdict(self.config),
             "seed": self.seed,
         }
+
+
+def specification_from_store(data: Mapping[str, Any]) -> Specification:
+    """The specification that ``Specification.to_dict`` wrote."""
+    return Specification(
+        cells=tuple(Cell(**cell) for cell in data["cells"]),
+        policies=tuple(Policy(name) for name in data["policies"]),
+        worlds=data["worlds"],
+        split=Split(data["split"]),
+        first_world=data["first_world"],
+        estimator=None if data["estimator"] is None else Path(data["estimator"]),
+        config=trial_config_from_dict(data["settings"]),
+        seed=data["seed"],
+    )
 
 
 def configuration_hash(config: TrialConfig) -> str:

@@ -1,0 +1,172 @@
+"""A sweep as one page: tables, plots, and the worst and best trials to look at."""
+
+import dataclasses
+import html
+import math
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from typing import Any
+
+from potlp_jax.sweep.results import Pair, compare_pairs
+from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, Table
+from potlp_jax.view.comparisons import loss_lines
+from potlp_jax.view.replay_page import embed_json, page_style, replay_script
+from potlp_jax.view.report_plots import cumulative, savings_by_world, scatter
+
+ORACLE, LEARNED = "oracle", "potlp"
+
+
+@dataclasses.dataclass(frozen=True)
+class Shown:
+    """A trial that the page replays: why it is there, and its data (``replay_page.replay_data``)."""
+
+    reason: str
+    policy: str
+    world: int
+    cost: float
+    baseline: float
+    data: Mapping[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """One environment and task of a sweep, its paired rows, and the trials to replay."""
+
+    environment: str
+    task: str
+    pairs: Sequence[Pair]
+    shown: Sequence[Shown]
+
+
+def report_page(title: str, facts: Sequence[tuple[str, str]], policies: Sequence[str], cells: Sequence[Cell]) -> str:
+    """A self-contained page. ``facts`` are pairs of a name and a text that say what was run and with what."""
+    replays: list[str] = []
+    sections = [_section(number, cell, policies, replays) for number, cell in enumerate(cells)]
+    contents = "".join(
+        f'<li><a href="#cell{number}">{html.escape(cell.environment)}: <code>{html.escape(cell.task)}</code></a></li>'
+        for number, cell in enumerate(cells)
+    )
+    rows = "".join(
+        f"<tr><th scope=row>{html.escape(name)}</th><td>{html.escape(text)}</td></tr>" for name, text in facts
+    )
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{html.escape(title)}</title>
+<style>{page_style()}{_text("report.css")}</style>
+</head>
+<body>
+<main>
+<h1>{html.escape(title)}</h1>
+<nav aria-label="tasks"><ul>{contents}</ul></nav>
+{"".join(sections)}
+<section><h2>What was run</h2><div class="scroll"><table>{rows}</table></div></section>
+</main>
+{"".join(replays)}
+<script>{replay_script()}</script>
+<script>{_text("report.js")}</script>
+</body>
+</html>
+"""
+
+
+def _text(name: str) -> str:
+    return resources.files("potlp_jax.view").joinpath("data", name).read_text("utf-8")
+
+
+def _section(number: int, cell: Cell, policies: Sequence[str], replays: list[str]) -> str:
+    heading = f"<h2>{html.escape(cell.environment)}: <code>{html.escape(cell.task)}</code></h2>"
+    if not cell.pairs:
+        return f'<section id="cell{number}">{heading}<p>No world has been finished by all policies yet.</p></section>'
+    comparison = compare_pairs(cell.pairs, policies)
+    tables = [
+        _table(comparison.satisfied, f"{comparison.satisfied.pairs} worlds in which every policy satisfied the task")
+    ]
+    if comparison.satisfied.dropped:
+        tables.append(_table(comparison.charged, "all worlds, unsatisfied trials charged their budget"))
+    lines = [*_outcome_lines(comparison.outcomes), *loss_lines(comparison)]
+    plots = [
+        (scatter(cell.pairs, policies), "Costs world by world; below the line is cheaper than the baseline."),
+        (savings_by_world(cell.pairs, policies), "Savings against the baseline, worlds in order of savings."),
+        (cumulative(cell.pairs, policies), "Costs summed over the worlds."),
+    ]
+    figures = "".join(f"<figure>{svg}<figcaption>{caption}</figcaption></figure>" for svg, caption in plots)
+    return f"""<section id="cell{number}">{heading}
+{"".join(tables)}
+{"".join(f'<p class="note">{html.escape(line)}</p>' for line in lines)}
+{_losses(comparison.satisfied)}
+<div class="plots">{figures}</div>
+{_trials(number, cell.shown, replays)}
+</section>"""
+
+
+_COLUMNS = ("policy", "attainable savings", "95 % interval", "net savings", "savings per trial", "mean cost")
+
+
+def _table(table: Table, caption: str) -> str:
+    head = "".join(f"<th scope=col>{name}</th>" for name in _COLUMNS)
+    best = max((row.attainable_share for row in table.rows if row.policy != KNOWN_MAP), default=math.nan)
+    body = ""
+    for row in table.rows:
+        kind = ' class="best"' if row.attainable_share == best else ""
+        cells = (
+            row.policy,
+            _percent(row.attainable_share),
+            f"{_percent(row.attainable_low)} to {_percent(row.attainable_high)}",
+            _percent(row.net_savings),
+            f"{_percent(row.trial_savings)} ± {_percent(row.trial_savings_error)}",
+            "-" if math.isnan(row.mean_cost) else f"{row.mean_cost:.1f}",
+        )
+        body += f"<tr{kind}>" + "".join(f"<td>{html.escape(text)}</td>" for text in cells) + "</tr>"
+    return (
+        f'<div class="scroll"><table><caption class="note">{html.escape(caption)}</caption>'
+        f"<thead><tr>{head}</tr></thead>"
+        f"<tbody>{body}</tbody></table></div>"
+    )
+
+
+def _percent(share: float) -> str:
+    return "-" if math.isnan(share) else f"{100 * share + 0.0:.1f} %"
+
+
+def _outcome_lines(outcomes: Mapping[str, Mapping[str, int]]) -> list[str]:
+    counts = {
+        policy: ", ".join(f"{count} {name}" for name, count in found.items()) for policy, found in outcomes.items()
+    }
+    if len(set(counts.values())) == 1:
+        return [f"Every policy: {next(iter(counts.values()))}."]
+    return [f"{policy}: {text}" for policy, text in counts.items()]
+
+
+def _losses(table: Table) -> str:
+    """Where the savings come from, and where they are lost: to the planner, and to the estimator."""
+    costs = {row.policy: row.mean_cost for row in table.rows}
+    if not {ORACLE, LEARNED} <= costs.keys() or not costs[BASELINE] > costs[KNOWN_MAP]:
+        return ""
+    whole = costs[BASELINE] - costs[KNOWN_MAP]
+    planner, estimator = costs[ORACLE] - costs[KNOWN_MAP], costs[LEARNED] - costs[ORACLE]
+    saved = costs[BASELINE] - costs[LEARNED]
+    return (
+        f"<p>Of {whole:.1f} that could be saved in a world, {LEARNED} saves {saved:.1f} ({_percent(saved / whole)}). "
+        f"The estimator costs {estimator:.1f} ({_percent(estimator / whole)}; {LEARNED} against the true answers), the "
+        f"planner {planner:.1f} ({_percent(planner / whole)}; true answers against the known map).</p>"
+    )
+
+
+def _trials(number: int, shown: Sequence[Shown], replays: list[str]) -> str:
+    if not shown:
+        return ""
+    rows = ""
+    for index, trial in enumerate(shown):
+        name = f"replay-{number}-{index}"
+        replays.append(f'<script type="application/json" id="{name}">{embed_json(trial.data)}</script>\n')
+        cells = (trial.reason, trial.policy, str(trial.world), f"{trial.cost:.1f}", f"{trial.baseline:.1f}")
+        rows += "<tr>" + "".join(f"<td>{html.escape(text)}</td>" for text in cells)
+        rows += f'<td><button type="button" data-replay="{name}" aria-expanded="false">replay</button></td></tr>'
+    head = "".join(f"<th scope=col>{name}</th>" for name in ("trial", "policy", "world", "cost", "baseline", ""))
+    return (
+        f'<h3>Trials to look at</h3><div class="scroll trials"><table><thead><tr>{head}</tr></thead>'
+        f'<tbody>{rows}</tbody></table></div><div class="replay-place"></div>'
+    )

@@ -1,0 +1,116 @@
+"""The pictures of a report, as SVG that takes its text and line colours from the page, light or dark."""
+
+import io
+from collections.abc import Mapping, Sequence
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from potlp_jax.sweep.results import Pair
+from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, SATISFIED
+from potlp_jax.view.style import FAINT, INK, STATE_COLOURS, new_figure
+
+_MARKERS = "osD^vP*X"
+_LINES = ("-", "--", "-.", ":")
+
+
+def policy_styles(policies: Sequence[str]) -> Mapping[str, tuple[str, str, str]]:
+    """Colour, marker and line of each policy: told apart without colour too."""
+    return {
+        policy: (
+            STATE_COLOURS[index % len(STATE_COLOURS)],
+            _MARKERS[index % len(_MARKERS)],
+            _LINES[index % len(_LINES)],
+        )
+        for index, policy in enumerate(policies)
+    }
+
+
+def scatter(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
+    """Each policy's cost over the baseline's, world by world, as in the paper's figure."""
+    figure, axes = _axes(5.2, 4.6)
+    limit = 1.05 * max((row.cost for pair in pairs for row in pair.values()), default=1.0)
+    axes.plot([0, limit], [0, limit], color=FAINT, linewidth=1.0)
+    for policy, (colour, marker, _) in policy_styles(policies).items():
+        if policy == BASELINE:
+            continue
+        good = [pair for pair in pairs if pair[policy].outcome == pair[BASELINE].outcome == SATISFIED]
+        axes.scatter(
+            [pair[BASELINE].cost for pair in good],
+            [pair[policy].cost for pair in good],
+            s=10 if policy == KNOWN_MAP else 20,
+            color=colour,
+            marker=marker,
+            alpha=0.6,
+            linewidths=0,
+            label=policy,
+        )
+    axes.set(xlim=(0, limit), ylim=(0, limit), xlabel="cost of the baseline", ylabel="cost of the policy")
+    _legend(axes)
+    return _svg(figure)
+
+
+def cumulative(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
+    """Costs summed over the worlds, in the order of their numbers."""
+    figure, axes = _axes(5.2, 4.6)
+    for policy, (colour, _, line) in policy_styles(policies).items():
+        total = np.cumsum([pair[policy].cost for pair in pairs])
+        axes.plot(np.arange(1, len(pairs) + 1), total, line, color=colour, linewidth=1.6, label=policy)
+    axes.set(xlim=(0, max(len(pairs), 1)), xlabel="worlds", ylabel="cost of all of them")
+    axes.set_ylim(bottom=0)
+    _legend(axes)
+    return _svg(figure)
+
+
+def savings_by_world(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
+    """What each policy saves against the baseline, worlds in order of it: few large savings, or many small ones."""
+    figure, axes = _axes(5.2, 4.6)
+    axes.axhline(0.0, color=FAINT, linewidth=1.0)
+    share = 100 * (np.arange(len(pairs)) + 0.5) / max(len(pairs), 1)
+    for policy, (colour, _, line) in policy_styles(policies).items():
+        if policy == BASELINE:
+            continue
+        saved = np.sort([pair[BASELINE].cost - pair[policy].cost for pair in pairs])[::-1]
+        axes.plot(share, saved, line, color=colour, linewidth=1.6, label=policy)
+    axes.set(xlim=(0, 100), xlabel="worlds (%), most saved first", ylabel="saved against the baseline")
+    _legend(axes)
+    return _svg(figure)
+
+
+def _axes(width: float, height: float) -> tuple[Figure, Axes]:
+    figure = new_figure(width, height)
+    axes = figure.add_axes((0.14, 0.11, 0.83, 0.86))
+    axes.grid(color=FAINT, linewidth=0.3)
+    axes.set_axisbelow(True)
+    return figure, axes
+
+
+def _legend(axes: Axes) -> None:
+    axes.legend(fontsize=8.5, frameon=False)
+
+
+def _svg(figure: Figure) -> str:
+    """The picture as an element of a page; its ink and grey become those of the page, its paper transparent."""
+    figure.patch.set_alpha(0.0)
+    for axes in figure.axes:
+        axes.patch.set_alpha(0.0)
+    buffer = io.StringIO()
+    _recolour(figure)
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "potlp"}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    return text.replace(INK, "currentColor").replace(FAINT.lower(), "var(--faint)")
+
+
+def _recolour(figure: Figure) -> None:
+    """Everything that is written in ink."""
+    for axes in figure.axes:
+        axes.tick_params(colors=INK, labelsize=8.5)
+        legend = axes.get_legend()
+        for item in (axes.xaxis.label, axes.yaxis.label, *(() if legend is None else legend.get_texts())):
+            item.set_color(INK)
+        for spine in axes.spines.values():
+            spine.set_edgecolor(INK)
