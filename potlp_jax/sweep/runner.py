@@ -7,6 +7,7 @@ needs nothing else, so workers may be killed, started again, or belong to severa
 import dataclasses
 import multiprocessing
 import os
+import signal
 import subprocess
 import time
 import zlib
@@ -245,6 +246,8 @@ def _work_in_processes(sweep: Sweep, folder: Path, processes: int, report: Calla
 
 def _work(specification: Specification, folder: Path, core: int | None) -> None:
     """A worker: works until nothing is left, or the process that started it is gone."""
+    # An interrupt from the terminal reaches all processes; the one that started this one ends it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     if core is not None:
         # Before XLA starts, which then uses one thread.
         os.sched_setaffinity(0, {core})
