@@ -105,7 +105,7 @@ function mountReplay(root, data) {
       const mine = chosen && chosen.subgoal === number;
       context.beginPath();
       cellBox(context, cell, 2.2);
-      context.fillStyle = mine ? colour("--chosen") : "#0072B2";
+      context.fillStyle = colour(mine ? "--chosen" : "--subgoal");
       context.fill();
       context.lineWidth = 3;
       context.strokeStyle = colour("--paper");
