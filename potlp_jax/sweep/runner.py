@@ -73,6 +73,7 @@ class Sweep:
         Raises:
             WorldError: a task is impossible in too many worlds in a row.
         """
+        done = self.store.done()
         for cell in self.specification.cells:
             known = self.store.possible(cell.environment, cell.task)
             worlds = self._worlds(known)
@@ -86,8 +87,9 @@ class Sweep:
                     )
                     return True
             for policy in self.specification.policies:
-                wanted = [Item(cell.environment, cell.task, policy.value, world) for world in worlds]
-                claimed = self.store.claim(wanted, BLOCK)
+                items = [Item(cell.environment, cell.task, policy.value, world) for world in worlds]
+                missing = [item for item in items if item not in done]
+                claimed = self.store.claim(missing, BLOCK) if missing else []
                 for item in claimed:
                     self.store.finish([self.run(item)])
                 if claimed:
