@@ -92,7 +92,7 @@ class SimulatedRobot:
 
     def advance(self, path: KnownPath, stop: Stop) -> Leg:
         """Follow ``path`` through known space, observing at every cell, until it ends or ``stop`` says so."""
-        self._belief, self._first_seen, moved = _follow(
+        self._belief, self._first_seen, moved = follow(
             self._world, self._belief, self._first_seen, path, jnp.int32(self._steps), stop, self._config.sensor
         )
         moved = int(moved)
@@ -120,7 +120,7 @@ def photograph(
 
 
 @partial(jax.jit, static_argnames=("config",))
-def _follow(
+def follow(
     world: World,
     belief: BeliefMap,
     first_seen: Int32[Array, "H W"],
@@ -129,7 +129,10 @@ def _follow(
     stop: Stop,
     config: SensorConfig,
 ) -> tuple[BeliefMap, Int32[Array, "H W"], Int32[Array, ""]]:
-    """Move along the path cell by cell; returns the belief, when each cell was first seen, and the moves made."""
+    """Move along the path cell by cell, ``steps`` made before.
+
+    Returns the belief, the step at which each cell was first seen, and the moves made. ``config`` is static.
+    """
     known_before = jnp.sum(~belief.unknown)
     propositions_before = _propositions_seen(belief)
     target = path.cells[path.length]

@@ -54,7 +54,7 @@ def run_trial(
     config = TrialConfig() if config is None else config
     if policy is Policy.KNOWN_MAP:
         config = dataclasses.replace(config, revealed=True)
-    robot = SimulatedRobot(world, config, jax.random.fold_in(key, _SENSING))
+    robot = SimulatedRobot(world, config, sensing_key(key))
     trained = estimator_for(task.propositions, estimator) if policy is Policy.POTLP else None
     eyes = _first_estimator(policy, world, trained)
     loop = Loop(robot, task, arrays if arrays is not None else task.arrays, policy, eyes, key, config)
@@ -102,8 +102,7 @@ class Loop:
     ) -> None:
         self._robot, self._task, self._arrays = robot, task, arrays
         self._policy, self._estimator, self._config = policy, estimator, config
-        # The trial's key is folded by name, so that no policy's draws depend on another use of the key.
-        self._key = jax.random.fold_in(key, _PLANNING)
+        self._key = planning_key(key)
         self._visits: Counter[tuple[tuple[int, int], int, int]] = Counter()
         belief, cell = robot.observe()
         letter = int(belief.letters[cell])
@@ -274,8 +273,15 @@ def versions() -> dict[str, str]:
     return {name: importlib.metadata.version(name) for name in ("potlp-jax", "jax", "numpy")}
 
 
-_PLANNING, _SENSING = 1, 2
-"""Names under which the trial's key is folded for the planner and for the sensors."""
+def planning_key(key: PRNGKeyArray) -> PRNGKeyArray:
+    """What a trial's key becomes for the planner: folded by name, so that no draw depends on another use of the key."""
+    return jax.random.fold_in(key, 1)
+
+
+def sensing_key(key: PRNGKeyArray) -> PRNGKeyArray:
+    """What a trial's key becomes for the sensors."""
+    return jax.random.fold_in(key, 2)
+
 
 _decide = jax.jit(decide, static_argnames=("policy", "config"))
 _look_numbers = jax.jit(look_of_subgoals)

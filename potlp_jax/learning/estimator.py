@@ -28,8 +28,14 @@ from potlp_jax.world.frontiers import Subgoals
 from potlp_jax.world.grid import BeliefMap
 from potlp_jax.world.panorama import bearing
 
-MEMORY: int = 64
+MEMORY: int = 32
 """Panoramas that are remembered. A trial takes 14 to 100, of which seldom more than a dozen still show a frontier."""
+
+NEAR: int = 16
+"""Cells between two subgoals that border the same place."""
+
+SURE: float = 0.97
+"""The most that the chances of subgoals side by side come to together."""
 
 
 @struct.dataclass(kw_only=True)
@@ -71,8 +77,9 @@ class NetworkEstimator:
             [jnp.zeros((subgoals.mask.shape[0], classes)), *[jnp.ones((subgoals.mask.shape[0], classes))] * 2]
         )
         probability, success_cost, failure_cost = jax.lax.fori_loop(0, real, ask, nothing)
+        chances = exclusive_chances(jnp.where(task.class_mask[None, :], probability, 0.0), subgoals)
         return Estimates(
-            success_probability=jnp.where(task.class_mask[None, :], probability, 0.0),
+            success_probability=chances,
             success_cost=success_cost * belief.resolution,
             failure_cost=failure_cost * belief.resolution,
         )
@@ -91,6 +98,23 @@ class NetworkEstimator:
         """The estimator after it has seen ``panorama`` from ``cell``."""
         features = EstimatorNetwork(self.config).encode(self.params, panorama)
         return dataclasses.replace(self, views=remember(self.views, features, belief, cell))
+
+
+def exclusive_chances(chances: Float32[Array, "S C"], subgoals: Subgoals) -> Float32[Array, "S C"]:
+    """P_S of subgoals side by side, raised so that, taken as independent, they fail together as rarely as they do.
+
+    Two frontiers within ``NEAR`` cells of each other border the same place, and what is asked for is in one of its
+    parts: both succeed in less than 1 % of the cases, and one of them does with about the sum of their chances
+    (``eval.exclusion``). Eq. 3 takes attempts as independent. The logarithms of the chances to fail are scaled by a
+    common factor, so that all subgoals near one fail together with ``1 - sum``, at least ``1 - SURE``.
+    """
+    apart = subgoals.cells[:, None] - subgoals.cells[None, :]
+    near = jnp.sum(apart**2, axis=2) <= NEAR**2
+    near = jnp.where(near & subgoals.mask[:, None] & subgoals.mask[None, :], 1.0, 0.0)
+    fails = jnp.log1p(-jnp.minimum(chances, jnp.float32(1.0 - 1e-6)))
+    independent, together = near @ fails, jnp.log1p(-jnp.minimum(near @ chances, SURE))
+    factor = jnp.where(independent < 0.0, together / jnp.minimum(independent, -1e-12), 1.0)
+    return -jnp.expm1(fails * jnp.maximum(factor, 1.0))
 
 
 def _distances(belief: BeliefMap, poses: Int32[Array, "S 2"], subgoals: Subgoals) -> Float32[Array, " S"]:

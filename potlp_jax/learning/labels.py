@@ -50,20 +50,28 @@ def true_labels(world: World, belief: BeliefMap, subgoals: Subgoals, task: TaskA
     state_of_class = jnp.argmax(same_stay, axis=1)
     used = jnp.any((state_of_class[:, None] == jnp.arange(states)[None, :]) & task.class_mask[:, None], axis=0)
 
-    # Real pairs first, so that chunks of padding cost next to nothing.
+    # Real pairs first, so that padding costs nothing.
     real = (subgoals.mask[:, None] & used[None, :]).reshape(-1)
     order = jnp.argsort(~real, stable=True).astype(jnp.int32)
+    chunks = -(-jnp.sum(real, dtype=jnp.int32) // lanes)
     missing = -(count * states) % lanes
-    chunks = (jnp.pad(order, (0, missing)).reshape(-1, lanes), jnp.pad(real[order], (0, missing)).reshape(-1, lanes))
+    pairs, real = jnp.pad(order, (0, missing)), jnp.pad(real[order], (0, missing))
 
-    def label(chunk):
-        pairs, real = chunk
-        return _labels_of_lanes(world, belief, subgoals, task, stays, pairs // states, pairs % states, real)
+    def label(chunk, found):
+        chosen, wanted = (jax.lax.dynamic_slice_in_dim(array, chunk * lanes, lanes) for array in (pairs, real))
+        labels = _labels_of_lanes(world, belief, subgoals, task, stays, chosen // states, chosen % states, wanted)
+        return jax.tree.map(
+            lambda into, rows: jax.lax.dynamic_update_slice_in_dim(into, rows, chunk * lanes, axis=0), found, labels
+        )
 
-    success_cost, failure_cost = jax.lax.map(label, chunks)
+    nothing = (
+        jnp.full((pairs.shape[0], task.class_mask.shape[0]), jnp.inf, jnp.float32),
+        jnp.zeros(pairs.shape[0], jnp.float32),
+    )
+    success_cost, failure_cost = jax.lax.fori_loop(0, chunks, label, nothing)
     back = jnp.argsort(order)
-    success_cost = success_cost.reshape(-1, task.class_mask.shape[0])[back].reshape(count, states, -1)
-    failure_cost = failure_cost.reshape(-1)[back].reshape(count, states)
+    success_cost = success_cost[back].reshape(count, states, -1)
+    failure_cost = failure_cost[back].reshape(count, states)
     success_cost = jnp.take_along_axis(success_cost, state_of_class[None, None, :], axis=1)[:, 0]
     reached = jnp.isfinite(success_cost) & task.class_mask[None, :]
     return Estimates(

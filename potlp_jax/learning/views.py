@@ -6,7 +6,7 @@ them later. Memory is fixed: a new look takes the place of one that no frontier 
 
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float32, Int32, UInt32
+from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
 from potlp_jax.types import NO_SUBGOAL, Status, status_array, status_if
 from potlp_jax.world.frontiers import Subgoals, frontier_cells
@@ -64,8 +64,7 @@ def remember(
     look_of_cell = jnp.where(in_sight, views.count, views.look_of_cell)
     # Of the looks that no frontier refers to the oldest makes room; an empty place is older than any.
     frontier = frontier_cells(belief, belief.free)
-    wanted = jnp.where(frontier, look_of_cell, NO_LOOK).reshape(-1)
-    needed = jnp.any(views.look[:, None] == wanted[None, :], axis=1) & (views.look != NO_LOOK)
+    needed = _referred_to(views.look, jnp.where(frontier, look_of_cell, NO_LOOK).reshape(-1))
     place = jnp.argmin(jnp.where(needed, views.look + views.count + 1, views.look))
     return Views(
         features=views.features.at[place].set(features),
@@ -75,6 +74,14 @@ def remember(
         count=views.count + 1,
         status=views.status | status_if(needed[place], Status.VIEW_OVERFLOW),
     )
+
+
+def _referred_to(looks: Int32[Array, " V"], wanted: Int32[Array, " N"]) -> Bool[Array, " V"]:
+    """Which of the remembered looks, by place, are among the wanted ones."""
+    order = jnp.argsort(looks)
+    found = jnp.minimum(jnp.searchsorted(looks[order], wanted), looks.shape[0] - 1)
+    same = (looks[order][found] == wanted) & (wanted != NO_LOOK)
+    return jnp.zeros(looks.shape, bool).at[order[found]].max(same)
 
 
 def look_of_subgoals(views: Views, subgoals: Subgoals) -> Int32[Array, " S"]:

@@ -172,14 +172,16 @@ def decide(
     ``estimator`` answers P_S, R_S and R_F for the policies that search and is None for the others.
     """
     situation = assess(belief, cell, state, task, config.frontiers)
-    if policy is Policy.OPTIMISTIC:
-        return _optimistic(situation, config)
-    if policy.searches:
-        if estimator is None:
-            raise ValueError(f"policy {policy.value!r} needs an estimator")
-        estimates = estimator(belief, situation.subgoals, task)
-        return search_move(situation, estimates, key, config)
-    return _finish_or_frontier(situation, config)
+    if not policy.searches:
+        return direct_move(situation, policy, config)
+    if estimator is None:
+        raise ValueError(f"policy {policy.value!r} needs an estimator")
+    return search_move(situation, estimator(belief, situation.subgoals, task), key, config)
+
+
+def direct_move(situation: Situation, policy: Policy, config: DecisionConfig) -> Move:
+    """The move of a policy that does not search."""
+    return _optimistic(situation, config) if policy is Policy.OPTIMISTIC else _finish_or_frontier(situation, config)
 
 
 def planning_problem(situation: Situation, estimates: Estimates, config: DecisionConfig) -> PlanningProblem:
@@ -253,9 +255,13 @@ def search_move(situation: Situation, estimates: Estimates, key: PRNGKeyArray, c
 
     ``estimates`` are those of the situation's subgoals. Where no action is available: the nearest frontier.
     """
-    task, subgoals = situation.task, situation.subgoals
     problem = planning_problem(situation, estimates, config)
-    plan = plan_actions(problem, key, config.search)
+    return planned_move(situation, problem, plan_actions(problem, key, config.search), config)
+
+
+def planned_move(situation: Situation, problem: PlanningProblem, plan: Plan, config: DecisionConfig) -> Move:
+    """The move that carries out the plan of a situation's problem."""
+    task, subgoals = situation.task, situation.subgoals
     search = Search(problem=problem, plan=plan, terms=action_terms(problem, initial_history(problem)))
 
     frontier_cell, frontier_state, frontier_cost = _nearest_frontier(situation)

@@ -182,7 +182,7 @@ def _layers_first(transitions: Int32[Array, "H W Z"]) -> Int32[Array, "Z H W 1"]
 def _map_sources(solve, cells: Int32[Array, "Q 2"], states: Int32[Array, " Q"]) -> Array:
     """Apply ``solve`` to ``LANES`` sources at a time; results carry the sources in the last axis.
 
-    Real sources are gathered in front, so that chunks of empty ones cost next to nothing.
+    Real sources are gathered in front, so that empty ones cost nothing: they reach nothing, ``inf``.
     """
     count = cells.shape[0]
     lanes = min(LANES, count)
@@ -193,6 +193,15 @@ def _map_sources(solve, cells: Int32[Array, "Q 2"], states: Int32[Array, " Q"]) 
     back = jnp.argsort(order)
     cells = jnp.pad(cells[order], ((0, missing), (0, 0)))
     states = jnp.pad(states[order], (0, missing), constant_values=NO_STATE)
-    chunks = (cells.reshape(-1, lanes, 2), states.reshape(-1, lanes))
-    solved = jnp.moveaxis(jax.lax.map(lambda chunk: solve(*chunk), chunks), 0, -2)
-    return solved.reshape(*solved.shape[:-2], -1)[..., back]
+    real = jnp.sum(states != NO_STATE, dtype=jnp.int32)
+
+    def solve_chunk(chunk, solved):
+        first = chunk * lanes
+        part = solve(
+            jax.lax.dynamic_slice_in_dim(cells, first, lanes), jax.lax.dynamic_slice_in_dim(states, first, lanes)
+        )
+        return jax.lax.dynamic_update_slice_in_dim(solved, part, first, axis=solved.ndim - 1)
+
+    one = jax.eval_shape(solve, cells[:lanes], states[:lanes])
+    unreached = jnp.full((*one.shape[:-1], count + missing), jnp.inf, jnp.float32)
+    return jax.lax.fori_loop(0, -(-real // lanes), solve_chunk, unreached)[..., back]

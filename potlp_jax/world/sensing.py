@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Int, Int32, UInt8
 from potlp_jax.world.grid import BeliefMap, World
 
 _OCCUPIED_BIT = 1
+_BLOCK = 12
 _DIAGONALS = ((-1, -1), (-1, 1), (1, -1), (1, 1))
 
 
@@ -91,14 +92,30 @@ def visible(occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], config: Senso
 
 
 def _reach(occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], lines: _Lines) -> Int32[Array, " lines"]:
-    """The last step of every line before it is stopped."""
+    """The last step of every line before it is stopped. A few steps at a time, until all lines are."""
     rows, columns = lines.margin
     padded = jnp.pad(_cell_codes(occupied), ((rows, rows), (columns, columns)), constant_values=_OCCUPIED_BIT)
     window = jax.lax.dynamic_slice(padded, (cell[0], cell[1]), (2 * rows + 1, 2 * columns + 1)).ravel()
-    code = jnp.append(window, jnp.uint8(_OCCUPIED_BIT))[lines.cells]
-    steps = lines.cells.shape[0]
-    step = jnp.arange(steps, dtype=jnp.int32)[:, None]
-    return jnp.min(jnp.where((code & lines.blocking) != 0, step, jnp.int32(steps)), axis=0, initial=steps)
+    codes = jnp.append(window, jnp.uint8(_OCCUPIED_BIT))
+    steps, count = lines.cells.shape
+    blocks = max(1, -(-steps // _BLOCK))
+    missing = blocks * _BLOCK - steps
+    # Beyond the last step every line is stopped.
+    cells = np.pad(lines.cells, ((0, missing), (0, 0)), constant_values=window.shape[0]).reshape(blocks, _BLOCK, count)
+    blocking = np.pad(lines.blocking, ((0, missing), (0, 0)), constant_values=_OCCUPIED_BIT)
+    cells, blocking = jnp.asarray(cells), jnp.asarray(blocking.reshape(blocks, _BLOCK, count))
+
+    def go_on(carry):
+        block, reach = carry
+        step = block * _BLOCK + jnp.arange(_BLOCK, dtype=jnp.int32)[:, None]
+        stopped = (codes[cells[block]] & blocking[block]) != 0
+        return block + 1, jnp.minimum(reach, jnp.min(jnp.where(stopped, step, jnp.int32(steps)), axis=0))
+
+    def some_go_on(carry):
+        block, reach = carry
+        return (block < blocks) & jnp.any(reach >= jnp.minimum(block * _BLOCK, steps))
+
+    return jax.lax.while_loop(some_go_on, go_on, (jnp.int32(0), jnp.full(count, steps, jnp.int32)))[1]
 
 
 def _cell_codes(occupied: Bool[Array, "H W"]) -> UInt8[Array, "H W"]:
