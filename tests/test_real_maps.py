@@ -75,6 +75,7 @@ def test_rooms_of_plans_stay_connected(external_data, name, rooms, reached):
     assert len(large & found) == reached
 
 
+@pytest.mark.filterwarnings("ignore:.*cut off:potlp_jax.environments.map_server.MapWarning")
 @pytest.mark.parametrize(
     ("name", "resolution", "radius", "shape"),
     [

@@ -38,7 +38,7 @@ PLACE_RADIUS: float = 0.5
 """Metres around a point where its proposition is true, unless a radius is given."""
 
 SHOWN: int = 8
-"""Passages in the table; JSON has all."""
+"""Passages, and parts that are cut off, that are printed; JSON has all."""
 
 
 def inspect_map(file: Path, resolution: float, radius: float, start: str | None, json: bool) -> None:
@@ -72,17 +72,18 @@ def write_clean_map(file: Path, out: Path, resolution: float, radius: float, sta
     clean = clean_map(image_map, resolution, radius, _read_start(start), "--start")
     out.parent.mkdir(parents=True, exist_ok=True)
     image = save_map(out, clean.free, clean.frame)
-    world = f"map:{out},places=LABELS.yaml,resolution={resolution:g},radius=0"
+    world = _environment(out, None, resolution, 0.0)
     if json:
         print_json({**_clean_facts(clean, radius), "files": [str(out), str(image)], "world": world})
         return
     output = console()
     for name, text in _clean_lines(clean, radius):
         output.print(f"{name:12} {text}", markup=False)
-    for part in clean.cut_off:
-        output.print(f"- {_cut_off_text(part.at, part.area)}", markup=False)
+    for line in _cut_off_lines(clean):
+        output.print(f"- {line}", markup=False)
     output.print(f"wrote {out} and {image}", markup=False)
-    output.print(f"next: potlp run {world} (the radius is in the map already)", markup=False, style="dim")
+    next_one = f"potlp map label {out} --resolution {resolution:g} --radius 0, then potlp run {world}"
+    output.print(f"next: {next_one} (the radius is in the map already)", markup=False, style="dim")
 
 
 def label_map(
@@ -117,9 +118,9 @@ def label_map(
     for name, count in cells.items():
         output.print(f"{name:12} {count} cells, {count * side**2:.1f} m2", markup=False)
     output.print(f"wrote {target}", markup=False)
-    options = "" if target == file.with_suffix(".places.yaml") else f",places={target}"
     task = labels.tasks[0][0] if labels.tasks else " & ".join(f"F {name}" for name in labels.names)
-    output.print(f"next: potlp run map:{file}{options} --task '{task}'", markup=False, style="dim")
+    world = _environment(file, None if out is None else target, resolution, radius)
+    output.print(f"next: potlp run {world} --task '{task}'", markup=False, style="dim")
 
 
 def preview_map(file: Path, out: Path, labels: Path | None, resolution: float, radius: float) -> None:
@@ -135,6 +136,13 @@ def preview_map(file: Path, out: Path, labels: Path | None, resolution: float, r
         figure = draw_places(family, family.generate(jax.random.key(0)), _title(file, family.clean))
     save_figure(figure, out)
     console().print(f"wrote {out}", markup=False)
+
+
+def _environment(file: Path, places: Path | None, resolution: float, radius: float) -> str:
+    """How the command line names the worlds on a map; what is as by default is left out."""
+    chosen = {"resolution": resolution, "radius": radius}
+    options = [f"{name}={value:g}" for name, value in chosen.items() if value != getattr(RosMapConfig, name)]
+    return ",".join([f"map:{file}", *([] if places is None else [f"places={places}"]), *options])
 
 
 @contextmanager
@@ -194,7 +202,7 @@ def _map_lines(image_map: OccupancyMap, survey: MapSurvey) -> Iterator[tuple[str
     shares = ((survey.free, "free"), (survey.occupied, "occupied"), (survey.unknown, "unknown"))
     yield "pixels", ", ".join(f"{100 * share:.1f} % {name}" for share, name in shares)
     specks = f", {survey.specks} of them specks" if survey.specks else ""
-    yield "free space", f"{survey.components} components{specks}; the largest has {survey.largest:.1f} m2"
+    yield "free space", f"connected parts: {survey.components}{specks}; the largest has {survey.largest:.1f} m2"
 
 
 def _clean_lines(clean: CleanMap, radius: float) -> Iterator[tuple[str, str]]:
@@ -237,12 +245,16 @@ def _defects(survey: MapSurvey, clean: CleanMap) -> Iterator[str]:
         yield f"{survey.specks} specks of free space that no robot can have seen: cleaning drops them"
     if survey.loose_obstacles:
         yield f"{survey.loose_obstacles} obstacles of a single pixel amid free space: kept; erase what is noise"
-    for part in clean.cut_off:
-        yield _cut_off_text(part.at, part.area)
+    yield from _cut_off_lines(clean)
 
 
-def _cut_off_text(at: Point, area: float) -> str:
-    return f"{area:.1f} m2 at [{at[0]:.2f}, {at[1]:.2f}] are cut off by the size of the cells: use smaller ones"
+def _cut_off_lines(clean: CleanMap) -> Iterator[str]:
+    why = "cut off by the size of the cells: use smaller ones"
+    for part in clean.cut_off[:SHOWN]:
+        yield f"{part.area:.1f} m2 at [{part.at[0]:.2f}, {part.at[1]:.2f}] are {why}"
+    rest = clean.cut_off[SHOWN:]
+    if rest:
+        yield f"{len(rest)} smaller parts, {sum(part.area for part in rest):.1f} m2 in all, are {why}"
 
 
 def _joined(

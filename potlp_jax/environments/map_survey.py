@@ -1,5 +1,6 @@
 """What a map holds, before it serves as a world: shares, components, passages and what looks like a defect."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,9 @@ WIDEST = 1.5
 
 PART_AREA = 2.0
 """Square metres on either side from which on a narrowing is a passage, not a gap between two chairs."""
+
+WIDE_SHARE = 1 / 16
+"""Of `PART_AREA` that has to lie in a part's wide places: all parts with less are passed over without a closer look."""
 
 SPECK = 0.2
 """Square metres below which a component of the free space is a speck."""
@@ -111,9 +115,9 @@ def find_passages(
         # In the middle of a passage of an odd number of pixels, the nearest obstacle's centre is so far away.
         wide = clearance >= (width + 1) / 2
         labels = component_labels(wide)
-        for meeting in _meetings(parts, labels):
+        for meeting in _meetings(parts, labels, smallest, (width + 2) / 2):
             passages += _passages_between(meeting, parts, labels, clearance, kept, frame, width)
-        parts = np.where((np.bincount(labels.ravel()) >= smallest)[labels], labels, 0)
+        parts = np.where((np.bincount(labels.ravel()) >= WIDE_SHARE * smallest)[labels], labels, 0)
     return tuple(sorted(passages, key=lambda passage: (passage.width, -passage.area)))
 
 
@@ -129,8 +133,13 @@ def _kept_pixels(clean: CleanMap, frame: GridFrame) -> Bool[np.ndarray, "H W"]:
     return kept
 
 
-def _meetings(parts: Int32[np.ndarray, "H W"], labels: Int32[np.ndarray, "H W"]) -> list[list[int]]:
-    """Numbers of the parts that have come together in one component, the largest part first."""
+def _meetings(
+    parts: Int32[np.ndarray, "H W"], labels: Int32[np.ndarray, "H W"], smallest: float, reach: float
+) -> list[list[int]]:
+    """Numbers of the parts that have come together in one component, the largest part first.
+
+    Parts count as ``smallest`` pixels or more if they do with all that is nearer than ``reach`` to them.
+    """
     sizes = np.bincount(parts.ravel())
     component = np.zeros(len(sizes), np.int32)
     # Any pixel will do: a part lies in one component as a whole, for every level holds the one before.
@@ -139,7 +148,21 @@ def _meetings(parts: Int32[np.ndarray, "H W"], labels: Int32[np.ndarray, "H W"])
     for number in 1 + np.argsort(-sizes[1:], kind="stable"):
         if sizes[number]:
             members.setdefault(int(component[number]), []).append(int(number))
-    return [found for found in members.values() if len(found) > 1]
+    boxes = ndimage.find_objects(parts)
+    counted = [
+        [number for number in found if sizes[number] >= smallest or _grown(parts, number, boxes, reach) >= smallest]
+        for found in members.values()
+        if len(found) > 1
+    ]
+    return [found for found in counted if len(found) > 1]
+
+
+def _grown(parts: Int32[np.ndarray, "H W"], number: int, boxes: list[tuple[slice, slice] | None], reach: float) -> int:
+    """Pixels nearer than ``reach`` to a part. All are free where no obstacle is nearer than that to the part."""
+    box = boxes[number - 1]
+    assert box is not None, "a part has pixels"
+    around = np.pad(parts[box] == number, math.ceil(reach))
+    return int(np.sum(np.asarray(ndimage.distance_transform_edt(~around)) < reach))
 
 
 def _passages_between(
@@ -159,7 +182,7 @@ def _passages_between(
     owner = np.where(component, members[tuple(nearest)], 0)
     border = np.flatnonzero(_borders(owner))
     border_owner, room = owner.flat[border], clearance[rows, cols].flat[border]
-    sizes, reached = np.bincount(owner.ravel()), np.bincount(owner[kept[rows, cols]], minlength=owner.max() + 1)
+    reached, boxes = np.bincount(owner[kept[rows, cols]], minlength=owner.max() + 1), ndimage.find_objects(owner)
     reached[0] = 0
     found = []
     for number in meeting[1:]:
@@ -169,7 +192,7 @@ def _passages_between(
             Passage(
                 at=frame.cell_to_metres(int(row) + rows.start, int(col) + cols.start),
                 width=round(width * frame.resolution, 9),
-                area=float(sizes[number]) * frame.resolution**2,
+                area=_grown(owner, number, boxes, (width + 1) / 2) * frame.resolution**2,
                 is_open=bool(0 < reached[number] < reached.sum()),
             )
         )

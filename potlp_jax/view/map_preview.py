@@ -79,7 +79,7 @@ def _plan(
 
 
 def _limits(image_map: OccupancyMap, clean: CleanMap) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Metres (x, y) that hold the reachable part and all free parts but specks, with a little around them."""
+    """Metres (x, y) that hold the reachable part and all free parts but specks, and their walls."""
     frame = image_map.frame
     labels = component_labels(image_map.free)
     shown = (np.bincount(labels.ravel()) * frame.resolution**2 >= SPECK)[labels] & image_map.free
@@ -89,7 +89,7 @@ def _limits(image_map: OccupancyMap, clean: CleanMap) -> tuple[tuple[float, floa
     corners = [_corners(frame, low, high), _corners(clean.frame, (0, 0), (clean.frame.width, clean.frame.height))]
     points = np.concatenate(corners)
     least, most = points.min(axis=0), points.max(axis=0)
-    margin = 0.02 * float(np.max(most - least))
+    margin = max(0.5, 0.02 * float(np.max(most - least)))
     return (float(least[0]) - margin, float(most[0]) + margin), (float(least[1]) - margin, float(most[1]) + margin)
 
 
