@@ -354,7 +354,8 @@ def _find_places(config: RosMapConfig, image_map: OccupancyMap) -> Places:
     raise MapError(
         Path(config.file),
         "places",
-        f"{file} does not exist, and a map has no propositions of its own. Write it, in map metres, for instance\n"
+        f"{file} does not exist, and a map has no propositions of its own. Write it with `potlp map label` or by hand, "
+        "in map metres, for instance\n"
         "propositions:\n"
         f"  document: [{{point: [{x0:.2f}, {y0:.2f}], radius: 0.5}}]\n"
         f"  package: [{{point: [{x1:.2f}, {y1:.2f}], radius: 0.5}}]\n"
