@@ -19,7 +19,8 @@ from potlp_jax.cli import app
 from potlp_jax.environments import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.planning.policies import Policy
-from potlp_jax.sweep.runner import RESULTS, Sweep, path_digest, run_sweep
+from potlp_jax.sweep.rows import path_digest
+from potlp_jax.sweep.runner import RESULTS, Sweep, run_sweep
 from potlp_jax.sweep.specification import SpecificationError, read_specification, specification_from_dict
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store, StoreError, process_start
 from potlp_jax.task.task import Task

@@ -18,6 +18,7 @@ from rich.console import Console
 
 from potlp_jax.records import NEVER_SEEN, ActionRecord, Decision, Outcome, Trial
 from potlp_jax.sweep.statistics import Comparison, TrialResult
+from potlp_jax.sweep.store import Item, Row
 from potlp_jax.task.task import Task
 from potlp_jax.view.animation import frame_steps, save_animation
 from potlp_jax.view.automata import Automaton, draw_automaton
@@ -382,17 +383,28 @@ def test_tree_shows_outcomes_and_follows_the_best_action():
     assert not _overlaps(figure, figure.axes[0].texts)
 
 
-def _trial_rows(*costs, outcome="satisfied"):
-    return [{"cost": cost, "outcome": outcome} for cost in costs]
+def _row(policy, world, cost, outcome="satisfied"):
+    return Row(
+        item=Item("toy", "F goal", policy, world),
+        **{"outcome": outcome, "cost": cost, "budget": 480.0, "steps": 9, "decisions": 3, "fallbacks": 0, "status": 0},
+        **{"key": (0, 1), "path": "", "configuration": "", "versions": {}, "commit": "", "seconds": 1.0},
+    )
 
 
 def test_scatter_places_worlds_and_marks_failures():
-    trials = {
-        "known-map": _trial_rows(5.0, 8.0),
-        "baseline": _trial_rows(10.0, 8.0),
-        "oracle": [*_trial_rows(6.0), *_trial_rows(30.0, outcome="stuck")],
-    }
-    figure = draw_scatter(trials, "a comparison")
+    pairs = [
+        {
+            "known-map": _row("known-map", 0, 5.0),
+            "baseline": _row("baseline", 0, 10.0),
+            "oracle": _row("oracle", 0, 6.0),
+        },
+        {
+            "known-map": _row("known-map", 1, 8.0),
+            "baseline": _row("baseline", 1, 8.0),
+            "oracle": _row("oracle", 1, 30.0, "stuck"),
+        },
+    ]
+    figure = draw_scatter(pairs, list(pairs[0]), "a comparison")
     points = {
         str(artist.get_label()): np.asarray(artist.get_offsets()).tolist()
         for artist in figure.axes[0].collections

@@ -3,12 +3,12 @@
 import csv
 import dataclasses
 import itertools
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 from rich.console import Console
 
 from potlp_jax.cli.inputs import (
@@ -34,26 +34,18 @@ from potlp_jax.environments import Generator, make
 from potlp_jax.environments.splits import Split
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.planning.policies import Policy
-from potlp_jax.records import Outcome, Trial
-from potlp_jax.sweep.statistics import Comparison, TrialResult
+from potlp_jax.records import Outcome
+from potlp_jax.sweep.results import Pair, compare_pairs
+from potlp_jax.sweep.rows import trial_row
+from potlp_jax.sweep.runner import IMPOSSIBLE_IN_A_ROW
+from potlp_jax.sweep.statistics import KNOWN_MAP, Comparison
+from potlp_jax.sweep.store import Item, Row
 from potlp_jax.task.task import Task
 from potlp_jax.trial import run_trial
 from potlp_jax.trial_config import TrialConfig
 from potlp_jax.view.comparisons import draw_scatter, loss_lines, outcome_table, savings_table
 from potlp_jax.view.style import save_figure
 from potlp_jax.world.grid import World
-
-IMPOSSIBLE_IN_A_ROW: int = 100
-"""Worlds that are redrawn one after the other before the task is taken to be impossible in all of them."""
-
-
-@dataclasses.dataclass(frozen=True)
-class _Pair:
-    """One world with the trials of all policies, reduced to what is reported."""
-
-    seed: int
-    trials: Mapping[str, dict[str, Any]]
-    budget: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,24 +61,25 @@ class _Setting:
     config: TrialConfig
     estimator: TrainedEstimator | None
 
-    def trial(self, world: World, seed: int, policy: Policy) -> Trial:
+    def row(self, world: World, seed: int, policy: Policy) -> Row:
         """The trial of a policy in world ``seed``; its key is the same for all policies."""
+        start, key = time.perf_counter(), jax.random.key(seed)
         name = f"{self.environment}/{self.split}"
-        key = jax.random.key(seed)
         trained = self.estimator if policy is Policy.POTLP else None
-        return run_trial(world, self.task, policy, key, self.config, environment=name, seed=seed, estimator=trained)
+        trial = run_trial(world, self.task, policy, key, self.config, environment=name, seed=seed, estimator=trained)
+        item = Item(self.environment, self.task.text, policy.value, seed)
+        return trial_row(item, trial, key, self.config, time.perf_counter() - start)
 
-    def pairs(self) -> Iterator[_Pair]:
-        """The worlds in which the task is possible, with a trial of every policy in each."""
+    def pairs(self) -> Iterator[Pair]:
+        """The worlds in which the task is possible, with the trials of all policies in each, the known map's first."""
         impossible = 0
         for seed in itertools.count(self.first):
             world = make_world(self.generator, self.split, seed)
-            floor = self.trial(world, seed, Policy.KNOWN_MAP)
-            if floor.outcome is Outcome.SATISFIED:
+            floor = self.row(world, seed, Policy.KNOWN_MAP)
+            if floor.outcome == Outcome.SATISFIED:
                 impossible = 0
-                others = [self.trial(world, seed, policy) for policy in self.policies if policy is not Policy.KNOWN_MAP]
-                trials = {trial.policy: trial.summary() for trial in (floor, *others)}
-                yield _Pair(seed, trials, _budget(world, self.config))
+                others = [self.row(world, seed, policy) for policy in self.policies if policy is not Policy.KNOWN_MAP]
+                yield {row.item.policy: row for row in (floor, *others)}
                 continue
             impossible += 1
             if impossible == IMPOSSIBLE_IN_A_ROW:
@@ -113,15 +106,14 @@ def compare_policies(
     setting = _Setting(environment, generator, split, seed, task, policies, trial_config(simulations), trained)
     folder = output_folder(out)
     pairs = _run(setting, trials)
-    results = {policy.value: [_result(pair, policy) for pair in pairs] for policy in policies}
-    comparison = Comparison.from_results(results)
-    redrawn = pairs[-1].seed - seed + 1 - trials
+    comparison = compare_pairs(pairs, [policy.value for policy in policies])
+    redrawn = _seed(pairs[-1]) - seed + 1 - trials
     report = {
         "environment": environment,
         "split": str(split),
         "task": task.text,
         "first_seed": seed,
-        "seeds": [pair.seed for pair in pairs],
+        "seeds": [_seed(pair) for pair in pairs],
         "redrawn": redrawn,
         **comparison.to_dict(),
     }
@@ -136,17 +128,17 @@ def compare_policies(
         console().print(f"wrote compare.json, trials.csv, scatter.png and table.txt in {folder}", markup=False)
 
 
-def _run(setting: _Setting, trials: int) -> list[_Pair]:
+def _run(setting: _Setting, trials: int) -> list[Pair]:
     """The first ``trials`` pairs, with progress on stderr: a bar on a terminal, else a line per world."""
-    pairs: list[_Pair] = []
+    pairs: list[Pair] = []
     with progress_bar() as progress:
         bar = progress.add_task("worlds (the first one compiles the planner)", total=trials)
         for pair in itertools.islice(setting.pairs(), trials):
             pairs.append(pair)
             progress.update(bar, completed=len(pairs), description="worlds")
             if progress.disable:
-                costs = ", ".join(f"{name} {row['cost']:.1f}" for name, row in pair.trials.items())
-                note(f"world {pair.seed} ({len(pairs)} of {trials}): {costs}")
+                costs = ", ".join(f"{name} {row.cost:.1f}" for name, row in pair.items())
+                note(f"world {_seed(pair)} ({len(pairs)} of {trials}): {costs}")
     return pairs
 
 
@@ -156,13 +148,8 @@ def _read_policies(names: str) -> tuple[Policy, ...]:
     return tuple(dict.fromkeys([Policy.KNOWN_MAP, Policy.BASELINE, *named]))
 
 
-def _budget(world: World, config: TrialConfig) -> float:
-    return config.budget_factor * float(np.sum(np.asarray(world.extent))) * float(world.resolution)
-
-
-def _result(pair: _Pair, policy: Policy) -> TrialResult:
-    trial = pair.trials[policy.value]
-    return TrialResult(cost=trial["cost"], outcome=trial["outcome"], budget=pair.budget, status=trial["status"])
+def _seed(pair: Pair) -> int:
+    return pair[KNOWN_MAP].item.world
 
 
 def _print(out: Console, heading: str, comparison: Comparison) -> None:
@@ -177,16 +164,16 @@ def _print(out: Console, heading: str, comparison: Comparison) -> None:
 
 
 def _write(
-    folder: Path, report: Mapping[str, Any], heading: str, comparison: Comparison, pairs: Sequence[_Pair]
+    folder: Path, report: Mapping[str, Any], heading: str, comparison: Comparison, pairs: Sequence[Pair]
 ) -> None:
     (folder / "compare.json").write_text(to_json(report) + "\n", "utf-8")
     with (folder / "table.txt").open("w", encoding="utf-8") as file:
         _print(Console(file=file, width=150, highlight=False), heading, comparison)
     with (folder / "trials.csv").open("w", encoding="utf-8", newline="") as file:
-        names = ("policy", "outcome", "cost", "steps", "decisions", "fallbacks", "status")
+        names = ("outcome", "cost", "steps", "decisions", "fallbacks", "status", "budget")
         writer = csv.writer(file)
-        writer.writerow(("seed", *names, "budget"))
+        writer.writerow(("seed", "policy", *names))
         for pair in pairs:
-            writer.writerows((pair.seed, *(row[name] for name in names), pair.budget) for row in pair.trials.values())
-    costs = {name: [pair.trials[name] for pair in pairs] for name in pairs[0].trials}
-    save_figure(draw_scatter(costs, heading), folder / "scatter.png")
+            for policy, row in pair.items():
+                writer.writerow((row.item.world, policy, *(getattr(row, name) for name in names)))
+    save_figure(draw_scatter(pairs, list(pairs[0]), heading), folder / "scatter.png")

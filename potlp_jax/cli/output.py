@@ -3,9 +3,10 @@
 import functools
 import importlib.metadata
 import json
+import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 import typer
 from rich.console import Console
@@ -53,12 +54,14 @@ def fail(message: str, code: int = BAD_INPUT) -> NoReturn:
 
 
 def clear_errors(command: Callable[..., None]) -> Callable[..., None]:
-    """Turn errors about the user's input and files into one message without a traceback."""
+    """Turn errors about the user's input and files into one message without a traceback, and warnings into notes."""
 
     @functools.wraps(command)
     def wrapped(*args: Any, **kwargs: Any) -> None:
         try:
-            command(*args, **kwargs)
+            with warnings.catch_warnings():
+                warnings.showwarning = _show_warning
+                command(*args, **kwargs)
         except ValueError as error:
             if not isinstance(error, _input_errors()):
                 raise
@@ -69,6 +72,18 @@ def clear_errors(command: Callable[..., None]) -> Callable[..., None]:
             fail(f"{error.filename}: {error.strerror}", FAILED)
 
     return wrapped
+
+
+def _show_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, *rest: TextIO | str | None
+) -> None:
+    """A warning about the user's input as a note, without the place in the program; any other as Python shows it."""
+    from potlp_jax.environments.map_server import MapWarning
+
+    if issubclass(category, MapWarning):
+        note(str(message))
+    else:
+        error_console().print(warnings.formatwarning(message, category, filename, lineno), markup=False)
 
 
 def _input_errors() -> tuple[type[Exception], ...]:

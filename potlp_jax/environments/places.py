@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from jaxtyping import Bool, Float64, Int32
 from scipy import ndimage
 
@@ -120,6 +121,52 @@ def load_places(file: Path | str) -> Places:
     return Places(
         _propositions(file, fields.get("propositions")), start, _tasks(file, fields.get("tasks", {})), str(file)
     )
+
+
+def save_places(places: Places, file: Path) -> None:
+    """Write what `load_places` reads back as the same propositions, start and tasks. Raises OSError."""
+    fields: dict[str, Any] = {
+        "propositions": {name: [_region_fields(region) for region in regions] for name, regions in places.propositions}
+    }
+    if places.start is not None:
+        fields["start"] = _numbers(places.start)
+    if places.tasks:
+        fields["tasks"] = dict(places.tasks)
+    file.write_text(yaml.safe_dump(fields, default_flow_style=None, sort_keys=False, allow_unicode=True), "utf-8")
+
+
+def _region_fields(region: Region) -> dict[str, Any]:
+    if isinstance(region, Disc):
+        return {"point": _numbers(region.centre), "radius": float(region.radius)}
+    return {"polygon": [_numbers(vertex) for vertex in region.vertices]}
+
+
+def _numbers(point: Point) -> list[float]:
+    return [float(point[0]), float(point[1])]
+
+
+def check_points(places: Places, reachable: Bool[np.ndarray, "H W"], frame: GridFrame) -> None:
+    """Check that every point of a disc lies in a cell that the robot can reach.
+
+    A disc whose point lies in a wall still covers what is near on one side of it (`Disc.covers`), perhaps not the side
+    that was meant.
+
+    Raises:
+        MapError: one does not; the nearest cell that can be reached is named.
+    """
+    for name, regions in places.propositions:
+        for region in regions:
+            if isinstance(region, Disc):
+                cell = frame.metres_to_cell(*region.centre)
+                if not frame.contains(*cell) or not reachable[cell]:
+                    raise MapError(
+                        places.source,
+                        f"propositions: {name}",
+                        f"the robot cannot reach {_text(region.centre)}: it lies in or too near an obstacle, in "
+                        "unknown space, or in a part that is not connected with the rest; the nearest cell that it "
+                        "can reach is at "
+                        f"{_text(nearest_free(region.centre, reachable, frame))}",
+                    )
 
 
 def place_letters(places: Places, reachable: Bool[np.ndarray, "H W"], frame: GridFrame) -> Int32[np.ndarray, "H W"]:

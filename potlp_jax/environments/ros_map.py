@@ -14,25 +14,35 @@ space without a wall between. `clean_map` therefore
    largest such component;
 5. crops to it, with a ring of obstacles around.
 
+Steps 2 and 3 can close a doorway. What a robot of this radius can reach on the map's own pixels but not on the grid is
+named: in ``CleanMap.cut_off``, and by a warning where a world is made of the map.
+
 Costs are in metres, since ``World.resolution`` is the size of a cell in metres.
 """
 
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Int32, PRNGKeyArray
+from jaxtyping import Bool, Int, Int32, PRNGKeyArray
 from scipy import ndimage
 
 from potlp_jax.environments.base import host_generators
-from potlp_jax.environments.map_server import GridFrame, MapError, OccupancyMap, load_map
+from potlp_jax.environments.map_server import GridFrame, MapError, MapWarning, OccupancyMap, load_map
 from potlp_jax.environments.places import Places, Point, component_labels, load_places, nearest_free, place_letters
 from potlp_jax.world.grid import World, make_world
 
 PREFIX = "map:"
+
+CUT_OFF_AREA = 2.0
+"""Square metres of free cells from which on a part that is cut off counts as a room, not as a niche."""
+
+CUT_OFF_NAMED = 3
+"""Parts that a warning names; `CleanMap.cut_off` has all."""
 
 
 @dataclass(frozen=True)
@@ -54,12 +64,51 @@ class RosMapConfig:
     radius: float = 0.1
 
 
+@dataclass(frozen=True)
+class FreeArea:
+    """Free space in square metres: on the map, and what each step of cleaning leaves of it.
+
+    Attributes:
+        mapped: what the thresholds call free.
+        inflated: where a robot's centre can be.
+        resampled: cells without any obstacle.
+        reachable: cells connected with the start, or the largest component.
+    """
+
+    mapped: float
+    inflated: float
+    resampled: float
+    reachable: float
+
+
+@dataclass(frozen=True)
+class CutOff:
+    """A part of the building that the robot fits into, behind a passage that the working grid closes.
+
+    Attributes:
+        at: metres (x, y) of one of its free cells, near its middle.
+        area: of its free cells, in square metres.
+    """
+
+    at: Point
+    area: float
+
+
 @dataclass(frozen=True, eq=False)
 class CleanMap:
-    """Cells that the robot can reach, all others being obstacles, and where they lie."""
+    """Cells that the robot can reach, all others being obstacles, and where they lie.
+
+    Attributes:
+        free: the cells that can be reached.
+        frame: metres to cells.
+        area: what cleaning left of the map's free space.
+        cut_off: parts of `CUT_OFF_AREA` or more that resampling has closed off, the largest first.
+    """
 
     free: Bool[np.ndarray, "H W"]
     frame: GridFrame
+    area: FreeArea
+    cut_off: tuple[CutOff, ...]
 
 
 class RosMap:
@@ -80,13 +129,15 @@ class RosMap:
             MapError: the map or the places cannot be used; the message names the file, the field, and what to do.
 
         Warns:
-            MapWarning: see `potlp_jax.environments.map_server.load_map`.
+            MapWarning: a part of the building is cut off by the size of the cells; see also
+                `potlp_jax.environments.map_server.load_map`.
         """
         self.config = config
         self.image_map = load_map(config.file)
         places = config.places if isinstance(config.places, Places) else _find_places(config, self.image_map)
         self.places = places
         self.clean = clean_map(self.image_map, config.resolution, config.radius, places.start, places.source)
+        _warn_of_cut_off(config, self.clean)
         # Not the path as typed: the name separates the seeds, and a map is the same map from every folder.
         self.name = f"{PREFIX}{Path(config.file).stem}"
         self.propositions: tuple[str, ...] = places.names
@@ -167,8 +218,8 @@ def clean_map(
     ratio = _exact(file, "resolution", resolution) / pixel
     if ratio < 1:
         raise MapError(file, "resolution", f"{resolution} m a cell is finer than the map's {float(pixel)} m a pixel")
-    blocked = _inflate(~image_map.free, _exact(file, "radius", radius) / pixel)
-    free = ~_resample(blocked, ratio)
+    inflated = ~_inflate(~image_map.free, _exact(file, "radius", radius) / pixel)
+    free = ~_resample(~inflated, ratio)
     height, width = free.shape
     frame = GridFrame(height, width, float(ratio * pixel), *image_map.settings.origin)
     if not free.any():
@@ -176,7 +227,11 @@ def clean_map(
             file, "", f"nothing is left free with cells of {resolution} m and a radius of {radius} m; make them smaller"
         )
     kept = _largest_component(free) if start is None else _component_of(start, free, frame, source)
-    return _crop(kept, frame)
+    area = FreeArea(
+        *(float(pixels.sum()) * float(pixel) ** 2 for pixels in (image_map.free, inflated)),
+        *(float(cells.sum()) * frame.resolution**2 for cells in (free, kept)),
+    )
+    return _crop(kept, frame, area, _cut_off(inflated, image_map.frame, free & ~kept, kept, frame))
 
 
 def _exact(file: Path, field: str, number: float) -> Fraction:
@@ -229,11 +284,64 @@ def _component_of(
     return labels == labels[cell]
 
 
-def _crop(kept: Bool[np.ndarray, "H W"], frame: GridFrame) -> CleanMap:
+def _cut_off(
+    inflated: Bool[np.ndarray, "H W"],
+    pixels: GridFrame,
+    lost: Bool[np.ndarray, "h w"],
+    kept: Bool[np.ndarray, "h w"],
+    frame: GridFrame,
+) -> tuple[CutOff, ...]:
+    """Components of ``lost`` cells whose pixels are connected with those of the cells that are kept."""
+    components = component_labels(inflated)
+    numbers = components[_pixels_of(frame, pixels)]
+    labels = component_labels(lost & (numbers == numbers[tuple(np.argwhere(kept)[0])]))
+    sizes = np.bincount(labels.ravel())[1:] * frame.resolution**2
+    found = [
+        CutOff(_middle(labels == 1 + index, frame), float(sizes[index]))
+        for index in np.flatnonzero(sizes >= CUT_OFF_AREA).tolist()
+    ]
+    return tuple(sorted(found, key=lambda part: -part.area))
+
+
+def _pixels_of(frame: GridFrame, pixels: GridFrame) -> tuple[Int[np.ndarray, "h 1"], Int[np.ndarray, "1 w"]]:
+    """Row and column of the pixel at every cell's centre, or of the nearest one where the cell lies beyond the image.
+
+    Both grids have the same lower left corner.
+    """
+    ratio = frame.resolution / pixels.resolution
+    up = ((frame.height - np.arange(frame.height) - 0.5) * ratio).astype(int)
+    across = ((np.arange(frame.width) + 0.5) * ratio).astype(int)
+    rows = pixels.height - 1 - np.minimum(up, pixels.height - 1)
+    return rows[:, None], np.minimum(across, pixels.width - 1)[None, :]
+
+
+def _middle(part: Bool[np.ndarray, "h w"], frame: GridFrame) -> Point:
+    """Centre of the part's cell that is nearest to its centroid, in metres."""
+    cells = np.argwhere(part)
+    row, col = cells[np.argmin(np.linalg.norm(cells - cells.mean(axis=0, keepdims=True), axis=1))].tolist()
+    return frame.cell_to_metres(row, col)
+
+
+def _warn_of_cut_off(config: RosMapConfig, clean: CleanMap) -> None:
+    if clean.cut_off:
+        named = [
+            f"{part.area:.0f} m2 at [{part.at[0]:.2f}, {part.at[1]:.2f}]" for part in clean.cut_off[:CUT_OFF_NAMED]
+        ]
+        rest = len(clean.cut_off) - len(named)
+        warnings.warn(
+            f"{config.file}: resolution: cells of {config.resolution} m close passages into which a robot of radius "
+            f"{config.radius} m fits, and cut off {', '.join(named)}{f' and {rest} more' if rest else ''}; "
+            "use smaller cells to keep them",
+            MapWarning,
+            stacklevel=3,
+        )
+
+
+def _crop(kept: Bool[np.ndarray, "H W"], frame: GridFrame, area: FreeArea, cut_off: tuple[CutOff, ...]) -> CleanMap:
     rows, cols = np.flatnonzero(kept.any(axis=1)), np.flatnonzero(kept.any(axis=0))
     content = kept[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
     free = np.pad(content, 1)
-    return CleanMap(free, frame.window(int(rows[0]) - 1, int(cols[0]) - 1, *free.shape))
+    return CleanMap(free, frame.window(int(rows[0]) - 1, int(cols[0]) - 1, *free.shape), area, cut_off)
 
 
 def _find_places(config: RosMapConfig, image_map: OccupancyMap) -> Places:
@@ -246,7 +354,8 @@ def _find_places(config: RosMapConfig, image_map: OccupancyMap) -> Places:
     raise MapError(
         Path(config.file),
         "places",
-        f"{file} does not exist, and a map has no propositions of its own. Write it, in map metres, for instance\n"
+        f"{file} does not exist, and a map has no propositions of its own. Write it with `potlp map label` or by hand, "
+        "in map metres, for instance\n"
         "propositions:\n"
         f"  document: [{{point: [{x0:.2f}, {y0:.2f}], radius: 0.5}}]\n"
         f"  package: [{{point: [{x1:.2f}, {y1:.2f}], radius: 0.5}}]\n"

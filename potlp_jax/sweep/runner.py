@@ -8,22 +8,20 @@ import dataclasses
 import multiprocessing
 import os
 import signal
-import subprocess
 import time
-import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cached_property, lru_cache
 from pathlib import Path
 
 import jax
-import numpy as np
 
 from potlp_jax.environments import Generator, make
 from potlp_jax.environments.splits import MAX_INDEX, world_key
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, read_estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.records import Outcome, Trial
-from potlp_jax.sweep.specification import Cell, Specification, configuration_hash
+from potlp_jax.sweep.rows import trial_row
+from potlp_jax.sweep.specification import Cell, Specification
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store
 from potlp_jax.task.task import Task, TaskArrays, TaskSizes
 from potlp_jax.trial import run_trial
@@ -127,22 +125,7 @@ class Sweep:
         """The row of one trial."""
         start = time.perf_counter()
         trial = self.trial(item)
-        return Row(
-            item=item,
-            outcome=trial.outcome.value,
-            cost=trial.cost,
-            budget=_budget(trial.world, self.specification.config.budget_factor),
-            steps=len(trial.path) - 1,
-            decisions=len(trial.decisions),
-            fallbacks=sum(decision.fallback for decision in trial.decisions),
-            status=trial.status,
-            key=_words(self._key(item.world)),
-            path=path_digest(trial.path),
-            configuration=configuration_hash(self.specification.config),
-            versions=trial.versions,
-            commit=source_commit(),
-            seconds=time.perf_counter() - start,
-        )
+        return trial_row(item, trial, self._key(item.world), self.specification.config, time.perf_counter() - start)
 
     def trial(self, item: Item) -> Trial:
         """The whole record of a trial, run or made again."""
@@ -274,32 +257,3 @@ def _world(environment: str, split: str, world: int) -> World:
     """The worlds of a block, which every policy visits."""
     generator = _generator(environment)
     return generator.generate(world_key(split, world, generator.name))
-
-
-def _budget(world: World, factor: float) -> float:
-    return factor * float(np.sum(np.asarray(world.extent))) * float(world.resolution)
-
-
-def _words(key: jax.Array) -> tuple[int, int]:
-    first, second = np.asarray(jax.random.key_data(key)).tolist()
-    return int(first), int(second)
-
-
-def path_digest(path: Sequence[tuple[int, int]]) -> str:
-    """Eight hexadecimal digits that tell paths apart."""
-    return f"{zlib.crc32(np.asarray(path, np.int32).tobytes()):08x}"
-
-
-@lru_cache(maxsize=1)
-def source_commit() -> str:
-    """The commit that the package was run from, with ``+`` where files were changed; empty outside of a repository."""
-    folder = Path(__file__).parent
-
-    def git(*arguments: str) -> str:
-        done = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=True)
-        return done.stdout.strip()
-
-    try:
-        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--", str(folder)) else "")
-    except (OSError, subprocess.CalledProcessError):
-        return ""

@@ -3,16 +3,18 @@
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.box import SIMPLE_HEAD
 from rich.table import Table as RichTable
 
+from potlp_jax.sweep.results import Pair
 from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, SATISFIED, Comparison, PolicyRow, Table
 from potlp_jax.view.style import FAINT, INK, STATE_COLOURS, new_figure
 
 _MARKERS = "osD^vP*X"
+_LINES = ("-", "--", "-.", ":")
 
 
 def savings_table(table: Table, title: str) -> RichTable:
@@ -75,16 +77,63 @@ def loss_lines(comparison: Comparison) -> list[str]:
     ]
 
 
-def draw_scatter(trials: Mapping[str, Sequence[Mapping[str, Any]]], title: str) -> Figure:
-    """Each policy's cost over the baseline's, world by world; below the diagonal is cheaper than the baseline.
+def policy_styles(policies: Sequence[str]) -> Mapping[str, tuple[str, str, str]]:
+    """Colour, marker and line of each policy: told apart without colour too."""
+    return {
+        policy: (
+            STATE_COLOURS[index % len(STATE_COLOURS)],
+            _MARKERS[index % len(_MARKERS)],
+            _LINES[index % len(_LINES)],
+        )
+        for index, policy in enumerate(policies)
+    }
 
-    ``trials`` holds per policy one mapping with ``cost`` and ``outcome`` per world. Trials that did not end satisfied,
-    or whose baseline did not, are crosses.
-    """
-    baseline = trials[BASELINE]
-    limit = 1.05 * max((trial["cost"] for rows in trials.values() for trial in rows), default=1.0) or 1.0
+
+def draw_scatter(pairs: Sequence[Pair], policies: Sequence[str], title: str) -> Figure:
+    """The picture of `scatter_costs` with a title."""
     figure = new_figure(6.4, 6.9)
-    axes = figure.add_axes((0.12, 0.1, 0.84, 0.78))
+    scatter_costs(figure.add_axes((0.12, 0.1, 0.84, 0.78)), pairs, policies)
+    figure.text(0.5, 0.975, textwrap.fill(title, 88), ha="center", va="top", size=8.5, color=INK)
+    return figure
+
+
+def scatter_costs(axes: Axes, pairs: Sequence[Pair], policies: Sequence[str]) -> None:
+    """Each policy's cost over the baseline's, world by world, as in the paper; below the diagonal is cheaper.
+
+    Trials that did not end satisfied, or whose baseline did not, are crosses.
+    """
+    limit = 1.05 * max((row.cost for pair in pairs for row in pair.values()), default=1.0) or 1.0
+    axes.set(xlim=(0, limit), ylim=(0, limit), aspect="equal")
+    axes.set(xlabel="cost of the baseline", ylabel="cost of the policy")
+    axes.grid(color=FAINT, linewidth=0.3)
+    axes.set_axisbelow(True)
+    _mark_diagonal(axes, limit)
+    unsatisfied = False
+    for policy, (colour, marker, _) in policy_styles(policies).items():
+        if policy == BASELINE:
+            continue
+        good = [pair for pair in pairs if pair[policy].outcome == pair[BASELINE].outcome == SATISFIED]
+        bad = [pair for pair in pairs if not pair[policy].outcome == pair[BASELINE].outcome == SATISFIED]
+        axes.scatter(
+            [pair[BASELINE].cost for pair in good],
+            [pair[policy].cost for pair in good],
+            s=12 if policy == KNOWN_MAP else 26,
+            marker=marker,
+            color=colour,
+            alpha=0.65,
+            linewidths=0,
+            label=f"{policy} ({len(good)} worlds)",
+            zorder=2,
+        )
+        failed = [pair[BASELINE].cost for pair in bad], [pair[policy].cost for pair in bad]
+        axes.scatter(*failed, s=34, marker="x", color=colour, zorder=3)
+        unsatisfied = unsatisfied or bool(bad)
+    if unsatisfied:
+        axes.scatter([], [], s=34, marker="x", color=FAINT, label="not satisfied")
+    axes.legend(loc="upper left", fontsize=8.5, frameon=False)
+
+
+def _mark_diagonal(axes: Axes, limit: float) -> None:
     axes.plot([0, limit], [0, limit], color=FAINT, linewidth=1.0, zorder=1)
     axes.annotate(
         "as the baseline",
@@ -96,38 +145,5 @@ def draw_scatter(trials: Mapping[str, Sequence[Mapping[str, Any]]], title: str) 
         rotation=45,
         rotation_mode="anchor",
         size=8,
-        color="#6E6E6E",
+        color=FAINT,
     )
-    others = [policy for policy in trials if policy != BASELINE]
-    unsatisfied = False
-    for index, policy in enumerate(others):
-        colour = "#777777" if policy == KNOWN_MAP else STATE_COLOURS[index % len(STATE_COLOURS)]
-        good = [
-            pair for pair in zip(baseline, trials[policy], strict=True) if all(t["outcome"] == SATISFIED for t in pair)
-        ]
-        bad = [
-            pair for pair in zip(baseline, trials[policy], strict=True) if any(t["outcome"] != SATISFIED for t in pair)
-        ]
-        axes.scatter(
-            [pair[0]["cost"] for pair in good],
-            [pair[1]["cost"] for pair in good],
-            s=14 if policy == KNOWN_MAP else 30,
-            marker=_MARKERS[index % len(_MARKERS)],
-            color=colour,
-            alpha=0.75,
-            linewidths=0,
-            label=f"{policy} ({len(good)} worlds)",
-            zorder=2,
-        )
-        axes.scatter([p[0]["cost"] for p in bad], [p[1]["cost"] for p in bad], s=34, marker="x", color=colour, zorder=3)
-        unsatisfied = unsatisfied or bool(bad)
-    if unsatisfied:
-        axes.scatter([], [], s=34, marker="x", color=INK, label="not satisfied")
-    axes.set(xlim=(0, limit), ylim=(0, limit), aspect="equal")
-    axes.set_xlabel("cost of the baseline", color=INK)
-    axes.set_ylabel("cost of the policy", color=INK)
-    axes.grid(color="#EEEEEE", linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.legend(loc="upper left", fontsize=8.5, framealpha=0.9)
-    figure.text(0.5, 0.975, textwrap.fill(title, 88), ha="center", va="top", size=8.5, color=INK)
-    return figure

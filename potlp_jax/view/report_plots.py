@@ -1,7 +1,7 @@
 """The pictures of a report, as SVG that takes its text and line colours from the page, light or dark."""
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import matplotlib
 import numpy as np
@@ -9,46 +9,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from potlp_jax.sweep.results import Pair
-from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, SATISFIED
-from potlp_jax.view.style import FAINT, INK, STATE_COLOURS, new_figure
-
-_MARKERS = "osD^vP*X"
-_LINES = ("-", "--", "-.", ":")
-
-
-def policy_styles(policies: Sequence[str]) -> Mapping[str, tuple[str, str, str]]:
-    """Colour, marker and line of each policy: told apart without colour too."""
-    return {
-        policy: (
-            STATE_COLOURS[index % len(STATE_COLOURS)],
-            _MARKERS[index % len(_MARKERS)],
-            _LINES[index % len(_LINES)],
-        )
-        for index, policy in enumerate(policies)
-    }
+from potlp_jax.sweep.statistics import BASELINE
+from potlp_jax.view.comparisons import policy_styles, scatter_costs
+from potlp_jax.view.style import FAINT, INK, new_figure
 
 
 def scatter(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
-    """Each policy's cost over the baseline's, world by world, as in the paper's figure."""
+    """Each policy's cost over the baseline's, world by world (`scatter_costs`)."""
     figure, axes = _axes(5.2, 4.6)
-    limit = 1.05 * max((row.cost for pair in pairs for row in pair.values()), default=1.0)
-    axes.plot([0, limit], [0, limit], color=FAINT, linewidth=1.0)
-    for policy, (colour, marker, _) in policy_styles(policies).items():
-        if policy == BASELINE:
-            continue
-        good = [pair for pair in pairs if pair[policy].outcome == pair[BASELINE].outcome == SATISFIED]
-        axes.scatter(
-            [pair[BASELINE].cost for pair in good],
-            [pair[policy].cost for pair in good],
-            s=10 if policy == KNOWN_MAP else 20,
-            color=colour,
-            marker=marker,
-            alpha=0.6,
-            linewidths=0,
-            label=policy,
-        )
-    axes.set(xlim=(0, limit), ylim=(0, limit), xlabel="cost of the baseline", ylabel="cost of the policy")
-    _legend(axes)
+    scatter_costs(axes, pairs, policies)
     return _svg(figure)
 
 

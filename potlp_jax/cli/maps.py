@@ -1,0 +1,322 @@
+"""``potlp map``: from a ROS map to a world."""
+
+import dataclasses
+import math
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from potlp_jax.cli.output import console, fail, print_json
+from potlp_jax.environments.map_server import MapWarning, OccupancyMap, load_map
+from potlp_jax.environments.map_survey import MapSurvey, Passage, survey_map
+from potlp_jax.environments.map_writer import save_map
+from potlp_jax.environments.places import (
+    Disc,
+    Places,
+    Point,
+    Polygon,
+    Region,
+    check_points,
+    load_places,
+    place_letters,
+    save_places,
+)
+from potlp_jax.environments.ros_map import CleanMap, RosMap, RosMapConfig, clean_map
+from potlp_jax.task.formula import check_propositions
+from potlp_jax.task.task import Task
+from potlp_jax.view.map_preview import draw_map, draw_places
+from potlp_jax.view.style import save_figure
+
+PLACE_RADIUS: float = 0.5
+"""Metres around a point where its proposition is true, unless a radius is given."""
+
+SHOWN: int = 8
+"""Passages, and parts that are cut off, that are printed; JSON has all."""
+
+
+def inspect_map(file: Path, resolution: float, radius: float, start: str | None, json: bool) -> None:
+    """Print what a map holds and what cleaning would make of it."""
+    with _caught_warnings() as remarks:
+        image_map = load_map(file)
+    clean = clean_map(image_map, resolution, radius, _read_start(start), "--start")
+    survey = survey_map(image_map, clean)
+    defects = [*remarks, *_defects(survey, clean)]
+    if json:
+        print_json(
+            {**_map_facts(image_map), **_survey_facts(survey), **_clean_facts(clean, radius), "defects": defects}
+        )
+        return
+    out = console()
+    out.print(str(file), markup=False, style="bold")
+    for name, text in (*_map_lines(image_map, survey), *_clean_lines(clean, radius)):
+        out.print(f"{name:12} {text}", markup=False)
+    if survey.passages:
+        out.print(_passage_table(survey.passages))
+    for defect in defects:
+        out.print(f"- {defect}", markup=False, soft_wrap=True)
+
+
+def write_clean_map(file: Path, out: Path, resolution: float, radius: float, start: str | None, json: bool) -> None:
+    """Write a cleaned map and say what has changed."""
+    image_map = load_map(file)
+    own = {path.resolve() for path in (image_map.settings.file, image_map.settings.image)}
+    if own & {out.resolve(), out.with_suffix(".pgm").resolve()}:
+        fail(f"--out {out} would overwrite the map itself; give another name")
+    clean = clean_map(image_map, resolution, radius, _read_start(start), "--start")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    image = save_map(out, clean.free, clean.frame)
+    world = _environment(out, None, resolution, 0.0)
+    if json:
+        print_json({**_clean_facts(clean, radius), "files": [str(out), str(image)], "world": world})
+        return
+    output = console()
+    for name, text in _clean_lines(clean, radius):
+        output.print(f"{name:12} {text}", markup=False)
+    for line in _cut_off_lines(clean):
+        output.print(f"- {line}", markup=False)
+    output.print(f"wrote {out} and {image}", markup=False)
+    next_one = f"potlp map label {out} --resolution {resolution:g} --radius 0, then potlp run {world}"
+    output.print(f"next: {next_one} (the radius is in the map already)", markup=False, style="dim")
+
+
+def label_map(
+    file: Path,
+    places: Sequence[str],
+    rooms: Sequence[str],
+    tasks: Sequence[str],
+    start: str | None,
+    out: Path | None,
+    add: bool,
+    resolution: float,
+    radius: float,
+    json: bool,
+) -> None:
+    """Write labels that have been checked against the map."""
+    target = file.with_suffix(".places.yaml") if out is None else out
+    if target.exists() and not add:
+        fail(f"{target} exists: --add adds to it, --out writes another file")
+    old = load_places(target) if add else Places(())
+    labels = _joined(old, places, rooms, tasks, start)
+    clean = clean_map(load_map(file), resolution, radius, labels.start, labels.source)
+    check_points(labels, clean.free, clean.frame)
+    letters = place_letters(labels, clean.free, clean.frame)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    save_places(labels, target)
+    cells = {name: int((letters >> bit & 1).sum()) for bit, name in enumerate(labels.names)}
+    side = clean.frame.resolution
+    if json:
+        print_json({"file": str(target), "cells": cells, "start": labels.start, "tasks": dict(labels.tasks)})
+        return
+    output = console()
+    for name, count in cells.items():
+        output.print(f"{name:12} {count} cells, {count * side**2:.1f} m2", markup=False)
+    output.print(f"wrote {target}", markup=False)
+    task = labels.tasks[0][0] if labels.tasks else " & ".join(f"F {name}" for name in labels.names)
+    world = _environment(file, None if out is None else target, resolution, radius)
+    output.print(f"next: potlp run {world} --task '{task}'", markup=False, style="dim")
+
+
+def preview_map(file: Path, out: Path, labels: Path | None, resolution: float, radius: float) -> None:
+    """Draw a map, with labels where there are any."""
+    beside = file.with_suffix(".places.yaml")
+    found = labels or (beside if beside.is_file() else None)
+    if found is None:
+        image_map = load_map(file)
+        clean = clean_map(image_map, resolution, radius)
+        figure = draw_map(image_map, clean, _title(file, clean))
+    else:
+        family = RosMap(RosMapConfig(file, str(found), resolution, radius))
+        figure = draw_places(family, family.generate(jax.random.key(0)), _title(file, family.clean))
+    save_figure(figure, out)
+    console().print(f"wrote {out}", markup=False)
+
+
+def _environment(file: Path, places: Path | None, resolution: float, radius: float) -> str:
+    """How the command line names the worlds on a map; what is as by default is left out."""
+    chosen = {"resolution": resolution, "radius": radius}
+    options = [f"{name}={value:g}" for name, value in chosen.items() if value != getattr(RosMapConfig, name)]
+    return ",".join([f"map:{file}", *([] if places is None else [f"places={places}"]), *options])
+
+
+@contextmanager
+def _caught_warnings() -> Iterator[list[str]]:
+    """The texts of the map's warnings, once the block is done."""
+    texts: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", MapWarning)
+        yield texts
+    texts += [str(warning.message) for warning in caught]
+
+
+def _title(file: Path, clean: CleanMap) -> str:
+    return f"{file.name}: {clean.frame.height} x {clean.frame.width} cells of {clean.frame.resolution:g} m"
+
+
+def _map_facts(image_map: OccupancyMap) -> dict[str, Any]:
+    settings, frame = image_map.settings, image_map.frame
+    return {
+        "file": str(settings.file),
+        "image": str(settings.image),
+        "pixels": [frame.height, frame.width],
+        "resolution": frame.resolution,
+        "metres": [round(frame.height * frame.resolution, 6), round(frame.width * frame.resolution, 6)],
+        "origin": [frame.x, frame.y],
+        "yaw": frame.yaw,
+        "mode": settings.mode,
+        "negate": settings.negate,
+        "occupied_thresh": float(settings.occupied_thresh),
+        "free_thresh": float(settings.free_thresh),
+    }
+
+
+def _survey_facts(survey: MapSurvey) -> dict[str, Any]:
+    facts = dataclasses.asdict(survey)
+    return {"shares": {name: facts.pop(name) for name in ("free", "occupied", "unknown")}, **facts}
+
+
+def _clean_facts(clean: CleanMap, radius: float) -> dict[str, Any]:
+    return {
+        "grid": {"cells": [clean.frame.height, clean.frame.width], "resolution": clean.frame.resolution},
+        "radius": radius,
+        "reachable_cells": int(clean.free.sum()),
+        "free_area": dataclasses.asdict(clean.area),
+        "cut_off": [dataclasses.asdict(part) for part in clean.cut_off],
+    }
+
+
+def _map_lines(image_map: OccupancyMap, survey: MapSurvey) -> Iterator[tuple[str, str]]:
+    settings, frame = image_map.settings, image_map.frame
+    metres = f"{frame.width * frame.resolution:.2f} x {frame.height * frame.resolution:.2f} m"
+    yield "image", f"{settings.image.name}, {frame.width} x {frame.height} pixels of {frame.resolution:g} m: {metres}"
+    yield "origin", f"[{frame.x:g}, {frame.y:g}], turned by {frame.yaw:g} rad ({math.degrees(frame.yaw):.1f} degrees)"
+    inverted = ", negated" if settings.negate else ""
+    thresholds = f"occupied above {float(settings.occupied_thresh):g}, free below {float(settings.free_thresh):g}"
+    yield "mode", f"{settings.mode}{inverted}, {thresholds}"
+    shares = ((survey.free, "free"), (survey.occupied, "occupied"), (survey.unknown, "unknown"))
+    yield "pixels", ", ".join(f"{100 * share:.1f} % {name}" for share, name in shares)
+    specks = f", {survey.specks} of them specks" if survey.specks else ""
+    yield "free space", f"connected parts: {survey.components}{specks}; the largest has {survey.largest:.1f} m2"
+
+
+def _clean_lines(clean: CleanMap, radius: float) -> Iterator[tuple[str, str]]:
+    frame, area = clean.frame, clean.area
+    yield "grid", f"{frame.height} x {frame.width} cells of {frame.resolution:g} m, {clean.free.sum()} reachable"
+    yield (
+        "cleaning",
+        f"{area.mapped:.1f} m2 free on the map; {area.inflated:.1f} where a robot of radius {radius:g} m fits; "
+        f"{area.resampled:.1f} in whole cells; {area.reachable:.1f} connected",
+    )
+
+
+def _passage_table(passages: Sequence[Passage]) -> Table:
+    rest = len(passages) - SHOWN
+    table = Table(
+        title="narrowest passages",
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        caption=f"and {rest} more: --json" if rest > 0 else None,
+        caption_justify="left",
+    )
+    for name in ("width (m)", "at", "area behind (m2)"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("on the grid")
+    for passage in passages[:SHOWN]:
+        x, y = passage.at
+        state = "open" if passage.is_open else "closed"
+        table.add_row(f"{passage.width:.2f}", f"[{x:.2f}, {y:.2f}]", f"{passage.area:.1f}", state)
+    return table
+
+
+def _defects(survey: MapSurvey, clean: CleanMap) -> Iterator[str]:
+    """What looks wrong, in words, with what cleaning does about it."""
+    if survey.open_edge:
+        yield (
+            f"{survey.open_edge:.1f} m of free space end at unknown space or the image's edge, without a wall: "
+            "cleaning closes them"
+        )
+    if survey.specks:
+        yield f"{survey.specks} specks of free space that no robot can have seen: cleaning drops them"
+    if survey.loose_obstacles:
+        yield f"{survey.loose_obstacles} obstacles of a single pixel amid free space: kept; erase what is noise"
+    yield from _cut_off_lines(clean)
+
+
+def _cut_off_lines(clean: CleanMap) -> Iterator[str]:
+    why = "cut off by the size of the cells: use smaller ones"
+    for part in clean.cut_off[:SHOWN]:
+        yield f"{part.area:.1f} m2 at [{part.at[0]:.2f}, {part.at[1]:.2f}] are {why}"
+    rest = clean.cut_off[SHOWN:]
+    if rest:
+        yield f"{len(rest)} smaller parts, {sum(part.area for part in rest):.1f} m2 in all, are {why}"
+
+
+def _joined(
+    old: Places, places: Sequence[str], rooms: Sequence[str], tasks: Sequence[str], start: str | None
+) -> Places:
+    """The old labels with what the options add. Raises TaskError for a bad name or formula."""
+    regions: dict[str, list[Region]] = {name: list(found) for name, found in old.propositions}
+    for option in places:
+        name, text = _named("--place", option, "NAME=X,Y[,RADIUS]")
+        regions.setdefault(name, []).append(_read_disc(option, text))
+    for option in rooms:
+        name, text = _named("--room", option, 'NAME="X,Y X,Y X,Y ..."')
+        regions.setdefault(name, []).append(_read_polygon(option, text))
+    if not regions:
+        fail("there is nothing to label: give a --place or a --room")
+    names = check_propositions(list(regions))
+    formulas = dict(old.tasks) | dict(_named("--task", option, "NAME=FORMULA") for option in tasks)
+    for formula in formulas.values():
+        Task.of_formula(formula, names)
+    return Places(
+        tuple((name, tuple(found)) for name, found in regions.items()),
+        old.start if start is None else _read_start(start),
+        tuple(formulas.items()),
+        "labels",
+    )
+
+
+def _named(option: str, text: str, form: str) -> tuple[str, str]:
+    name, equals, value = (part.strip() for part in text.partition("="))
+    if not (name and equals and value):
+        fail(f"{option} {text}: write {option} {form}")
+    return name, value
+
+
+def _read_disc(option: str, text: str) -> Disc:
+    numbers = _read_numbers(f"--place {option}", text)
+    if len(numbers) not in (2, 3):
+        fail(f"--place {option}: give x and y in metres and, if you like, a radius: 2.1,3.4,0.5")
+    radius = numbers[2] if len(numbers) == 3 else PLACE_RADIUS
+    if radius < 0:
+        fail(f"--place {option}: a radius of {radius:g} m is negative")
+    return Disc((numbers[0], numbers[1]), radius)
+
+
+def _read_polygon(option: str, text: str) -> Polygon:
+    corners = [_read_numbers(f"--room {option}", corner) for corner in text.split()]
+    if len(corners) < 3 or any(len(corner) != 2 for corner in corners):
+        fail(f"--room {option}: give three corners or more, in metres: 1,1 4,1 4,3")
+    return Polygon(tuple((x, y) for x, y in corners))
+
+
+def _read_start(text: str | None) -> Point | None:
+    if text is None:
+        return None
+    numbers = _read_numbers("--start", text)
+    if len(numbers) != 2:
+        fail(f"--start {text}: give x and y in metres: 1.5,2")
+    return numbers[0], numbers[1]
+
+
+def _read_numbers(what: str, text: str) -> list[float]:
+    parts = [part.strip() for part in text.split(",")]
+    if not all(re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)", part) for part in parts):
+        fail(f"{what}: {text!r} are no numbers joined by commas")
+    return [float(part) for part in parts]

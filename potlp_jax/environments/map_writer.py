@@ -1,0 +1,44 @@
+"""Writes occupancy maps in the format that `potlp_jax.environments.map_server` reads."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool
+
+from potlp_jax.environments.map_server import (
+    DEFAULT_FREE_THRESH,
+    DEFAULT_OCCUPIED_THRESH,
+    GridFrame,
+    MapError,
+)
+
+FREE_GREY = 254
+OCCUPIED_GREY = 0
+"""The greys of the map savers of ROS 1 and ROS 2."""
+
+
+def save_map(file: Path, free: Bool[np.ndarray, "H W"], frame: GridFrame) -> Path:
+    """Write a trinary map, ``file`` (.yaml) with its image beside it (.pgm), and return the image's path.
+
+    What is not free is an obstacle. Numbers are written so that reading them gives the same frame.
+
+    Raises:
+        MapError: the name does not end in .yaml.
+        OSError: a file cannot be written.
+    """
+    if file.suffix != ".yaml":
+        raise MapError(file, "", "a map's name must end in .yaml")
+    image = file.with_suffix(".pgm")
+    pixels = np.where(free, FREE_GREY, OCCUPIED_GREY).astype(np.uint8)
+    image.write_bytes(f"P5\n{frame.width} {frame.height}\n255\n".encode() + pixels.tobytes())
+    file.write_text(
+        f"image: {image.name}\n"
+        "mode: trinary\n"
+        f"resolution: {frame.resolution!r}\n"
+        f"origin: [{frame.x!r}, {frame.y!r}, {frame.yaw!r}]\n"
+        "negate: 0\n"
+        f"occupied_thresh: {DEFAULT_OCCUPIED_THRESH}\n"
+        f"free_thresh: {DEFAULT_FREE_THRESH}\n",
+        "utf-8",
+    )
+    return image

@@ -1,0 +1,67 @@
+"""A finished trial as the row that the statistics need of it."""
+
+import subprocess
+import zlib
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from potlp_jax.records import Trial
+from potlp_jax.sweep.specification import configuration_hash
+from potlp_jax.sweep.store import Item, Row
+from potlp_jax.trial_config import TrialConfig
+from potlp_jax.world.grid import World
+
+
+def trial_row(item: Item, trial: Trial, key: PRNGKeyArray, config: TrialConfig, seconds: float) -> Row:
+    """The row of a trial that was run with this key and configuration and took so many seconds."""
+    return Row(
+        item=item,
+        outcome=trial.outcome.value,
+        cost=trial.cost,
+        budget=trial_budget(trial.world, config.budget_factor),
+        steps=len(trial.path) - 1,
+        decisions=len(trial.decisions),
+        fallbacks=sum(decision.fallback for decision in trial.decisions),
+        status=trial.status,
+        key=_words(key),
+        path=path_digest(trial.path),
+        configuration=configuration_hash(config),
+        versions=trial.versions,
+        commit=source_commit(),
+        seconds=seconds,
+    )
+
+
+def trial_budget(world: World, factor: float) -> float:
+    """The cost at which a trial in this world is given up (docs/model.md, section 7)."""
+    return factor * float(np.sum(np.asarray(world.extent))) * float(world.resolution)
+
+
+def path_digest(path: Sequence[tuple[int, int]]) -> str:
+    """Eight hexadecimal digits that tell paths apart."""
+    return f"{zlib.crc32(np.asarray(path, np.int32).tobytes()):08x}"
+
+
+@lru_cache(maxsize=1)
+def source_commit() -> str:
+    """The commit that the package was run from, with ``+`` where files were changed; empty outside of a repository."""
+    folder = Path(__file__).parents[1]
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
+    try:
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--", str(folder)) else "")
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+
+
+def _words(key: PRNGKeyArray) -> tuple[int, int]:
+    first, second = np.asarray(jax.random.key_data(key)).tolist()
+    return int(first), int(second)
