@@ -29,14 +29,21 @@ Environment = Annotated[
     str,
     typer.Argument(
         metavar="ENV",
-        help="[cyan]toy[/cyan], [cyan]firefighting[/cyan], [cyan]rooms[/cyan] or [cyan]map:FILE.yaml[/cyan] (ROS map).",
+        help="[cyan]toy[/cyan], [cyan]firefighting[/cyan], [cyan]delivery[/cyan], [cyan]rooms[/cyan], "
+        "[cyan]map:FILE.yaml[/cyan] (ROS map) or [cyan]floorplan:FILE.xml[/cyan] (real floor plan, or a folder).",
     ),
 ]
 TaskName = Annotated[
     str, typer.Option("--task", "-t", help="Number of one of the environment's tasks, a formula, or a .hoa file.")
 ]
 SplitName = Annotated[
-    str, typer.Option("--split", help="Which worlds to draw from: calibration, training, validation or test.")
+    str | None,
+    typer.Option(
+        "--split",
+        help="Which worlds to draw from: calibration, training, validation (the default) or test (all that floor plans "
+        "are for).",
+        show_default=False,
+    ),
 ]
 Simulations = Annotated[
     int | None, typer.Option("--simulations", min=1, help="Simulations per decision of policies that search.")
@@ -161,7 +168,7 @@ def run_command(
         ),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="Which world of the split.")] = 0,
-    split: SplitName = "validation",
+    split: SplitName = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for trial.json, trial.png and trial.gif.")
     ] = None,
@@ -200,7 +207,7 @@ def compare_command(
     ] = None,
     trials: Annotated[int, typer.Option("--trials", "-n", min=1, help="Worlds; every policy runs in each.")] = 20,
     seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="First world of the split.")] = 0,
-    split: SplitName = "validation",
+    split: SplitName = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Folder for compare.json, trials.csv, scatter.png and table.txt."),
