@@ -35,7 +35,8 @@ from potlp_jax.world.grid import World, WorldError
 
 _HALLWAYS = 0
 _MIN_SIDE = 5
-_ATTEMPTS = 50
+_DEEPEST_SMALL = 13
+_ATTEMPTS = 20
 _POSITIONS = 8
 
 _WIDTHS = {Kind.OFFICE: (5, 9), Kind.LAB: (10, 20), Kind.CLASSROOM: (11, 20), Kind.OTHER: (4, 8)}
@@ -64,14 +65,14 @@ class DeliveryConfig:
         severed: probability that a hallway between two others is closed by a room in its middle.
         split: probability that a block which rooms could fill is divided by another hallway.
         outdoors, lobby: probability that a block stays solid, or that a small one is a lobby.
-        room_behind: probability that a small room in a deep row has another behind it.
+        room_behind: probability that a small room 11 to 13 cells deep has another behind it; deeper ones always do.
         second_door: probability of a second door to the hallways, for rooms at least 12 cells wide.
         joining_door: probability, per room, of a door to a neighbouring room.
         furnishing: people, light and colours.
     """
 
-    smallest: tuple[int, int] = (52, 88)
-    largest: tuple[int, int] = (96, 160)
+    smallest: tuple[int, int] = (48, 72)
+    largest: tuple[int, int] = (80, 136)
     resolution: float = 0.5
     hallway_width: tuple[int, int] = (3, 6)
     door_width: int = 2
@@ -210,7 +211,7 @@ class _Builder:
     def build(self) -> Floor:
         height, width = self.rooms.shape
         block = _Box(0, height, 0, width)
-        self._cut(block, self._choose_cut(block, [False, True]))
+        self._cut(block, self._choose_turn(block, [False, True]), first=True)
         return self._without(set(range(len(self.kinds))) - self._open_doors())
 
     def _chance(self, probability: float) -> bool:
@@ -221,11 +222,11 @@ class _Builder:
     def _divide(self, block: _Box) -> None:
         """Fill a block with rooms, or run a hallway through it and go on with what lies on both sides."""
         fits = [turned for turned in (False, True) if self._fits(block, turned)]
-        cuts = [turned for turned in (False, True) if self._can_cut(block, turned)]
-        if fits and not (cuts and self._chance(self.config.split)):
+        cuts = [turned for turned in (False, True) if any(self._contacts(block, turned))]
+        if cuts and (not fits or self._chance(self.config.split)) and self._cut(block, self._choose_turn(block, cuts)):
+            return
+        if fits:
             self._fill(block, fits[int(self.rng.integers(len(fits)))])
-        elif cuts:
-            self._cut(block, self._choose_cut(block, cuts))
         else:
             self._fill_strip(block)
 
@@ -243,43 +244,49 @@ class _Builder:
         depth = block.width if turned else block.height
         return count > 0 and depth <= count * self.config.row_depth
 
-    def _can_cut(self, block: _Box, turned: bool) -> bool:
-        """Whether a hallway across the rows (the columns if ``turned``) leaves two blocks and meets another hallway."""
-        across = block.height if turned else block.width
-        return across >= 2 * (_MIN_SIDE + 3) + self.config.hallway_width[1] and any(self._contacts(block, turned))
+    def _choose_turn(self, block: _Box, turns: list[bool]) -> bool:
+        """Across which side a hallway runs: mostly so that it divides the longer one."""
+        if len(turns) == 1:
+            return turns[0]
+        return self._chance(block.height**2 / (block.height**2 + block.width**2))
 
-    def _choose_cut(self, block: _Box, cuts: list[bool]) -> bool:
-        """The side that is longer is divided more often."""
-        if len(cuts) == 1:
-            return cuts[0]
-        share = block.height**2 / (block.height**2 + block.width**2)
-        return self._chance(share)
+    def _cut(self, block: _Box, turned: bool, *, first: bool = False) -> bool:
+        """Run a hallway from the first to the last row of the block (column if ``turned``), divide what is left.
 
-    def _cut(self, block: _Box, turned: bool) -> None:
-        """Run a hallway from the first to the last row of the block (column if ``turned``), divide what is left."""
+        Returns False, and does nothing, where the block is too narrow, or the hallway would meet no other. The first
+        hallway need not.
+        """
         width = int(self.rng.integers(self.config.hallway_width[0], self.config.hallway_width[1] + 1))
         box = block.turned if turned else block
-        left = self._choose_position(box, width)
-        hallway = box.columns(left, left + width)
-        self._carve_hallway(hallway, turned)
+        left = self._choose_position(box, width, turned, first)
+        if left is None:
+            return False
+        self._carve_hallway(box.columns(left, left + width), turned)
         for side in (box.columns(box.left, left), box.columns(left + width, box.right)):
             self._divide(side.turned if turned else side)
+        return True
 
-    def _choose_position(self, box: _Box, width: int) -> int:
+    def _choose_position(self, box: _Box, width: int, turned: bool, first: bool) -> int | None:
         """Of a few positions the one beside which rows of rooms fit best."""
         margin, depth = _MIN_SIDE + 3, self.config.row_depth
+        if box.width < 2 * margin + width:
+            return None
         left = self.rng.integers(box.left + margin, box.right - margin - width + 1, size=_POSITIONS)
+        joined = np.array([first or any(self._meets(box.columns(one, one + width), turned)) for one in left.tolist()])
         sides = np.stack([left - box.left, box.right - left - width])
         wasted = np.where(sides <= depth, 0, np.minimum(abs(sides - 1.7 * depth), depth)).sum(axis=0)
-        return int(left[np.argmin(wasted)])
+        return int(left[np.argmin(np.where(joined, wasted, np.inf))]) if joined.any() else None
+
+    def _meets(self, hallway: _Box, turned: bool) -> tuple[bool, bool]:
+        """Whether a hallway, over its whole width, meets another at its first row, and at its last."""
+        rooms, columns = self.rooms.T if turned else self.rooms, slice(hallway.left, hallway.right)
+        before = hallway.top > 0 and bool((rooms[hallway.top - 1, columns] == _HALLWAYS).all())
+        after = hallway.bottom < len(rooms) and bool((rooms[hallway.bottom, columns] == _HALLWAYS).all())
+        return before, after
 
     def _carve_hallway(self, hallway: _Box, turned: bool) -> None:
         """Open the hallway up to the hallways that it meets; it may stop short, or be closed in its middle."""
-        rooms = self.rooms.T if turned else self.rooms
-        meets = [
-            0 < line < len(rooms) and bool((rooms[beyond, hallway.left : hallway.right] == _HALLWAYS).all())
-            for line, beyond in ((hallway.top, hallway.top - 1), (hallway.bottom, min(hallway.bottom, len(rooms) - 1)))
-        ]
+        rooms, meets = self.rooms.T if turned else self.rooms, self._meets(hallway, turned)
         top, bottom = hallway.top + (not meets[0]), hallway.bottom - (not meets[1])
         length = bottom - top
         room = int(self.rng.integers(_MIN_SIDE + 1, 13))
@@ -346,6 +353,8 @@ class _Builder:
         left = row.left
         while left < row.right:
             kind = list(mix)[int(self.rng.choice(len(mix), p=list(mix.values())))]
+            if kind in (Kind.LAB, Kind.CLASSROOM) and min(row.right - left, row.height + 3) < _WIDTHS[kind][0]:
+                kind = Kind.OFFICE
             low, high = _WIDTHS[kind]
             right = left + int(self.rng.integers(low, high + 1))
             if row.right - right < _MIN_SIDE + 1:
@@ -356,8 +365,8 @@ class _Builder:
     def _add_rooms_in_depth(self, box: _Box, kind: Kind, turned: bool, front_first: bool) -> None:
         """One room, or a small one with another behind it."""
         parts = [(box, kind)]
-        small = kind in (Kind.OFFICE, Kind.OTHER)
-        if small and box.height >= 2 * _MIN_SIDE + 1 and self._chance(self.config.room_behind):
+        small, possible = kind in (Kind.OFFICE, Kind.OTHER), box.height >= 2 * _MIN_SIDE + 1
+        if small and possible and (box.height > _DEEPEST_SMALL or self._chance(self.config.room_behind)):
             wall = box.top + _MIN_SIDE + int(self.rng.integers(0, box.height - 2 * _MIN_SIDE))
             front, back = box.rows(box.top, wall), box.rows(wall + 1, box.bottom)
             if not front_first:
@@ -419,7 +428,7 @@ class _Builder:
         places = []
         for wall in walls:
             leads = (wall.beyond == target) & (self.rooms[wall.rows, wall.columns] == NO_ROOM)
-            stretches = leads[: len(leads) - width + 1].copy()
+            stretches = leads[: max(len(leads) - width + 1, 0)].copy()
             for step in range(1, width):
                 stretches &= leads[step : step + len(stretches)]
             places += [(wall, int(first)) for first in np.flatnonzero(stretches)]
