@@ -393,8 +393,11 @@ class _Drawing:
             if not 0 <= line < cells.shape[1]:
                 return None
             steps = _gap(cells[:, line], along, reach, rooms)
-            lines = np.full_like(steps, line)
-            return None if not len(steps) else (steps, lines)
+            beside = cells[steps, max(line - 1, 0) : line + 2]
+            # A cut along a third room would open that, too.
+            if not len(steps) or not np.isin(beside, (NO_ROOM, *rooms)).all():
+                return None
+            return steps, np.full_like(steps, line)
 
         if implicit:
             found = _all_cuts(cut, int(across), along)
