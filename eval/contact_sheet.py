@@ -151,7 +151,7 @@ def draw_plan(plan: Axes, world: World, propositions: Sequence[str], cell: Cell,
     floor = np.asarray(look.floor_colour)[window] * (0.25 + 0.75 * np.asarray(look.light)[window][..., None])
     hidden = 1 - np.exp(-6 * smoke)
     # Walls have a colour where they stand beside something; the rest is out of sight.
-    facing = wall_colours & ndimage.binary_dilation(~occupied, np.ones((3, 3)))[..., None]
+    facing = np.logical_and(wall_colours, ndimage.binary_dilation(~occupied, np.ones((3, 3))))[..., None]
     walls = np.where(facing, 0.6 * np.asarray(look.wall_colour)[window], 70)
     image = np.where(occupied[..., None], walls, floor * (1 - hidden) + 250 * hidden)
     plan.imshow(image.astype(np.uint8), interpolation="nearest")
