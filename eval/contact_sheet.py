@@ -5,6 +5,7 @@ The worlds are training worlds. The figure's format is that of the file's ending
 
 import argparse
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
+from scipy import ndimage
 
 from potlp_jax.environments.firefighting import (
     HALLWAYS,
@@ -126,45 +128,49 @@ def draw_sheet(scenes: list[Scene], path: Path) -> None:
         bottom, height = 1 - (number + 1) / len(scenes), 1 / len(scenes)
         pane = figure.add_axes((0.01, bottom + 0.14 * height, _PICTURE_SHARE - 0.02, 0.72 * height))
         pane.imshow(np.asarray(picture), aspect="auto", interpolation="nearest")
-        _mark_bearings(pane, picture.shape[1])
+        mark_bearings(pane, picture.shape[1])
         pane.set_title(scene.title, size=9, loc="left", pad=3, color=INK)
         plan = figure.add_axes((_PICTURE_SHARE, bottom + 0.06 * height, 0.99 - _PICTURE_SHARE, 0.86 * height))
-        _draw_plan(plan, scene)
+        draw_plan(plan, scene.world, Firefighting.propositions, scene.cell)
     figure.savefig(path, pil_kwargs={"quality": _QUALITY} if path.suffix.lower() in (".jpg", ".jpeg") else None)
 
 
-def _mark_bearings(pane: Axes, columns: int) -> None:
+def mark_bearings(pane: Axes, columns: int) -> None:
+    """Name the bearings below a panorama of so many columns."""
     names = ("west", "north", "east", "south", "west")
     pane.set_xticks(np.linspace(0, columns, len(names)) - 0.5, names, size=7, color="#6E6E6E")
     pane.set_yticks([])
     pane.tick_params(length=2, color="#6E6E6E", pad=1)
 
 
-def _draw_plan(plan: Axes, scene: Scene) -> None:
-    """The map as it looks from above, its letters, and the robot."""
-    look = scene.world.appearance
-    occupied, smoke = np.asarray(scene.world.occupied)[..., None], np.asarray(look.smoke)[..., None]
-    floor = np.asarray(look.floor_colour) * (0.25 + 0.75 * np.asarray(look.light)[..., None])
+def draw_plan(plan: Axes, world: World, propositions: Sequence[str], cell: Cell, *, wall_colours: bool = False) -> None:
+    """The map as it looks from above, without padding, its letters, and the robot's cell; walls grey or coloured."""
+    rows, columns = (int(size) for size in np.asarray(world.extent))
+    window, look = (slice(rows), slice(columns)), world.appearance
+    occupied, smoke = np.asarray(world.occupied)[window], np.asarray(look.smoke)[window][..., None]
+    floor = np.asarray(look.floor_colour)[window] * (0.25 + 0.75 * np.asarray(look.light)[window][..., None])
     hidden = 1 - np.exp(-6 * smoke)
-    image = np.where(occupied, 70, floor * (1 - hidden) + 250 * hidden)
+    # Walls have a colour where they stand beside something; the rest is out of sight.
+    facing = np.logical_and(wall_colours, ndimage.binary_dilation(~occupied, np.ones((3, 3))))[..., None]
+    walls = np.where(facing, 0.6 * np.asarray(look.wall_colour)[window], 70)
+    image = np.where(occupied[..., None], walls, floor * (1 - hidden) + 250 * hidden)
     plan.imshow(image.astype(np.uint8), interpolation="nearest")
-    letters = np.asarray(scene.world.letters)
-    for bit, name in enumerate(Firefighting.propositions):
-        rows, columns = np.nonzero(letters >> bit & 1)
+    letters = np.asarray(world.letters)[window]
+    for bit, name in enumerate(propositions):
+        rows_of, columns_of = np.nonzero(letters >> bit & 1)
         colour = area_colour(bit)
-        plan.scatter(columns, rows, s=5, marker="s", color=colour, linewidths=0)
-        above = name == "exit"
+        plan.scatter(columns_of, rows_of, s=5, marker="s", color=colour, linewidths=0)
+        above = name == "exit" or rows_of.mean() > 0.9 * rows
         plan.annotate(
             name,
-            (columns.mean(), rows.mean() + (-2 if above else 2)),
+            (columns_of.mean(), rows_of.mean() + (-2 if above else 2)),
             ha="center",
             va="bottom" if above else "top",
             size=6,
             color=INK,
             bbox={"boxstyle": "round,pad=0.12", "facecolor": "white", "edgecolor": colour, "lw": 0.8},
         )
-    row, column = scene.cell
-    plan.plot(column, row, marker="o", markersize=7, color=CHOSEN, markeredgecolor="white", markeredgewidth=1.2)
+    plan.plot(cell[1], cell[0], marker="o", markersize=7, color=CHOSEN, markeredgecolor="white", markeredgewidth=1.2)
     plan.set_axis_off()
 
 

@@ -95,8 +95,10 @@ def test_max_positive_literals_reaches_the_task():
         (("task", "F b", "--propositions", "a"), "unknown proposition"),
         (("task", "missing.hoa"), "missing.hoa"),
         (("task", "F a", "--svg", "picture.docx"), "docx"),
-        (("run", "castle"), "toy, firefighting, rooms, map:FILE.yaml"),
+        (("run", "castle"), "toy, firefighting, delivery, rooms, map:FILE.yaml, floorplan:FILE.xml"),
         (("run", "map:missing.yaml"), "missing.yaml"),
+        (("run", "floorplan:missing.xml"), "missing.xml: cannot be read"),
+        (("run", "floorplan:"), "names no plan"),
         (("run", "toy", "--task", "9"), "1 (F goal)"),
         (("run", "toy", "--task", "F dragon"), "dragon"),
         (("run", "toy", "--policy", "clever"), "known-map, baseline"),
@@ -267,7 +269,7 @@ def test_unknown_environment_lists_the_known_ones():
 
 def test_every_family_of_worlds_is_found_by_its_name():
     for family in FAMILIES:
-        if not family.startswith("map:"):
+        if ":" not in family:
             assert make(family).name == family
 
 

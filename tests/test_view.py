@@ -165,6 +165,8 @@ def test_trial_without_decisions_has_a_picture(trial, tmp_path):
         ("firefighting/test", "firefighting/test, seed 3"),
         ("map:/some/where/lab.yaml,places=a/b.yaml,resolution=0.3/validation", "map:lab.yaml/validation, seed 3"),
         ("map:lab.yaml/validation", "map:lab.yaml/validation, seed 3"),
+        ("floorplan:/some/where/school.xml,resolution=0.4/test", "floorplan:school.xml/test, seed 3"),
+        ("floorplan:plans/schools//test", "floorplan:schools/test, seed 3"),
     ],
 )
 def test_heading_names_the_environment_briefly(trial, environment, shown):

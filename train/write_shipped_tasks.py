@@ -11,14 +11,16 @@ import potlp_jax.task
 from potlp_jax.task import Task
 
 FIREFIGHTING = ("fire", "alarm", "extinguisher", "exit")
+DELIVERY = ("professor", "grad", "undergrad")
 TOY = ("goal", "hazard")
 
-# The fire-fighting tasks are those of Bradley et al. 2021, section V-A, in the paper's order.
+# The fire-fighting and delivery tasks are those of Bradley et al. 2021, sections V-A and V-B, in the paper's order.
 SHIPPED_TASKS: dict[str, tuple[str, tuple[str, ...]]] = {
     "firefighting-1": ("(!fire U alarm) | ((!fire U extinguisher) & F fire)", FIREFIGHTING),
     "firefighting-2": ("!fire U (alarm & F exit)", FIREFIGHTING),
     "firefighting-3": ("(!fire U extinguisher) & F(fire & F exit)", FIREFIGHTING),
     "firefighting-4": ("!fire U exit", FIREFIGHTING),
+    "delivery-1": ("F professor & F grad & F undergrad", DELIVERY),
     "toy-1": ("F goal", TOY),
     "toy-2": ("!hazard U goal", TOY),
 }

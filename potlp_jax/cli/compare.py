@@ -92,14 +92,15 @@ def compare_policies(
     policy_names: str | None,
     trials: int,
     seed: int,
-    split_name: str,
+    split_name: str | None,
     out: Path | None,
     simulations: int | None,
     estimator: Path | None,
     json: bool,
 ) -> None:
     """Run every policy in the same worlds and report the paired figures (docs/model.md, section 8)."""
-    generator, split = make(environment), read_split(split_name)
+    generator = make(environment)
+    split = read_split(split_name, generator)
     policies = _read_policies(default_policy(generator) if policy_names is None else policy_names)
     trained = read_trained_estimator(estimator)
     task = read_environment_task(generator, task_name)

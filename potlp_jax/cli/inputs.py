@@ -6,7 +6,7 @@ from pathlib import Path
 
 from potlp_jax.cli.output import fail, note
 from potlp_jax.environments import Generator
-from potlp_jax.environments.splits import MAX_INDEX, Split, world_key
+from potlp_jax.environments.splits import MAX_INDEX, Split, check_split, default_split, world_key
 from potlp_jax.learning.estimator import TrainedEstimator, read_estimator, shipped_estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task, shipped_tasks
@@ -55,10 +55,13 @@ def read_trained_estimator(path: Path | None) -> TrainedEstimator | None:
     return None if path is None else read_estimator(path)
 
 
-def read_split(name: str) -> Split:
-    """A split of worlds by name."""
+def read_split(name: str | None, generator: Generator) -> Split:
+    """A split of worlds by name; None: the environment's default. Raises WorldError where it has no such worlds."""
+    if name is None:
+        name = default_split(generator.name)
     if name not in list(Split):
         fail(f"unknown split {name!r}; choose from: {', '.join(Split)}")
+    check_split(Split(name), generator.name)
     if name == Split.TEST:
         note("worlds of the test split are for reported figures: log this run")
     return Split(name)

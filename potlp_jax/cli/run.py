@@ -31,7 +31,7 @@ def run_one(
     task_name: str,
     policy_name: str | None,
     seed: int,
-    split_name: str,
+    split_name: str | None,
     out: Path | None,
     animation: bool,
     simulations: int | None,
@@ -39,7 +39,8 @@ def run_one(
     json: bool,
 ) -> None:
     """Run a trial and leave with exit code 1 if it did not end satisfied."""
-    generator, split = make(environment), read_split(split_name)
+    generator = make(environment)
+    split = read_split(split_name, generator)
     policy = default_policy(generator) if policy_name is None else read_policy(policy_name)
     trained = read_trained_estimator(estimator)
     task = read_environment_task(generator, task_name)

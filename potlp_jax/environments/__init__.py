@@ -3,7 +3,14 @@
 from potlp_jax.environments.base import Generator
 from potlp_jax.world.grid import WorldError
 
-FAMILIES: tuple[str, ...] = ("toy", "firefighting", "rooms", "map:FILE.yaml")
+FAMILIES: tuple[str, ...] = (
+    "toy",
+    "firefighting",
+    "delivery",
+    "rooms",
+    "map:FILE.yaml",
+    "floorplan:FILE.xml",
+)
 """The names that ``make`` understands."""
 
 
@@ -11,11 +18,12 @@ def make(name: str) -> Generator:
     """The generator of a family of worlds, as named on the command line.
 
     Args:
-        name: ``toy``, ``firefighting``, ``rooms``, or ``map:FILE.yaml`` for worlds on a ROS map.
+        name: ``toy``, ``firefighting``, ``delivery``, ``rooms``, ``map:FILE.yaml`` for worlds on a ROS map, or
+            ``floorplan:FILE.xml`` for delivery worlds on a real floor plan (or on those of a folder).
 
     Raises:
         WorldError: there is no such family.
-        MapError: the map cannot be used.
+        MapError: the map or the floor plan cannot be used.
     """
     # Only the family asked for is imported: reading maps needs libraries that the others do not.
     if name == "toy":
@@ -26,6 +34,10 @@ def make(name: str) -> Generator:
         from potlp_jax.environments.firefighting import Firefighting
 
         return Firefighting()
+    if name == "delivery":
+        from potlp_jax.environments.delivery import Delivery
+
+        return Delivery()
     if name == "rooms":
         from potlp_jax.environments.rooms import Rooms
 
@@ -34,6 +46,10 @@ def make(name: str) -> Generator:
         from potlp_jax.environments.ros_map import RosMap
 
         return RosMap.from_spec(name)
+    if name.startswith("floorplan:"):
+        from potlp_jax.environments.floorplan import FloorPlans
+
+        return FloorPlans.from_spec(name)
     raise WorldError(f"unknown environment {name!r}; choose one of: {', '.join(FAMILIES)}")
 
 

@@ -8,6 +8,9 @@ Rule of the project: parameters of an environment are chosen on CALIBRATION; tra
 TRAINING and VALIDATION; TEST is for the figures that are reported, and every run on it is logged. World ``N`` of the
 command line is index ``N`` of VALIDATION unless another split is named.
 
+Real floor plans are test data: no plan is ever trained, tuned or validated on, and ``world_key`` refuses every other
+split for them (``usable_splits``).
+
 The key of a world makes only the world. What a trial draws comes from the trial's own key.
 """
 
@@ -16,6 +19,8 @@ import zlib
 
 import jax
 from jaxtyping import PRNGKeyArray
+
+from potlp_jax.world.grid import WorldError
 
 _INDEX_BITS = 28
 MAX_INDEX: int = 2**_INDEX_BITS - 1
@@ -33,12 +38,37 @@ class Split(enum.StrEnum):
     TEST = "test"
 
 
+FLOOR_PLAN_PREFIX = "floorplan:"
+"""How the names of families of worlds on real floor plans begin."""
+
+
+def usable_splits(family: str) -> tuple[Split, ...]:
+    """The splits from which worlds of a family may be drawn."""
+    return (Split.TEST,) if family.startswith(FLOOR_PLAN_PREFIX) else tuple(Split)
+
+
+def default_split(family: str) -> Split:
+    """Where the command line draws worlds of a family from, unless told: VALIDATION, or TEST for floor plans."""
+    return Split.VALIDATION if Split.VALIDATION in usable_splits(family) else Split.TEST
+
+
+def check_split(split: Split, family: str) -> None:
+    """Raises WorldError where worlds of the family must not be drawn from the split."""
+    if split not in usable_splits(family):
+        raise WorldError(
+            f"{family}: real floor plans are test data, and {split} worlds cannot be drawn from them; "
+            f"use the split {Split.TEST}, and {Split.TRAINING} worlds of a generator (delivery)"
+        )
+
+
 def world_key(split: Split | str, index: int, family: str) -> PRNGKeyArray:
     """The typed key of world ``index`` of a split of a family of worlds.
 
     Raises:
         ValueError: where the index is negative or above ``MAX_INDEX``, or the split has no such name.
+        WorldError: where worlds of the family must not be drawn from the split.
     """
+    check_split(Split(split), family)
     number = list(Split).index(Split(split))
     if not 0 <= index <= MAX_INDEX:
         raise ValueError(f"the index of a world must lie in 0..{MAX_INDEX}, found {index}")

@@ -19,7 +19,7 @@ import hashlib
 import json
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -27,10 +27,11 @@ from typing import Any
 import yaml
 
 from potlp_jax.environments import make
-from potlp_jax.environments.splits import MAX_INDEX, Split
+from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
 from potlp_jax.trial_config import TrialConfig, trial_config_from_dict
+from potlp_jax.world.grid import WorldError
 
 
 class SpecificationError(ValueError):
@@ -136,6 +137,7 @@ def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = 
             raise SpecificationError(f"{where}: {name} is missing")
     policies = _policies(_list(data, "policies", where), where)
     environments = [str(name) for name in _list(data, "environments", where)]
+    split = _split(data.get("split", Split.VALIDATION.value), environments, where)
     cells = [
         Cell(environment, _formula(environment, task, where))
         for environment in environments
@@ -151,7 +153,7 @@ def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = 
         cells=tuple(cells),
         policies=policies,
         worlds=_number(data, "worlds", 1, where),
-        split=_split(data.get("split", Split.VALIDATION.value), where),
+        split=split,
         first_world=_number(data, "first_world", 0, where, default=0),
         estimator=None if estimator is None else folder / estimator,
         config=_settings(TrialConfig, data.get("settings", {}), f"{where}: settings"),
@@ -184,10 +186,15 @@ def _policies(names: list[Any], where: str) -> tuple[Policy, ...]:
     return tuple(dict.fromkeys([Policy.KNOWN_MAP, Policy.BASELINE, *map(Policy, names)]))
 
 
-def _split(name: Any, where: str) -> Split:
+def _split(name: Any, environments: Sequence[str], where: str) -> Split:
     known = [split.value for split in Split]
     if name not in known:
         raise SpecificationError(f"{where}: split: unknown split {name!r}; choose from: {', '.join(known)}")
+    for environment in environments:
+        try:
+            check_split(Split(name), environment)
+        except WorldError as error:
+            raise SpecificationError(f"{where}: split: {error}") from error
     return Split(name)
 
 

@@ -39,7 +39,7 @@ def run_command(
         ),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="Which world of the split.")] = 0,
-    split: SplitName = "validation",
+    split: SplitName = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for trial.json, trial.png and trial.gif.")
     ] = None,
@@ -78,7 +78,7 @@ def compare_command(
     ] = None,
     trials: Annotated[int, typer.Option("--trials", "-n", min=1, help="Worlds; every policy runs in each.")] = 20,
     seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="First world of the split.")] = 0,
-    split: SplitName = "validation",
+    split: SplitName = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Folder for compare.json, trials.csv, scatter.png and table.txt."),

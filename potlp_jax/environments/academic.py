@@ -1,0 +1,234 @@
+"""What floors of academic buildings have in common, wherever they come from: kinds of rooms, people, light, colours.
+
+A ``Floor`` says which room each free cell belongs to and of what kind the rooms are. ``furnish`` makes it a world: a
+professor stands in an office, a graduate student in a laboratory, an undergraduate in a classroom, each in a room drawn
+uniformly from those of its kind; the robot starts anywhere in the hallways.
+
+Light. Bradley et al. 2021, section V-B, say of rooms only: those that are occupied have the lights on, others are not
+illuminated. Hallways are therefore lit (by an amount that differs between worlds), rooms of every kind are dark unless
+somebody is in them. The cells of a doorway are as light as the room behind it.
+
+Walls are a cell thick in most places, and a cell has one colour: that of the room beside it, where several are, of the
+first of classroom, laboratory, office, other room, hallway. The wall between a hallway and a laboratory is the
+laboratory's on both sides; between a laboratory and an office, too.
+"""
+
+import dataclasses
+import enum
+from collections.abc import Mapping
+from types import MappingProxyType
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float32, Int32, PRNGKeyArray
+
+from potlp_jax.environments.base import host_generators
+from potlp_jax.world.grid import Appearance, World, WorldError, make_world
+
+Cell = tuple[int, int]
+
+NO_ROOM: int = -1
+"""Number of no room: the cell is an obstacle."""
+
+PROPOSITIONS: tuple[str, ...] = ("professor", "grad", "undergrad")
+"""In the order of the letters' bits."""
+
+TASKS: Mapping[str, str] = MappingProxyType({"1": "F professor & F grad & F undergrad"})
+"""The task of Bradley et al. 2021, section V-B."""
+
+
+class Kind(enum.IntEnum):
+    """What a room is for; where two meet at a wall, the larger value gives its colour."""
+
+    HALLWAY = 0
+    OTHER = 1
+    OFFICE = 2
+    LAB = 3
+    CLASSROOM = 4
+
+
+KIND_OF_PERSON: Mapping[str, Kind] = MappingProxyType(
+    {"professor": Kind.OFFICE, "grad": Kind.LAB, "undergrad": Kind.CLASSROOM}
+)
+"""Where each of ``PROPOSITIONS`` can be."""
+
+_WALL_COLOURS = {
+    Kind.HALLWAY: (208, 204, 194),
+    Kind.OTHER: (160, 152, 150),
+    Kind.OFFICE: (108, 146, 212),
+    Kind.LAB: (110, 190, 120),
+    Kind.CLASSROOM: (226, 170, 84),
+}
+_FLOOR_COLOURS = {
+    Kind.HALLWAY: (150, 150, 152),
+    Kind.OTHER: (132, 128, 124),
+    Kind.OFFICE: (136, 140, 150),
+    Kind.LAB: (140, 150, 140),
+    Kind.CLASSROOM: (158, 146, 128),
+}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Floor:
+    """A floor without people.
+
+    Attributes:
+        rooms: number of the room of each free cell, ``NO_ROOM`` on obstacles. A door's cells belong to the room behind
+            it, not to the hallway.
+        doors: the cells of doors.
+        kinds: the kind of each room, by its number.
+        resolution: side of a cell in metres.
+    """
+
+    rooms: Int32[np.ndarray, "H W"]
+    doors: Bool[np.ndarray, "H W"]
+    kinds: tuple[Kind, ...]
+    resolution: float
+
+    @property
+    def occupied(self) -> Bool[np.ndarray, "H W"]:
+        """True on obstacles."""
+        return self.rooms == NO_ROOM
+
+    @property
+    def kind_of_cell(self) -> Int32[np.ndarray, "H W"]:
+        """The ``Kind`` of each free cell's room; ``NO_ROOM`` on obstacles."""
+        return np.append(np.array(self.kinds, np.int32), np.int32(NO_ROOM))[self.rooms]
+
+    def rooms_of(self, kind: Kind) -> list[int]:
+        """Numbers of the rooms of a kind."""
+        return [number for number, found in enumerate(self.kinds) if found is kind]
+
+
+@dataclasses.dataclass(frozen=True)
+class FurnishConfig:
+    """People, light and colours.
+
+    Attributes:
+        person_radius: a person is met on a square of ``2 * person_radius + 1`` cells a side, inside of the room.
+        hallway_light: bounds of the hallways' brightness, drawn once a world.
+        tint: largest shift of each colour, per world; tint_noise: of the brightness, per cell (both of 255).
+    """
+
+    person_radius: int = 1
+    hallway_light: tuple[float, float] = (0.6, 1.0)
+    tint: int = 16
+    tint_noise: int = 3
+
+    def __post_init__(self) -> None:
+        low, high = self.hallway_light
+        if self.person_radius < 0 or not 0 <= low <= high <= 1 or self.tint < 0 or self.tint_noise < 0:
+            raise WorldError(
+                "person_radius, tint and tint_noise must not be negative, and hallway_light two numbers of 0 to 1 in "
+                f"increasing order; found {self}"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
+class Placement:
+    """Who is where.
+
+    Attributes:
+        start: the robot's first cell.
+        rooms, cells: number of the room and middle cell of each person, by proposition.
+        hallway_light: brightness of the hallways.
+    """
+
+    start: Cell
+    rooms: Mapping[str, int]
+    cells: Mapping[str, Cell]
+    hallway_light: float
+
+
+def missing_kinds(floor: Floor) -> tuple[Kind, ...]:
+    """The kinds of room that the task needs and the floor does not have."""
+    return tuple(kind for kind in (Kind.HALLWAY, *KIND_OF_PERSON.values()) if not floor.rooms_of(kind))
+
+
+def furnish(floor: Floor, key: PRNGKeyArray, config: FurnishConfig, shape: tuple[int, int]) -> tuple[World, Placement]:
+    """The floor with people, a start, light and colours, all drawn by key; costs are in metres.
+
+    The world's arrays have ``shape``: what is missing is solid and no part of its ``extent``. Two floors of one shape
+    cost one compilation.
+
+    Raises:
+        WorldError: a kind of room that somebody or the robot needs is missing, or the floor is larger than ``shape``.
+    """
+    missing = missing_kinds(floor)
+    if missing:
+        names = ", ".join(kind.name.lower() for kind in missing)
+        raise WorldError(f"the floor has no room of kind {names}, which the delivery task needs")
+    extent = floor.rooms.shape
+    floor = _padded(floor, shape)
+    people_rng, look_rng = host_generators(key, 2)
+    placement = _place_people(floor, people_rng, config)
+    look = _appearance(floor, placement, look_rng, config)
+    letters = _letters(floor, placement, config)
+    world = make_world(floor.occupied, letters, placement.start, floor.resolution, look)
+    return dataclasses.replace(world, extent=jnp.asarray(np.array(extent, np.int32))), placement
+
+
+def _padded(floor: Floor, shape: tuple[int, int]) -> Floor:
+    missing = [(0, size - found) for size, found in zip(shape, floor.rooms.shape, strict=True)]
+    if min(missing)[1] < 0:
+        raise WorldError(f"a floor of {floor.rooms.shape} cells does not fit into arrays of {shape}; give larger ones")
+    rooms = np.pad(floor.rooms, missing, constant_values=NO_ROOM)
+    return dataclasses.replace(floor, rooms=rooms, doors=np.pad(floor.doors, missing))
+
+
+def _place_people(floor: Floor, rng: np.random.Generator, config: FurnishConfig) -> Placement:
+    hallway = np.isin(floor.rooms, floor.rooms_of(Kind.HALLWAY)) & ~floor.doors
+    start = _draw_cell(rng, hallway)
+    rooms = {name: floor.rooms_of(kind) for name, kind in KIND_OF_PERSON.items()}
+    chosen = {name: numbers[int(rng.integers(len(numbers)))] for name, numbers in rooms.items()}
+    cells = {name: _draw_cell(rng, (floor.rooms == number) & ~floor.doors) for name, number in chosen.items()}
+    low, high = config.hallway_light
+    light = low + (high - low) * float(rng.random())
+    return Placement(start, MappingProxyType(chosen), MappingProxyType(cells), light)
+
+
+def _draw_cell(rng: np.random.Generator, allowed: Bool[np.ndarray, "H W"]) -> Cell:
+    row, column = np.argwhere(allowed)[rng.integers(np.count_nonzero(allowed))]
+    return int(row), int(column)
+
+
+def _letters(floor: Floor, placement: Placement, config: FurnishConfig) -> Int32[np.ndarray, "H W"]:
+    letters = np.zeros(floor.rooms.shape, np.int32)
+    reach = config.person_radius
+    for bit, name in enumerate(PROPOSITIONS):
+        row, column = placement.cells[name]
+        patch = (slice(max(row - reach, 0), row + reach + 1), slice(max(column - reach, 0), column + reach + 1))
+        letters[patch] |= np.where(floor.rooms[patch] == placement.rooms[name], 1 << bit, 0).astype(np.int32)
+    return letters
+
+
+def _appearance(floor: Floor, placement: Placement, rng: np.random.Generator, config: FurnishConfig) -> Appearance:
+    tints = rng.integers(-config.tint, config.tint + 1, size=(2, len(Kind), 3))
+    noise = rng.integers(-config.tint_noise, config.tint_noise + 1, size=(2, *floor.rooms.shape, 1))
+    floor_palette = np.array([_FLOOR_COLOURS[kind] for kind in Kind]) + tints[0]
+    wall_palette = np.array([_WALL_COLOURS[kind] for kind in Kind]) + tints[1]
+    kinds = floor.kind_of_cell
+    return Appearance(
+        floor_colour=_colours(floor_palette[np.maximum(kinds, 0)] + noise[0]),
+        wall_colour=_colours(wall_palette[_kind_of_wall(kinds)] + noise[1]),
+        smoke=jnp.asarray(np.zeros(floor.rooms.shape, np.float32)),
+        light=jnp.asarray(_light(floor, placement)),
+    )
+
+
+def _colours(values: Int32[np.ndarray, "H W 3"] | np.ndarray) -> jnp.ndarray:
+    return jnp.asarray(np.clip(values, 0, 255).astype(np.uint8))
+
+
+def _kind_of_wall(kinds: Int32[np.ndarray, "H W"]) -> Int32[np.ndarray, "H W"]:
+    """The largest kind among a cell and its eight neighbours; ``HALLWAY`` where no room is near."""
+    largest = cv2.dilate((kinds + 1).astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.int32) - 1
+    return np.maximum(largest, Kind.HALLWAY).astype(np.int32)
+
+
+def _light(floor: Floor, placement: Placement) -> Float32[np.ndarray, "H W"]:
+    lit = np.zeros(len(floor.kinds) + 1, np.float32)
+    lit[floor.rooms_of(Kind.HALLWAY)] = placement.hallway_light
+    lit[list(placement.rooms.values())] = 1.0
+    return lit[floor.rooms]
