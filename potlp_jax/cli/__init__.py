@@ -12,7 +12,8 @@ import typer
 from typer.core import TyperGroup
 
 from potlp_jax.cache import enable_compilation_cache
-from potlp_jax.cli.output import clear_errors, package_version
+from potlp_jax.cli.log_app import log_app
+from potlp_jax.cli.output import Json, clear_errors, package_version
 
 NO_CACHE = "--no-cache"
 
@@ -24,7 +25,6 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-Json = Annotated[bool, typer.Option("--json", help="Write JSON, and nothing else, to stdout.")]
 Environment = Annotated[
     str,
     typer.Argument(
@@ -46,6 +46,7 @@ estimator_app = typer.Typer(
     name="estimator", no_args_is_help=True, rich_markup_mode="rich", help="Describe or evaluate a trained estimator."
 )
 app.add_typer(estimator_app)
+app.add_typer(log_app)
 Estimator = Annotated[Path, typer.Argument(metavar="CHECKPOINT", help="An estimator (.npz), as train.fit writes it.")]
 EstimatorFile = Annotated[
     Path | None, typer.Option("--estimator", help="Trained estimator for the policy potlp; default: the shipped one.")

@@ -5,7 +5,7 @@ import importlib.metadata
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -13,6 +13,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 
 FAILED = 1
 BAD_INPUT = 2
+
+Json = Annotated[bool, typer.Option("--json", help="Write JSON, and nothing else, to stdout.")]
+"""The option of commands that programs may call."""
 
 
 def console() -> Console:
@@ -75,6 +78,7 @@ def _input_errors() -> tuple[type[Exception], ...]:
     """The errors that say what is wrong with an input; any other is a fault of the program and keeps its traceback."""
     from potlp_jax.environments.map_server import MapError
     from potlp_jax.learning.estimator_files import CheckpointError
+    from potlp_jax.logs.errors import LogError
     from potlp_jax.records import RecordError
     from potlp_jax.sweep.specification import SpecificationError
     from potlp_jax.sweep.store import StoreError
@@ -82,7 +86,17 @@ def _input_errors() -> tuple[type[Exception], ...]:
     from potlp_jax.view.style import PictureError
     from potlp_jax.world.grid import WorldError
 
-    return TaskError, WorldError, MapError, RecordError, PictureError, CheckpointError, SpecificationError, StoreError
+    return (
+        TaskError,
+        WorldError,
+        MapError,
+        LogError,
+        RecordError,
+        PictureError,
+        CheckpointError,
+        SpecificationError,
+        StoreError,
+    )
 
 
 def progress_bar() -> Progress:

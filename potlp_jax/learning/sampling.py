@@ -115,8 +115,9 @@ def settled(
     answers = np.zeros(mask.shape, bool)
     for subgoal in np.flatnonzero(mask):
         own = component == subgoal
-        beyond = np.setdiff1d(regions[ndimage.binary_dilation(own)], [0])
-        answers[subgoal] = not (np.any(unexplored & own) or np.any(np.isin(beyond, leads_on)))
+        around = np.asarray(ndimage.binary_dilation(own))
+        open_beyond = np.isin(regions[around], leads_on[leads_on > 0])
+        answers[subgoal] = not (np.any(unexplored & own) or np.any(open_beyond))
     return answers
 
 
