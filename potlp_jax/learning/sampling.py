@@ -115,7 +115,7 @@ def settled(
     answers = np.zeros(mask.shape, bool)
     for subgoal in np.flatnonzero(mask):
         own = component == subgoal
-        around = np.asarray(ndimage.binary_dilation(own))
+        around = np.asarray(ndimage.binary_dilation(own), bool)
         open_beyond = np.isin(regions[around], leads_on[leads_on > 0])
         answers[subgoal] = not (np.any(unexplored & own) or np.any(open_beyond))
     return answers

@@ -13,9 +13,8 @@ import sqlite3
 import struct
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
-from io import BytesIO
+from io import BufferedReader, BytesIO
 from pathlib import Path
-from typing import BinaryIO
 
 import yaml
 from rosbags.rosbag1 import Reader as Rosbag1Reader
@@ -191,7 +190,7 @@ def _messages_of_chunk(content: bytes, connections: dict[int, tuple[str, str]]) 
             yield RawMessage(topic, message_type, header.get_time("time"), data)
 
 
-def _rosbag1_records(stream: BinaryIO) -> Iterator[tuple[Header, bytes]]:
+def _rosbag1_records(stream: BufferedReader | BytesIO) -> Iterator[tuple[Header, bytes]]:
     """Records until the stream ends or makes no sense; of a chunk that is cut short what there is."""
     while True:
         try:
@@ -218,12 +217,13 @@ def _scan_mcap(file: Path) -> Iterator[RawMessage]:
 
 
 def _messages_of_mcap(
-    stream: BinaryIO, schemas: dict[int, str], channels: dict[int, tuple[str, str]]
+    stream: BufferedReader | BytesIO, schemas: dict[int, str], channels: dict[int, tuple[str, str]]
 ) -> Iterator[RawMessage]:
     for kind, record in _mcap_records(stream):
         content = BytesIO(record)
         if kind == _SCHEMA:
-            schemas[struct.unpack("<H", read_exact(content, 2))[0]] = read_string(content)
+            (number,) = struct.unpack("<H", read_exact(content, 2))
+            schemas[number] = read_string(content)
         elif kind == _CHANNEL:
             number, schema = struct.unpack("<HH", read_exact(content, 4))
             channels[number] = read_string(content), schemas.get(schema, "")
@@ -237,7 +237,7 @@ def _messages_of_mcap(
                 yield from _messages_of_mcap(BytesIO(_chunk_of_mcap(content)), schemas, channels)
 
 
-def _chunk_of_mcap(content: BinaryIO) -> bytes:
+def _chunk_of_mcap(content: BytesIO) -> bytes:
     """The records of a chunk; of one that is cut short and not compressed, what there is."""
     _, _, size, crc = struct.unpack("<QQQI", read_exact(content, 28))
     compression = read_string(content)
@@ -246,7 +246,7 @@ def _chunk_of_mcap(content: BinaryIO) -> bytes:
     return data if len(data) < stored and not compression else decompress(data, compression, size, crc)
 
 
-def _mcap_records(stream: BinaryIO) -> Iterator[tuple[int, bytes]]:
+def _mcap_records(stream: BufferedReader | BytesIO) -> Iterator[tuple[int, bytes]]:
     """Kind and content of the records until the stream ends; of a chunk that is cut short what there is."""
     while True:
         head = stream.read(9)

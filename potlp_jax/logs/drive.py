@@ -511,8 +511,8 @@ def _letters(places: Places, grid: _WorkingGrid, notes: list[str]) -> Int32[np.n
         if len(seen) < len(regions):
             missing = next(region for region in regions if region not in seen)
             notes.append(
-                f"{places.source}: {name}: {len(regions) - len(seen)} of {len(regions)} regions lie in what the log never "
-                f"saw, and are nowhere: {missing}"
+                f"{places.source}: {name}: {len(regions) - len(seen)} of {len(regions)} regions lie in what the log "
+                f"never saw, and are nowhere: {missing}"
             )
         kept.append((name, seen))
     # Not only what the robot could reach: places may be seen across a gap.

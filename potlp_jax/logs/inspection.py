@@ -17,7 +17,7 @@ from potlp_jax.logs.log import (
     Log,
 )
 
-GAP_FACTOR, GAP_SECONDS = 10.0, 2.0
+GAP_FACTOR, GAP_SECONDS = 5.0, 2.0
 """A pause is a gap if it is so many times the topic's usual interval, and so long."""
 
 _NOT_READ = {
