@@ -25,12 +25,14 @@ from potlp_jax.logs.drive import Eyes, GridConfig
 from potlp_jax.logs.errors import LogError
 from potlp_jax.logs.inspection import inspect
 from potlp_jax.logs.log import Log, LogConfig
-from potlp_jax.logs.replaying import replay
+from potlp_jax.logs.replaying import LoggedRobot, from_first_picture, replay
 from potlp_jax.logs.transforms import Transforms, headings, quaternion_of
 from potlp_jax.logs.writing import BagFormat
+from potlp_jax.planning.paths import KnownPath
 from potlp_jax.planning.policies import Policy
 from potlp_jax.records import NEVER_SEEN, Outcome, RecordError, belief_seen_by, load_trial
 from potlp_jax.replay import panorama_at
+from potlp_jax.robot import Robot, Stop
 from potlp_jax.task.task import Task
 from potlp_jax.trial import run_trial
 from potlp_jax.world.grid import BeliefMap, make_world
@@ -386,3 +388,38 @@ def test_bags_become_one_dataset(bags, tmp_path):
     again = _potlp(*command, "--out", tmp_path)
     assert again.exit_code == 2
     assert "choose an empty folder" in again.stderr
+
+
+def test_a_robot_that_looks_stops_where_there_is_a_picture(bags):
+    drive = drive_of(bags / "tour.bag", places_of(bags))
+    blind = {step: picture for step, picture in drive.pictures.items() if step in (2, 9, 17)}
+    drive = from_first_picture(dataclasses.replace(drive, pictures=blind), CAMERA)
+    assert drive.path == tuple(tour()[2:])
+    assert sorted(drive.pictures) == [0, 7, 15]
+    seen = first_seen_along(WORLD, tour())
+    np.testing.assert_array_equal(drive.first_seen, np.where(seen == NEVER_SEEN, seen, np.maximum(seen - 2, 0)))
+    robot = LoggedRobot(drive, Eyes(drive, CAMERA))
+    assert isinstance(robot, Robot)
+    path = KnownPath(
+        cells=jnp.asarray([tour()[2], tour()[2]], jnp.int32),
+        states=jnp.zeros(2, jnp.int32),
+        length=jnp.int32(0),
+        cost=jnp.float32(0.0),
+    )
+    stop = Stop(replan_distance=jnp.float32(1.0), budget=jnp.float32(0.0), is_frontier=jnp.bool_(False))
+    legs = []
+    while not robot.ended:
+        assert np.abs(np.asarray(robot.panorama()).astype(int) - panorama_of(tour_step(robot))).mean() < 4
+        legs.append(len(robot.advance(path, stop).cells))
+    assert legs == [7, 8, 3]
+    with pytest.raises(LogError, match="there is no picture of cell number 18"):
+        robot.panorama()
+
+
+def tour_step(robot):
+    """Number of the tour's cell on which the robot stands; its belief tells which of two visits it is."""
+    belief, cell = robot.observe()
+    known = np.count_nonzero(~np.asarray(belief.unknown))
+    seen = first_seen_along(WORLD, tour())
+    visits = [step for step, entered in enumerate(tour()) if entered == cell]
+    return next(step for step in visits if np.count_nonzero((seen != NEVER_SEEN) & (seen <= step)) == known)

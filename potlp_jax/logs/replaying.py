@@ -138,7 +138,7 @@ def replay(
     trained = estimator_for(task.propositions, estimator) if policy is Policy.POTLP else None
     eyes = None
     if trained is not None:
-        drive = _from_first_picture(drive, config.camera)
+        drive = from_first_picture(drive, config.camera)
         eyes = Eyes(drive, config.camera)
     first = _first_estimator(policy, drive, trained)
     loop = _Replay(LoggedRobot(drive, eyes), task, task.arrays, policy, first, key, config)
@@ -179,7 +179,7 @@ def _panoramas(drive: Drive, trial: Trial, camera: CameraConfig) -> dict[int, UI
     return {look: image for look, image in seen.items() if image is not None}
 
 
-def _from_first_picture(drive: Drive, camera: CameraConfig) -> Drive:
+def from_first_picture(drive: Drive, camera: CameraConfig) -> Drive:
     """The drive from the first cell on of which there is a picture."""
     eyes = Eyes(drive, camera)
     first = next((step for step in sorted(drive.pictures) if eyes.panorama(step) is not None), None)
