@@ -85,12 +85,18 @@ class LoggedRobot:
         return bool(np.bitwise_or.reduce(letters[seen & (first_seen <= self._step)], initial=0) & ~before)
 
     def _beside_unobserved(self, cell: Cell) -> bool:
-        """As the simulator asks it: whether a 4-neighbour is unobserved."""
-        unknown = np.pad(np.asarray(self._drive.belief_at(self._step).unknown), 1, constant_values=True)
-        row, column = cell[0] + 1, cell[1] + 1
-        return bool(
-            unknown[row - 1, column] | unknown[row + 1, column] | unknown[row, column - 1] | unknown[row, column + 1]
-        )
+        """As the simulator asks it: whether a 4-neighbour is unobserved; outside of the map counts as unobserved."""
+        first_seen = self._drive.first_seen
+        for row, column in (
+            (cell[0] - 1, cell[1]),
+            (cell[0] + 1, cell[1]),
+            (cell[0], cell[1] - 1),
+            (cell[0], cell[1] + 1),
+        ):
+            inside = 0 <= row < first_seen.shape[0] and 0 <= column < first_seen.shape[1]
+            if not inside or first_seen[row, column] == NEVER_SEEN or first_seen[row, column] > self._step:
+                return True
+        return False
 
 
 class _Replay(Loop):
