@@ -29,6 +29,8 @@ from potlp_jax.world.grid import (
 FORMAT = "potlp-trial-1"
 NEVER_SEEN: int = -1
 """Entry of ``first_seen`` for a cell that was never observed."""
+LOG_PREFIX: str = "log:"
+"""How the ``environment`` of a trial begins that was made from a robot's log."""
 
 
 class RecordError(ValueError):
@@ -36,12 +38,13 @@ class RecordError(ValueError):
 
 
 class Outcome(StrEnum):
-    """How a trial ended (MODEL.md section 7)."""
+    """How a trial ended (MODEL.md section 7); ``UNFINISHED``: the log of a drive ended before the task was decided."""
 
     SATISFIED = "satisfied"
     INFEASIBLE = "infeasible"
     STUCK = "stuck"
     BUDGET = "budget"
+    UNFINISHED = "unfinished"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,13 +125,7 @@ class Trial:
 
     def belief_at(self, step: int) -> BeliefMap:
         """The belief after observing from ``path[step]``."""
-        seen = (self.first_seen != NEVER_SEEN) & (self.first_seen <= step)
-        cells = np.where(
-            seen, np.where(np.asarray(self.world.occupied), BeliefMap.OCCUPIED, BeliefMap.FREE), BeliefMap.UNKNOWN
-        )
-        letters = np.where(seen, np.asarray(self.world.letters), 0)
-        height, width = (int(size) for size in self.world.extent)
-        return belief_from_numpy(cells, letters, float(self.world.resolution), (height, width))
+        return belief_seen_by(self.world, self.first_seen, step)
 
     def summary(self) -> dict[str, Any]:
         """The figures of the trial without its arrays."""
@@ -161,6 +158,16 @@ class Trial:
     def save(self, path: Path) -> None:
         """Write the record as JSON."""
         path.write_text(json.dumps(self.to_dict(), allow_nan=False))
+
+
+def belief_seen_by(world: World, first_seen: Int32[np.ndarray, "H W"], step: int) -> BeliefMap:
+    """The belief of a robot that saw each cell first at step ``first_seen`` (or ``NEVER_SEEN``), after ``step``."""
+    seen = (first_seen != NEVER_SEEN) & (first_seen <= step)
+    truth = np.where(np.asarray(world.occupied), BeliefMap.OCCUPIED, BeliefMap.FREE)
+    cells = np.where(seen, truth, BeliefMap.UNKNOWN)
+    letters = np.where(seen, np.asarray(world.letters), 0)
+    height, width = (int(size) for size in world.extent)
+    return belief_from_numpy(cells, letters, float(world.resolution), (height, width))
 
 
 def load_trial(path: Path) -> Trial:

@@ -14,7 +14,7 @@ from potlp_jax.planning.policies import DecisionConfig, Policy, assess, planning
 from potlp_jax.planning.pouct import Plan, search_tree
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search_graph import Tree
-from potlp_jax.records import Decision, Trial
+from potlp_jax.records import LOG_PREFIX, Decision, RecordError, Trial
 from potlp_jax.robot import photograph
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trial_config import TrialConfig, trial_config_from_dict
@@ -73,7 +73,12 @@ def _replayed_estimator(
 
 
 def panorama_at(trial: Trial, decision: Decision, config: TrialConfig | None = None) -> UInt8[Array, "rows columns 3"]:
-    """What the camera saw at a decision of a trial in simulation."""
+    """What the camera saw at a decision of a trial in simulation. Raises RecordError where the trial is from a log."""
+    if trial.environment.startswith(LOG_PREFIX):
+        raise RecordError(
+            f"the trial is the replay of a robot's log, {trial.environment.removeprefix(LOG_PREFIX)}: its panoramas "
+            "are in the log, and in the page that `potlp log replay` wrote"
+        )
     config = trial_config_from_dict(trial.config) if config is None else config
     if config.disturbance != Disturbance():
         raise ValueError("the trial's camera was disturbed: its panoramas cannot be made again without the trial's key")

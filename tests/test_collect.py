@@ -27,12 +27,13 @@ from potlp_jax.learning.dataset import (
     views_file,
 )
 from potlp_jax.learning.formulas import TaskDistribution
+from potlp_jax.learning.sampling import survey
 from potlp_jax.task.task import Task
 from potlp_jax.world.panorama import CameraConfig, render
 from potlp_jax.world.sensing import SensorConfig
 from tests.reference.dijkstra import dijkstra, grid_moves
 from tests.reference.sensing import visible
-from train.collect import CollectConfig, collect, main, summary, survey
+from train.collect import CollectConfig, collect, main, summary
 from train.explorer import Explorer, ExplorerConfig
 
 GENERATOR = Firefighting.toy()

@@ -20,6 +20,7 @@ ORDER = (
     "robot",
     "trial",
     "replay",
+    "logs",
     "sweep",
     "view",
     "bench",
@@ -57,8 +58,8 @@ def test_a_room_imports_only_from_rooms_above(path):
 
 
 def test_only_one_module_imports_each_heavy_neighbour():
-    # Spot is imported where formulas become automata, typer by the command line alone.
-    for library, rooms in {"spot": {"task"}, "typer": {"cli"}, "matplotlib": {"view"}}.items():
+    # Spot is imported where formulas become automata, typer by the command line alone, rosbags where logs are read.
+    for library, rooms in {"spot": {"task"}, "typer": {"cli"}, "matplotlib": {"view"}, "rosbags": {"logs"}}.items():
         users = {
             path.relative_to(PACKAGE).with_suffix("").parts[0]
             for path in SOURCES

@@ -19,79 +19,52 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Any
 
 import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pyarrow
-from flax import struct
-from jaxtyping import Array, Bool, Float32, Int32
+from jaxtyping import Array, Int32, UInt8
 from tqdm import tqdm
 
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments import Generator, make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.learning.dataset import (
-    JPEG_QUALITY,
-    SAMPLES_SCHEMA,
-    VIEWS_SCHEMA,
     DatasetError,
     DatasetMetadata,
     Samples,
-    encode,
     finished_shards,
     read_dataset,
     read_metadata,
     remove_unfinished_files,
-    view_id,
     write_shard,
 )
-from potlp_jax.learning.formulas import HELD_OUT, Question, TaskDistribution, draw_questions, question_sheet
-from potlp_jax.learning.labels import true_labels
-from potlp_jax.learning.weights import WeightBounds, Weights, loss_weights
-from potlp_jax.planning.estimates import Estimates
-from potlp_jax.planning.product import grid_distances
-from potlp_jax.task.task import TaskArrays
+from potlp_jax.learning.formulas import HELD_OUT, TaskDistribution
+from potlp_jax.learning.sampling import Pose, Recorder, ViewConfig, record_views
+from potlp_jax.learning.weights import WeightBounds
 from potlp_jax.trial import versions
-from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
-from potlp_jax.world.grid import BeliefMap, World
-from potlp_jax.world.panorama import CameraConfig, Disturbance, bearing, disturb, render
-from potlp_jax.world.sensing import SensorConfig, visible
-from train.explorer import Explorer, ExplorerConfig, Pose
-
-_FRONTIERS = FrontierConfig()
+from potlp_jax.world.grid import World
+from potlp_jax.world.panorama import CameraConfig, Disturbance, disturb, render
+from train.explorer import Explorer, ExplorerConfig
 
 
-@dataclasses.dataclass(frozen=True)
-class CollectConfig:
-    """What is recorded.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CollectConfig(ViewConfig):
+    """What is recorded, and how the robot comes there.
 
     Attributes:
         seed: of everything but the worlds.
         worlds_per_shard: what is lost, at most, where a process is killed.
-        views_per_world: at most.
-        spacing: travelled between views: uniform, in cells, divided by the number of subgoals in view, so that most
-            views are where there is most to choose.
-        tasks_per_world: drawn for the robot to pursue and for the outcome classes.
-        classes: outcome classes per view, at most; staying_sets: distinct sets of staying letters among them.
         held_out: formulas whose languages are never drawn.
-        image_format, quality: of the encoded images: ``jpeg`` or ``png``; quality is JPEG's.
         camera, disturbance: the images.
-        explorer: how the robot wanders.
+        explorer: how the robot wanders; it pursues the tasks that the outcome classes are from.
     """
 
     seed: int = 0
     worlds_per_shard: int = 4
-    views_per_world: int = 12
-    spacing: tuple[float, float] = (6.0, 54.0)
-    tasks_per_world: int = 12
-    classes: int = 12
-    staying_sets: int = 4
     held_out: tuple[str, ...] = ()
-    image_format: str = "jpeg"
-    quality: int = JPEG_QUALITY
     camera: CameraConfig = dataclasses.field(default_factory=CameraConfig)
     disturbance: Disturbance = dataclasses.field(default_factory=Disturbance)
     explorer: ExplorerConfig = dataclasses.field(default_factory=ExplorerConfig)
@@ -109,108 +82,9 @@ class Job:
     metadata: DatasetMetadata
 
 
-@struct.dataclass(kw_only=True)
-class Scene:
-    """What there is to ask at a pose: the subgoals, D and bearing of each, and which are in the camera's view."""
-
-    subgoals: Subgoals
-    distance: Float32[Array, " S"]
-    bearing: Float32[Array, " S"]
-    in_view: Bool[Array, " S"]
-
-
-@jax.jit
-def survey(world: World, belief: BeliefMap, cell: Int32[Array, "2"]) -> Scene:
-    """The subgoals of a belief by known-space distance, letters ignored. The camera sees without limit of range."""
-    distances = grid_distances(belief.free, cell, belief.resolution)
-    subgoals = find_subgoals(belief, jnp.isfinite(distances), distances, _FRONTIERS)
-    seen = visible(world.occupied, cell, SensorConfig(range_cells=float(sum(world.shape))))
-    index = jnp.arange(subgoals.mask.shape[0], dtype=jnp.int32)[:, None, None]
-    in_view = jnp.any((subgoals.component[None] == index) & seen[None], axis=(1, 2))
-    return Scene(
-        subgoals=subgoals,
-        distance=subgoals.distance,
-        bearing=bearing(cell, subgoals.cells),
-        in_view=in_view & subgoals.mask,
-    )
-
-
-@partial(jax.jit, static_argnames="bounds")
-def label(
-    world: World, belief: BeliefMap, scene: Scene, sheet: TaskArrays, bounds: WeightBounds
-) -> tuple[Estimates, Weights]:
-    """True labels and weights of every (subgoal, question), also of subgoals out of view."""
-    labels = true_labels(world, belief, scene.subgoals, sheet)
-    mask = scene.subgoals.mask[:, None] & sheet.class_mask[None, :]
-    return labels, loss_weights(scene.distance, labels, mask, bounds)
-
-
 @partial(jax.jit, static_argnames="config")
 def _image(world: World, cell: Int32[Array, "2"], key, config: CollectConfig):
     return disturb(render(world, cell, config.camera), key, config.disturbance)
-
-
-class Recorder:
-    """Columns of the views and samples of one shard."""
-
-    def __init__(self, job: Job, bounds: WeightBounds) -> None:
-        self._job, self._bounds = job, bounds
-        self.views: dict[str, list[Any]] = {name: [] for name in VIEWS_SCHEMA.names}
-        self.samples: dict[str, list[Any]] = {name: [] for name in SAMPLES_SCHEMA.names}
-
-    def add(self, world: World, index: int, pose: Pose, scene: Scene, questions: Sequence[Question]) -> None:
-        """Record a view and its samples."""
-        config = self._job.config
-        sheet = question_sheet(questions, config.classes, config.staying_sets)
-        labels, weights = label(world, pose.belief, scene, sheet, self._bounds)
-        view = view_id(self._job.shard, len(self.views["view"]))
-        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), index), pose.step)
-        image = np.asarray(_image(world, jnp.asarray(pose.cell, jnp.int32), key, config))
-        row = {
-            "view": view,
-            "world": index,
-            "step": pose.step,
-            "row": pose.cell[0],
-            "column": pose.cell[1],
-            "format": config.image_format,
-            "image": encode(image, config.image_format, config.quality),
-        }
-        for name, value in row.items():
-            self.views[name].append(value)
-        for name, values in _sample_columns(view, scene, questions, labels, weights).items():
-            self.samples[name].extend(values)
-
-
-def _sample_columns(
-    view: int, scene: Scene, questions: Sequence[Question], labels: Estimates, weights: Weights
-) -> dict[str, list[Any]]:
-    """Columns of one view: its subgoals in view, times its questions."""
-    chosen = np.flatnonzero(scene.in_view)
-    count = len(questions)
-
-    def per_subgoal(values: Array) -> list[Any]:
-        return np.repeat(np.asarray(values)[chosen], count).tolist()
-
-    def per_pair(values: Array | np.ndarray) -> list[Any]:
-        return np.asarray(values)[chosen, :count].reshape(-1).tolist()
-
-    success = np.asarray(labels.success_probability)
-    return {
-        "view": [view] * (len(chosen) * count),
-        "task": [question.task for question in questions] * len(chosen),
-        "outcome_class": [question.outcome_class for question in questions] * len(chosen),
-        "row": per_subgoal(scene.subgoals.cells[:, 0]),
-        "column": per_subgoal(scene.subgoals.cells[:, 1]),
-        "bearing": per_subgoal(scene.bearing),
-        "distance": per_subgoal(scene.distance),
-        "phi_stay": [list(question.phi_stay) for question in questions] * len(chosen),
-        "phi_go": [list(question.phi_go) for question in questions] * len(chosen),
-        "success_probability": per_pair(success),
-        "success_cost": per_pair(np.where(success > 0, np.asarray(labels.success_cost), np.nan)),
-        "failure_cost": per_pair(labels.failure_cost),
-        "success_weight": per_pair(weights.success),
-        "failure_weight": per_pair(weights.failure),
-    }
 
 
 def collect_world(recorder: Recorder, world: World, index: int, tasks: TaskDistribution, job: Job) -> None:
@@ -218,24 +92,18 @@ def collect_world(recorder: Recorder, world: World, index: int, tasks: TaskDistr
     config = job.config
     rng = np.random.default_rng([config.seed, zlib.crc32(job.split.encode()), index])
     pool = [tasks.draw(rng) for _ in range(config.tasks_per_world)]
-    due, recorded = 0.0, 0
-    for pose in Explorer(world, pool, rng, config.explorer).poses():
-        if recorded == config.views_per_world:
-            return
-        if pose.travelled < due:
-            continue
-        scene = survey(world, pose.belief, jnp.asarray(pose.cell, jnp.int32))
-        if not np.any(scene.in_view):
-            continue
-        recorder.add(world, index, pose, scene, draw_questions(rng, pool, config.classes, config.staying_sets))
-        due = pose.travelled + rng.uniform(*config.spacing) / int(np.sum(scene.in_view))
-        recorded += 1
+
+    def photograph(pose: Pose) -> UInt8[np.ndarray, "rows columns 3"]:
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), index), pose.step)
+        return np.asarray(_image(world, jnp.asarray(pose.cell, jnp.int32), key, config))
+
+    record_views(recorder, world, index, Explorer(world, pool, rng, config.explorer).poses(), pool, rng, photograph)
 
 
 def collect_shard(job: Job) -> int:
     """Collect and write one shard; returns the number of its views."""
     tasks = TaskDistribution(job.generator.propositions, job.config.held_out)
-    recorder = Recorder(job, WeightBounds(**job.metadata.weights))
+    recorder = Recorder(job.shard, job.config, WeightBounds(**job.metadata.weights))
     first = job.shard * job.config.worlds_per_shard
     for index in range(first, first + job.config.worlds_per_shard):
         world = job.generator.generate(world_key(job.split, index, job.generator.name))

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Int32
 
 from potlp_jax.learning.formulas import LARGEST
+from potlp_jax.learning.sampling import Pose
 from potlp_jax.planning.paths import KnownPath, shortest_path
 from potlp_jax.planning.policies import Situation, assess
 from potlp_jax.planning.sweeps import DIAGONAL
@@ -48,16 +49,6 @@ class ExplorerConfig:
     replan_distance: float = 4.0
     travel_factor: float = 6.0
     sensor: SensorConfig = SensorConfig()
-
-
-@dataclasses.dataclass(frozen=True)
-class Pose:
-    """Where the robot stands and what it knows; ``step`` counts cells entered, ``travelled`` is in cells."""
-
-    belief: BeliefMap
-    cell: Cell
-    step: int
-    travelled: float
 
 
 class Explorer:

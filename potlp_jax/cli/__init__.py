@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from potlp_jax.cache import enable_compilation_cache
-from potlp_jax.cli.commands import estimator, maps, planner, report, sweep, task, trials
+from potlp_jax.cli.commands import estimator, log, maps, planner, report, sweep, task, trials
 from potlp_jax.cli.output import package_version
 
 NO_CACHE = "--no-cache"
@@ -21,7 +21,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (task, trials, report, planner, estimator, sweep, maps):
+for group in (task, trials, report, planner, estimator, sweep, maps, log):
     app.add_typer(group.app)
 
 _ABOUT = (

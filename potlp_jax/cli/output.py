@@ -90,6 +90,7 @@ def _input_errors() -> tuple[type[Exception], ...]:
     """The errors that say what is wrong with an input; any other is a fault of the program and keeps its traceback."""
     from potlp_jax.environments.map_server import MapError
     from potlp_jax.learning.estimator_files import CheckpointError
+    from potlp_jax.logs.errors import LogError
     from potlp_jax.records import RecordError
     from potlp_jax.sweep.specification import SpecificationError
     from potlp_jax.sweep.store import StoreError
@@ -97,7 +98,17 @@ def _input_errors() -> tuple[type[Exception], ...]:
     from potlp_jax.view.style import PictureError
     from potlp_jax.world.grid import WorldError
 
-    return TaskError, WorldError, MapError, RecordError, PictureError, CheckpointError, SpecificationError, StoreError
+    return (
+        TaskError,
+        WorldError,
+        MapError,
+        LogError,
+        RecordError,
+        PictureError,
+        CheckpointError,
+        SpecificationError,
+        StoreError,
+    )
 
 
 def progress_bar() -> Progress:

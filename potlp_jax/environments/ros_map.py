@@ -28,7 +28,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Int, Int32, PRNGKeyArray
+from jaxtyping import Bool, Int, Int32, PRNGKeyArray, Shaped
 from scipy import ndimage
 
 from potlp_jax.environments.base import host_generators
@@ -218,8 +218,8 @@ def clean_map(
     ratio = _exact(file, "resolution", resolution) / pixel
     if ratio < 1:
         raise MapError(file, "resolution", f"{resolution} m a cell is finer than the map's {float(pixel)} m a pixel")
-    inflated = ~_inflate(~image_map.free, _exact(file, "radius", radius) / pixel)
-    free = ~_resample(~inflated, ratio)
+    inflated = ~inflate(~image_map.free, _exact(file, "radius", radius) / pixel)
+    free = ~resample(~inflated, ratio)
     height, width = free.shape
     frame = GridFrame(height, width, float(ratio * pixel), *image_map.settings.origin)
     if not free.any():
@@ -240,26 +240,33 @@ def _exact(file: Path, field: str, number: float) -> Fraction:
     return Fraction(str(number))
 
 
-def _inflate(blocked: Bool[np.ndarray, "H W"], pixels: Fraction) -> Bool[np.ndarray, "H W"]:
+def inflate(blocked: Bool[np.ndarray, "H W"], pixels: Fraction) -> Bool[np.ndarray, "H W"]:
     """Obstacles and all whose centre is within a radius, in pixels, of an obstacle's centre."""
     distance = np.asarray(ndimage.distance_transform_edt(~np.pad(blocked, 1, constant_values=True)))[1:-1, 1:-1]
     # Squared distances between centres are integers, so that the comparison can be exact.
     return np.rint(distance**2) <= int(pixels * pixels)
 
 
-def _resample(blocked: Bool[np.ndarray, "H W"], ratio: Fraction) -> Bool[np.ndarray, "h w"]:
-    """Cells of ``ratio`` pixels, from the lower left corner; blocked if a pixel that shares area is, or is missing."""
-    upwards = _any_of_each(blocked[::-1], ratio)[::-1]
-    return _any_of_each(upwards.T, ratio).T
+def resample(
+    pixels: Shaped[np.ndarray, "H W"], ratio: Fraction, reduce: np.ufunc = np.logical_or, beyond: bool | int = True
+) -> Shaped[np.ndarray, "h w"]:
+    """Cells of ``ratio`` pixels, from the lower left corner: ``reduce`` of all pixels that share area with the cell.
+
+    Beyond the image every pixel is ``beyond``. By default: a cell is blocked if a pixel is, or is missing.
+    """
+    upwards = _reduce_each(pixels[::-1], ratio, reduce, beyond)[::-1]
+    return _reduce_each(upwards.T, ratio, reduce, beyond).T
 
 
-def _any_of_each(blocked: Bool[np.ndarray, "H W"], ratio: Fraction) -> Bool[np.ndarray, "h W"]:
-    count = -(-len(blocked) // ratio)
+def _reduce_each(
+    pixels: Shaped[np.ndarray, "H W"], ratio: Fraction, reduce: np.ufunc, beyond: bool | int
+) -> Shaped[np.ndarray, "h W"]:
+    count = -(-len(pixels) // ratio)
     spans = [(int(cell * ratio), int(-(-(cell + 1) * ratio // 1))) for cell in range(count)]
-    # Beyond the image is an obstacle: it blocks a last cell that reaches over its edge.
-    padded = np.pad(blocked, ((0, spans[-1][1] + 1 - len(blocked)), (0, 0)), constant_values=True)
+    # A last cell may reach over the image's edge.
+    padded = np.pad(pixels, ((0, spans[-1][1] + 1 - len(pixels)), (0, 0)), constant_values=beyond)
     # `reduceat` reduces between consecutive indices; every other result spans one cell.
-    return np.logical_or.reduceat(padded, np.array(spans).ravel(), axis=0)[::2]
+    return reduce.reduceat(padded, np.array(spans).ravel(), axis=0)[::2]
 
 
 def _largest_component(free: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:

@@ -1,4 +1,4 @@
-"""Pictures of real cameras, mapped to the geometry of ``panorama``."""
+"""Pictures of real cameras, mapped to the geometry of ``panorama``, and back."""
 
 import math
 
@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from potlp_jax.world.panorama import CameraConfig, column_bearings, finer, row_slopes
+from potlp_jax.world.panorama import CameraConfig, column_bearings, finer, row_slopes, rows_at_slopes
 
 _MOST_SAMPLES = 8
 
@@ -49,6 +49,28 @@ def from_equirectangular(
         borderMode=cv2.BORDER_REPLICATE,
     )
     return cv2.resize(sampled, (config.width, config.height), interpolation=cv2.INTER_AREA)
+
+
+def to_equirectangular(
+    panorama: UInt8[np.ndarray, "rows columns 3"], config: CameraConfig, height: int, width: int, yaw: float = 0.0
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The full sphere that a panoramic camera would have delivered: the inverse of ``from_equirectangular``.
+
+    Beyond the panorama's upper and lower edge its outermost row is repeated. ``yaw`` as in ``from_equirectangular``.
+    """
+    elevations = math.pi * (0.5 - (np.arange(height) + 0.5) / height)
+    bearings = yaw + 2 * math.pi * (np.arange(width) + 0.5) / width - math.pi
+    columns = (bearings + math.pi) / (2 * math.pi) * config.width - 0.5
+    rows = np.clip(rows_at_slopes(config, np.tan(elevations)), 0, config.height - 1)
+    # One column of the other side at each edge closes the circle.
+    closed = np.concatenate([panorama[:, -1:], panorama, panorama[:, :1]], axis=1)
+    return cv2.remap(
+        closed,
+        _grid((columns + 0.5) % config.width + 0.5, (height, 1)),
+        _grid(rows[:, None], (1, width)),
+        interpolation=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
 
 
 def _samples(config: CameraConfig, rows_per_radian: float, width: int) -> int:

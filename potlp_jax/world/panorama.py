@@ -228,6 +228,11 @@ def row_slopes(config: CameraConfig) -> Float[np.ndarray, " rows"]:
     return -config.eye_height / config.far * np.sinh(below)
 
 
+def rows_at_slopes(config: CameraConfig, slopes: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Row coordinate, 0 in the middle of the first row, at which the tangent of the elevation has each value."""
+    return config.horizon + config.fold * np.arcsinh(-slopes * config.far / config.eye_height) - 0.5
+
+
 def finer(config: CameraConfig, factor: int) -> CameraConfig:
     """The same view in ``factor`` times as many rows and columns."""
     return dataclasses.replace(

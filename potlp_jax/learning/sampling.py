@@ -1,0 +1,227 @@
+"""From poses to the rows of a dataset: what is asked at a pose, and what the true map answers.
+
+In simulation and from a robot's log alike. A **pose** is where the robot stood and what it knew of the map. Now and
+then a panorama is recorded, and for every subgoal in line of sight and some outcome classes, drawn from a pool of
+tasks, the true P_S, R_S, R_F and the weights of the loss. ``docs/dataset.md`` describes the rows.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float32, Int32, UInt8
+from scipy import ndimage
+
+from potlp_jax.learning.dataset import JPEG_QUALITY, SAMPLES_SCHEMA, VIEWS_SCHEMA, encode, view_id
+from potlp_jax.learning.formulas import Question, draw_questions, question_sheet
+from potlp_jax.learning.labels import true_labels
+from potlp_jax.learning.weights import WeightBounds, Weights, loss_weights
+from potlp_jax.planning.estimates import Estimates
+from potlp_jax.planning.product import grid_distances
+from potlp_jax.task.task import Task, TaskArrays
+from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
+from potlp_jax.world.grid import BeliefMap, World
+from potlp_jax.world.panorama import bearing
+from potlp_jax.world.sensing import SensorConfig, visible
+
+_FRONTIERS = FrontierConfig()
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ViewConfig:
+    """What is recorded of a world.
+
+    Attributes:
+        views_per_world: at most.
+        spacing: travelled between views: uniform, in cells, divided by the number of subgoals in view, so that most
+            views are where there is most to choose.
+        tasks_per_world: drawn for the outcome classes.
+        classes: outcome classes per view, at most; staying_sets: distinct sets of staying letters among them.
+        image_format, quality: of the encoded images: ``jpeg`` or ``png``; quality is JPEG's.
+    """
+
+    views_per_world: int = 12
+    spacing: tuple[float, float] = (6.0, 54.0)
+    tasks_per_world: int = 12
+    classes: int = 12
+    staying_sets: int = 4
+    image_format: str = "jpeg"
+    quality: int = JPEG_QUALITY
+
+
+@dataclasses.dataclass(frozen=True)
+class Pose:
+    """Where the robot stands and what it knows; ``step`` counts cells entered, ``travelled`` is in cells."""
+
+    belief: BeliefMap
+    cell: tuple[int, int]
+    step: int
+    travelled: float
+
+
+@struct.dataclass(kw_only=True)
+class Scene:
+    """What there is to ask at a pose: the subgoals, D and bearing of each, and which are in the camera's view."""
+
+    subgoals: Subgoals
+    distance: Float32[Array, " S"]
+    bearing: Float32[Array, " S"]
+    in_view: Bool[Array, " S"]
+
+
+@jax.jit
+def survey(world: World, belief: BeliefMap, cell: Int32[Array, "2"]) -> Scene:
+    """The subgoals of a belief by known-space distance, letters ignored. The camera sees without limit of range."""
+    distances = grid_distances(belief.free, cell, belief.resolution)
+    subgoals = find_subgoals(belief, jnp.isfinite(distances), distances, _FRONTIERS)
+    seen = visible(world.occupied, cell, SensorConfig(range_cells=float(sum(world.shape))))
+    index = jnp.arange(subgoals.mask.shape[0], dtype=jnp.int32)[:, None, None]
+    in_view = jnp.any((subgoals.component[None] == index) & seen[None], axis=(1, 2))
+    return Scene(
+        subgoals=subgoals,
+        distance=subgoals.distance,
+        bearing=bearing(cell, subgoals.cells),
+        in_view=in_view & subgoals.mask,
+    )
+
+
+@partial(jax.jit, static_argnames="bounds")
+def label(
+    world: World, belief: BeliefMap, scene: Scene, sheet: TaskArrays, bounds: WeightBounds
+) -> tuple[Estimates, Weights]:
+    """True labels and weights of every (subgoal, question), also of subgoals out of view."""
+    labels = true_labels(world, belief, scene.subgoals, sheet)
+    mask = scene.subgoals.mask[:, None] & sheet.class_mask[None, :]
+    return labels, loss_weights(scene.distance, labels, mask, bounds)
+
+
+def settled(
+    world: World, belief: BeliefMap, subgoals: Subgoals, unexplored: Bool[np.ndarray, "H W"]
+) -> Bool[np.ndarray, " S"]:
+    """Whether ``world`` answers all that can be asked about each subgoal; False where masked.
+
+    ``unexplored`` are free cells of ``world`` beyond which it is not known how the building goes on. A subgoal is not
+    settled where one of them is on its frontier, or can be reached from it through cells that ``belief`` does not know.
+    """
+    regions = np.zeros(unexplored.shape, np.int32)
+    ndimage.label(np.asarray(belief.unknown) & ~np.asarray(world.occupied), output=regions)
+    leads_on = np.unique(regions[unexplored])
+    component, mask = np.asarray(subgoals.component), np.asarray(subgoals.mask)
+    answers = np.zeros(mask.shape, bool)
+    for subgoal in np.flatnonzero(mask):
+        own = component == subgoal
+        around = np.asarray(ndimage.binary_dilation(own), bool)
+        open_beyond = np.isin(regions[around], leads_on[leads_on > 0])
+        answers[subgoal] = not (np.any(unexplored & own) or np.any(open_beyond))
+    return answers
+
+
+class Recorder:
+    """Columns of the views and samples of one shard."""
+
+    def __init__(self, shard: int, config: ViewConfig, bounds: WeightBounds) -> None:
+        self._shard, self._bounds = shard, bounds
+        self.config = config
+        self.views: dict[str, list[Any]] = {name: [] for name in VIEWS_SCHEMA.names}
+        self.samples: dict[str, list[Any]] = {name: [] for name in SAMPLES_SCHEMA.names}
+
+    def add(
+        self,
+        world: World,
+        index: int,
+        pose: Pose,
+        image: UInt8[np.ndarray, "rows columns 3"],
+        scene: Scene,
+        questions: Sequence[Question],
+    ) -> None:
+        """Record a view and its samples. ``index`` is the world's number."""
+        config = self.config
+        sheet = question_sheet(questions, config.classes, config.staying_sets)
+        labels, weights = label(world, pose.belief, scene, sheet, self._bounds)
+        view = view_id(self._shard, len(self.views["view"]))
+        row = {
+            "view": view,
+            "world": index,
+            "step": pose.step,
+            "row": pose.cell[0],
+            "column": pose.cell[1],
+            "format": config.image_format,
+            "image": encode(image, config.image_format, config.quality),
+        }
+        for name, value in row.items():
+            self.views[name].append(value)
+        for name, values in _sample_columns(view, scene, questions, labels, weights).items():
+            self.samples[name].extend(values)
+
+
+def record_views(
+    recorder: Recorder,
+    world: World,
+    index: int,
+    poses: Iterable[Pose],
+    tasks: Sequence[Task],
+    rng: np.random.Generator,
+    photograph: Callable[[Pose], UInt8[np.ndarray, "rows columns 3"] | None],
+    unexplored: Bool[np.ndarray, "H W"] | None = None,
+) -> None:
+    """Record views of one world from which a subgoal can be seen, at random intervals along ``poses``.
+
+    ``photograph`` is called once a view, in the order of the poses; None: there is no picture, and the pose is passed
+    over. With ``unexplored`` (see ``settled``) subgoals whose answer ``world`` does not settle are left out.
+    """
+    config, due, recorded = recorder.config, 0.0, 0
+    for pose in poses:
+        if recorded == config.views_per_world:
+            return
+        if pose.travelled < due:
+            continue
+        scene = survey(world, pose.belief, jnp.asarray(pose.cell, jnp.int32))
+        if unexplored is not None:
+            answered = jnp.asarray(settled(world, pose.belief, scene.subgoals, unexplored))
+            scene = dataclasses.replace(scene, in_view=scene.in_view & answered)
+        if not np.any(scene.in_view):
+            continue
+        image = photograph(pose)
+        if image is None:
+            continue
+        questions = draw_questions(rng, tasks, config.classes, config.staying_sets)
+        recorder.add(world, index, pose, image, scene, questions)
+        due = pose.travelled + rng.uniform(*config.spacing) / int(np.sum(scene.in_view))
+        recorded += 1
+
+
+def _sample_columns(
+    view: int, scene: Scene, questions: Sequence[Question], labels: Estimates, weights: Weights
+) -> dict[str, list[Any]]:
+    """Columns of one view: its subgoals in view, times its questions."""
+    chosen = np.flatnonzero(scene.in_view)
+    count = len(questions)
+
+    def per_subgoal(values: Array) -> list[Any]:
+        return np.repeat(np.asarray(values)[chosen], count).tolist()
+
+    def per_pair(values: Array | np.ndarray) -> list[Any]:
+        return np.asarray(values)[chosen, :count].reshape(-1).tolist()
+
+    success = np.asarray(labels.success_probability)
+    return {
+        "view": [view] * (len(chosen) * count),
+        "task": [question.task for question in questions] * len(chosen),
+        "outcome_class": [question.outcome_class for question in questions] * len(chosen),
+        "row": per_subgoal(scene.subgoals.cells[:, 0]),
+        "column": per_subgoal(scene.subgoals.cells[:, 1]),
+        "bearing": per_subgoal(scene.bearing),
+        "distance": per_subgoal(scene.distance),
+        "phi_stay": [list(question.phi_stay) for question in questions] * len(chosen),
+        "phi_go": [list(question.phi_go) for question in questions] * len(chosen),
+        "success_probability": per_pair(success),
+        "success_cost": per_pair(np.where(success > 0, np.asarray(labels.success_cost), np.nan)),
+        "failure_cost": per_pair(labels.failure_cost),
+        "success_weight": per_pair(weights.success),
+        "failure_weight": per_pair(weights.failure),
+    }

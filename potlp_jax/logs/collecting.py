@@ -1,0 +1,110 @@
+"""Rows for training the estimator from robots' logs: the same files as ``train.collect`` writes."""
+
+import dataclasses
+import json
+import zlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pyarrow
+
+from potlp_jax.environments.places import Places
+from potlp_jax.learning.dataset import DatasetError, DatasetMetadata, finished_shards, write_shard
+from potlp_jax.learning.formulas import TaskDistribution
+from potlp_jax.learning.sampling import Pose, Recorder, ViewConfig, record_views
+from potlp_jax.learning.weights import WeightBounds
+from potlp_jax.logs.drive import Drive, Eyes
+from potlp_jax.logs.errors import LogError
+from potlp_jax.robot import DIAGONAL
+from potlp_jax.trial import versions
+from potlp_jax.world.panorama import CameraConfig, Disturbance
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LogCollectConfig(ViewConfig):
+    """What is recorded of each log. ``held_out``: formulas whose languages are never drawn; ``seed``: of the draws."""
+
+    views_per_world: int = 200
+    seed: int = 0
+    held_out: tuple[str, ...] = ()
+    camera: CameraConfig = dataclasses.field(default_factory=CameraConfig)
+
+
+def poses_of(drive: Drive) -> Iterator[Pose]:
+    """The poses of a drive at which there is a picture."""
+    travelled = 0.0
+    for step, cell in enumerate(drive.path):
+        if step:
+            before = drive.path[step - 1]
+            travelled += DIAGONAL if before[0] != cell[0] and before[1] != cell[1] else 1.0
+        if step in drive.pictures:
+            yield Pose(belief=drive.belief_at(step), cell=cell, step=step, travelled=travelled)
+
+
+def collect_drives(
+    drives: Sequence[Drive], places: Places, folder: Path, environment: str, split: str, config: LogCollectConfig
+) -> list[int]:
+    """Write a dataset with a shard for each drive; returns the number of views of each.
+
+    Raises:
+        LogError: no drive, the drives have cells of different sizes, or not one has a picture.
+        DatasetError: there is a dataset in the folder already.
+    """
+    if finished_shards(folder):
+        raise DatasetError(f"{folder} holds a dataset: choose an empty folder, and give all bags at once")
+    resolutions = sorted({float(drive.world.resolution) for drive in drives})
+    if len(resolutions) != 1:
+        raise LogError(f"the logs have cells of {resolutions} m: give one --resolution for all")
+    if not any(drive.pictures for drive in drives):
+        raise LogError(
+            f"{', '.join(str(drive.log.path) for drive in drives)}: no panorama that can be used: a dataset needs a "
+            "topic of type sensor_msgs/CompressedImage; `potlp log inspect` says what there is"
+        )
+    tasks = TaskDistribution(places.names, config.held_out)
+    metadata = _metadata(drives, places, environment, split, config)
+    counts = []
+    for number, drive in enumerate(drives):
+        recorder = Recorder(number, config, WeightBounds(**metadata.weights))
+        rng = np.random.default_rng([config.seed, zlib.crc32(split.encode()), number])
+        pool = [tasks.draw(rng) for _ in range(config.tasks_per_world)]
+        eyes = Eyes(drive, config.camera)
+        record_views(
+            recorder,
+            drive.world,
+            number,
+            poses_of(drive),
+            pool,
+            rng,
+            lambda pose, eyes=eyes: eyes.panorama(pose.step),
+            drive.unexplored(),
+        )
+        write_shard(folder, number, recorder.views, recorder.samples, metadata)
+        counts.append(len(recorder.views["view"]))
+    return counts
+
+
+def _metadata(
+    drives: Sequence[Drive], places: Places, environment: str, split: str, config: LogCollectConfig
+) -> DatasetMetadata:
+    settings = json.loads(json.dumps(dataclasses.asdict(config)))
+    camera = settings.pop("camera")
+    encoding = {"format": settings.pop("image_format"), "quality": settings.pop("quality")}
+    resolution = float(drives[0].world.resolution)
+    height, width = (max(drive.world.shape[axis] for drive in drives) for axis in (0, 1))
+    return DatasetMetadata(
+        propositions=places.names,
+        environment=environment,
+        generator={"logs": [drive.log.path.name for drive in drives], "labels": Path(places.source).name},
+        split=split,
+        camera=camera,
+        disturbance=dataclasses.asdict(Disturbance()),
+        encoding=encoding,
+        weights=dataclasses.asdict(WeightBounds.of_map(height, width, resolution)),
+        collection=settings,
+        versions={**versions(), "pyarrow": pyarrow.__version__, "opencv": cv2.__version__},
+        unit="metres",
+        resolution=resolution,
+        source="log",
+    )
