@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float32, Int8, Int16, Int32, PRNGKeyArray, UInt32
+from jaxtyping import Array, Bool, Float32, Int8, Int16, Int32, Key, PRNGKeyArray, UInt32
 
 from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator
 from potlp_jax.learning.labels import TrueMapEstimator
@@ -71,10 +71,10 @@ class Start:
     All worlds of a batch have one shape (``grid.pad_world``), all tasks one size (``Task.padded``).
     """
 
-    name: Hashable
     world: World
     arrays: TaskArrays
     key: PRNGKeyArray
+    name: Hashable = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,8 +100,8 @@ class Scene:
 
     world: World
     task: TaskArrays
-    planning: PRNGKeyArray
-    sensing: PRNGKeyArray
+    planning: Key[Array, "*batch"]
+    sensing: Key[Array, "*batch"]
 
 
 @struct.dataclass(kw_only=True)
@@ -351,13 +351,24 @@ def _phase(running: Bool[Array, ""], function: Any, *arguments: Any) -> Any:
     there many times: a whole decision took three times as long as its phases.
     """
 
-    def zeros(leaf: Any) -> Array:
-        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            return jnp.broadcast_to(jax.random.key(0), leaf.shape)
-        return jnp.zeros(leaf.shape, leaf.dtype)
+    structure: Any = None
 
-    blank = jax.eval_shape(function, *arguments)
-    return jax.lax.cond(running, function, lambda *_: jax.tree.map(zeros, blank), *arguments)
+    def leaves_of(*arguments: Any) -> list[Array]:
+        nonlocal structure
+        leaves, structure = jax.tree.flatten(function(*arguments))
+        return leaves
+
+    # Compiled together, so that it is traced once for its shapes and the branch.
+    phase = jax.jit(leaves_of)
+    blank = jax.eval_shape(phase, *arguments)
+    leaves = jax.lax.cond(running, phase, lambda *_: [_zeros(leaf) for leaf in blank], *arguments)
+    return jax.tree.unflatten(structure, leaves)
+
+
+def _zeros(leaf: Any) -> Array:
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        return jnp.broadcast_to(jax.random.key(0), leaf.shape)
+    return jnp.zeros(leaf.shape, leaf.dtype)
 
 
 def _decide_directly(rules: Rules, progress: Progress, scene: Scene) -> Progress:
@@ -462,6 +473,6 @@ def _went(
         diagonal=progress.diagonal + diagonals,
         path=path,
         decisions=progress.decisions + 1,
-        fallbacks=progress.fallbacks + (move.kind == MoveKind.FALLBACK),
+        fallbacks=progress.fallbacks + (move.kind == MoveKind.FALLBACK).astype(jnp.int32),
         status=progress.status | move.status,
     )

@@ -106,12 +106,17 @@ class Loop:
         self._visits: Counter[tuple[tuple[int, int], int, int]] = Counter()
         belief, cell = robot.observe()
         letter = int(belief.letters[cell])
-        self.travelled = 0.0
+        self._diagonal = 0
         self.path: list[tuple[int, int]] = [cell]
         self.word: list[int] = [letter]
         self.states: list[int] = [int(task.dfa.transitions[task.dfa.initial, letter])]
         self.decisions: list[Decision] = []
         self.status = 0
+
+    @property
+    def travelled(self) -> float:
+        """Cells travelled. From counts, so that the sum does not depend on the order of the moves."""
+        return len(self.path) - 1 - self._diagonal + self._diagonal * DIAGONAL
 
     def run(self) -> Outcome:
         """Loop until the task is satisfied or cannot go on."""
@@ -172,7 +177,7 @@ class Loop:
         for cell in leg.cells:
             letter = int(letters[cell])
             row_step, column_step = cell[0] - self.path[-1][0], cell[1] - self.path[-1][1]
-            self.travelled += DIAGONAL if row_step and column_step else 1.0
+            self._diagonal += bool(row_step and column_step)
             self.path.append(cell)
             self.word.append(letter)
             self.states.append(int(self._task.dfa.transitions[self.states[-1], letter]))

@@ -11,9 +11,18 @@ import pytest
 from potlp_jax.cli.explain import explain_decision
 from potlp_jax.environments import make
 from potlp_jax.environments.splits import world_key
-from potlp_jax.learning.estimator import estimator_for, look, read_estimator, shipped_estimator
+from potlp_jax.learning.estimator import NEAR as NEAR_CELLS
+from potlp_jax.learning.estimator import (
+    SURE,
+    estimator_for,
+    exclusive_chances,
+    look,
+    read_estimator,
+    shipped_estimator,
+)
 from potlp_jax.learning.estimator_files import CheckpointError, save_estimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
+from potlp_jax.planning.decision import subgoals_at
 from potlp_jax.planning.policies import Policy
 from potlp_jax.records import ActionRecord, load_trial
 from potlp_jax.replay import panorama_at, replay_decision
@@ -64,6 +73,29 @@ def trial(world, task, trained):
     return run_trial(world, task, Policy.POTLP, jax.random.key(0), NEAR, estimator=trained)
 
 
+def _with_neighbours(chances, cells):
+    """The chances given those of the subgoals near by, one after the other."""
+    raised = np.array(chances)
+    for s, c in np.ndindex(*chances.shape):
+        group = [chances[t, c] for t in range(len(cells)) if np.hypot(*(cells[s] - cells[t])) <= NEAR_CELLS]
+        none = np.prod([1 - chance for chance in group])
+        if 0 < none < 1:
+            power = np.log(max(1 - sum(group), 1 - SURE)) / np.log(none)
+            raised[s, c] = 1 - (1 - chances[s, c]) ** max(power, 1)
+    return raised
+
+
+def test_subgoals_side_by_side_fail_together_with_what_their_sum_leaves():
+    cells = jnp.asarray([[0, 0], [0, 10], [0, 60], [0, 5]], jnp.int32)
+    subgoals = subgoals_at(cells, jnp.asarray([True, True, True, False]), 10, 80)
+    chances = jnp.asarray([[0.3, 0.53, 0.0, 0.99], [0.4, 0.54, 0.2, 0.5], [0.3, 0.6, 0.1, 0.2], [0.9, 0.9, 0.9, 0.9]])
+    raised = np.asarray(exclusive_chances(chances, subgoals))
+    np.testing.assert_allclose((1 - raised[0]) * (1 - raised[1]), [0.3, 1 - SURE, 0.8, 0.005], rtol=1e-4)
+    np.testing.assert_allclose(raised[2:], chances[2:], rtol=1e-5)
+    np.testing.assert_allclose(raised[:3], _with_neighbours(np.asarray(chances)[:3], np.asarray(cells)[:3]), rtol=1e-4)
+    assert np.all(raised >= np.asarray(chances) - 1e-6)
+
+
 def test_answers_equal_the_network_asked_pair_by_pair(world, task, trained):
     belief = observe(BeliefMap.unobserved(world), world, world.start, NEAR.sensor)
     subgoals = find_subgoals(belief, belief.free, jnp.zeros(world.shape), FrontierConfig())
@@ -75,6 +107,7 @@ def test_answers_equal_the_network_asked_pair_by_pair(world, task, trained):
     count = int(subgoals.mask.sum())
     assert count > 0
     assert len(task.classes) > 0
+    chances = np.zeros((count, len(task.classes)))
     free = np.asarray(belief.free)
     distances = product_distances(free, np.zeros(free.shape, int), np.zeros((1, 1), int), [False], start, 0)
     for s in range(count):
@@ -90,10 +123,13 @@ def test_answers_equal_the_network_asked_pair_by_pair(world, task, trained):
                 jnp.asarray([stay], jnp.int8),
                 jnp.asarray([go], jnp.int8),
             )
-            pair = (estimates.success_probability, estimates.success_cost, estimates.failure_cost)
-            expected = (answer.success_probability, answer.success_cost, answer.failure_cost)
+            chances[s, c] = answer.success_probability[0]
+            pair = (estimates.success_cost, estimates.failure_cost)
+            expected = (answer.success_cost, answer.failure_cost)
             for found, wanted in zip(pair, expected, strict=True):
                 np.testing.assert_allclose(found[s, c], wanted[0], rtol=1e-4)
+    expected = _with_neighbours(chances, np.asarray(subgoals.cells)[:count])
+    np.testing.assert_allclose(estimates.success_probability[:count], expected, rtol=1e-3)
     assert np.all(np.asarray(estimates.success_probability)[count:] == 0)
     assert np.all(np.asarray(estimates.success_cost) > 0)
 

@@ -19,6 +19,7 @@ ORDER = (
     "trial_config",
     "robot",
     "trial",
+    "batch",
     "replay",
     "logs",
     "sweep",

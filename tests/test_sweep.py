@@ -211,12 +211,13 @@ from potlp_jax.sweep.runner import RESULTS, Sweep
 from potlp_jax.sweep.specification import Cell, Specification
 from potlp_jax.sweep.store import Row, Store
 
-def run(self, item):
-    time.sleep(0.002)
-    return Row(item, "satisfied", item.world / 7, 9.0, 1, 1, 0, 0, (1, 2), "p", "c", {}, "", 0.0)
+def rows(self, items, environment, policy):
+    for item in items:
+        time.sleep(0.002)
+        yield Row(item, "satisfied", item.world / 7, 9.0, 1, 1, 0, 0, (1, 2), "p", "c", {}, "", 0.0)
 
-Sweep.run = run
-Sweep._is_possible = lambda self, cell, world: world % 3 != 1
+Sweep.rows = rows
+Sweep.possible = lambda self, items: {item.world: item.world % 3 != 1 for item in items}
 specification = Specification(
     cells=(Cell("toy", "F goal"), Cell("toy", "F hazard")),
     policies=(Policy.KNOWN_MAP, Policy.BASELINE, Policy.ORACLE),

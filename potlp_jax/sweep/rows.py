@@ -8,11 +8,14 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Int32, PRNGKeyArray
 
+from potlp_jax.batch import Finished
+from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.records import Trial
 from potlp_jax.sweep.specification import configuration_hash
 from potlp_jax.sweep.store import Item, Row
+from potlp_jax.trial import versions
 from potlp_jax.trial_config import TrialConfig
 from potlp_jax.world.grid import World
 
@@ -37,12 +40,39 @@ def trial_row(item: Item, trial: Trial, key: PRNGKeyArray, config: TrialConfig, 
     )
 
 
+def batch_row(
+    item: Item,
+    trial: Finished,
+    world: World,
+    key: PRNGKeyArray,
+    config: TrialConfig,
+    estimator: TrainedEstimator | None,
+) -> Row:
+    """The same of a trial that ran in a batch; ``estimator`` is what it looked with."""
+    return Row(
+        item=item,
+        outcome=trial.outcome.value,
+        cost=trial.cost,
+        budget=trial_budget(world, config.budget_factor),
+        steps=len(trial.path) - 1,
+        decisions=trial.decisions,
+        fallbacks=trial.fallbacks,
+        status=trial.status,
+        key=_words(key),
+        path=path_digest(trial.path),
+        configuration=configuration_hash(config),
+        versions=versions() | ({} if estimator is None else {"estimator": estimator.identity}),
+        commit=source_commit(),
+        seconds=trial.seconds,
+    )
+
+
 def trial_budget(world: World, factor: float) -> float:
     """The cost at which a trial in this world is given up (docs/model.md, section 7)."""
     return factor * float(np.sum(np.asarray(world.extent))) * float(world.resolution)
 
 
-def path_digest(path: Sequence[tuple[int, int]]) -> str:
+def path_digest(path: Sequence[tuple[int, int]] | Int32[np.ndarray, "steps 2"]) -> str:
     """Eight hexadecimal digits that tell paths apart."""
     return f"{zlib.crc32(np.asarray(path, np.int32).tobytes()):08x}"
 

@@ -1,7 +1,8 @@
 """Runs a sweep: workers, one pinned to each core, take trials from the store until none is left.
 
-Each worker looks at the store, claims a block of work of one kind and writes a row as soon as a trial has ended. It
-needs nothing else, so workers may be killed, started again, or belong to several commands on one store.
+Each worker looks at the store, claims a few trials at a time and runs them as one batch (``potlp_jax.batch``), in
+which a trial that has ended makes room for the next. A row is written as soon as its trial has ended. A worker needs
+nothing else, so workers may be killed, started again, or belong to several commands on one store.
 """
 
 import dataclasses
@@ -9,18 +10,19 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
 
 import jax
 
+from potlp_jax.batch import Finished, Start, run_batch
 from potlp_jax.environments import Generator, make
 from potlp_jax.environments.splits import MAX_INDEX, world_key
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, read_estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.records import Outcome, Trial
-from potlp_jax.sweep.rows import trial_row
+from potlp_jax.sweep.rows import batch_row
 from potlp_jax.sweep.specification import Cell, Specification
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store
 from potlp_jax.task.task import Task, TaskArrays, TaskSizes
@@ -66,33 +68,47 @@ class Sweep:
         return self.store.count() == self.total
 
     def step(self) -> bool:
-        """Do one block of work; returns whether there was any that no other process works on.
+        """Do work of one kind as long as there is some; returns whether there was any that no other process works on.
 
         Raises:
             WorldError: a task is impossible in too many worlds in a row.
         """
-        done = self.store.done()
+        return self._look_for_worlds() or self._run_trials()
+
+    def _look_for_worlds(self) -> bool:
+        """Find out in which of the next worlds a task is possible."""
         for cell in self.specification.cells:
             known = self.store.possible(cell.environment, cell.task)
-            worlds = self._worlds(known)
-            if len(worlds) < self.specification.worlds:
-                looked = self.store.claim(self._unknown_worlds(cell, known, len(worlds)), BLOCK)
+            found = len(self._worlds(known))
+            if found < self.specification.worlds:
+                looked = self.store.claim(self._unknown_worlds(cell, known, found), BLOCK)
                 if looked:
-                    self.store.set_possible(
-                        cell.environment,
-                        cell.task,
-                        {item.world: self._is_possible(cell, item.world) for item in looked},
-                    )
-                    return True
-            for policy in self.specification.policies:
-                items = [Item(cell.environment, cell.task, policy.value, world) for world in worlds]
-                missing = [item for item in items if item not in done]
-                claimed = self.store.claim(missing, BLOCK) if missing else []
-                for item in claimed:
-                    self.store.finish([self.run(item)])
-                if claimed:
+                    self.store.set_possible(cell.environment, cell.task, self.possible(looked))
                     return True
         return False
+
+    def _run_trials(self) -> bool:
+        """Run the missing trials of one environment and policy; a row is written as soon as a trial has ended."""
+        for environment in dict.fromkeys(cell.environment for cell in self.specification.cells):
+            for policy in self.specification.policies:
+                any_ran = False
+                for row in self.rows(self._claimed(environment, policy), environment, policy):
+                    self.store.finish([row])
+                    any_ran = True
+                if any_ran:
+                    return True
+        return False
+
+    def _claimed(self, environment: str, policy: Policy) -> Iterator[Item]:
+        """Trials that are missing, claimed a few at a time, as they are asked for."""
+        for cell in self.specification.cells:
+            if cell.environment != environment:
+                continue
+            worlds = self._worlds(self.store.possible(environment, cell.task))
+            missing = [Item(environment, cell.task, policy.value, world) for world in worlds]
+            while missing and (block := self.store.claim(missing, BLOCK)):
+                yield from block
+                missing = missing[missing.index(block[-1]) + 1 :]
 
     def _worlds(self, known: dict[int, bool]) -> list[int]:
         """The first worlds in which the task is possible, as far as that is known without a gap."""
@@ -117,15 +133,28 @@ class Sweep:
         after = range(self.specification.first_world, min(last + missing, MAX_INDEX) + 1)
         return [Item(cell.environment, cell.task, POSSIBLE, world) for world in after if world not in known]
 
-    def _is_possible(self, cell: Cell, world: int) -> bool:
-        trial = self.trial(Item(cell.environment, cell.task, Policy.KNOWN_MAP.value, world))
-        return trial.outcome is Outcome.SATISFIED
+    def possible(self, items: Sequence[Item]) -> dict[int, bool]:
+        """In which worlds, by number, the planner that knows the map succeeds; the items are of one task."""
+        trials = self._trials(items, items[0].environment, Policy.KNOWN_MAP)
+        return {item.world: trial.outcome is Outcome.SATISFIED for item, trial in trials}
 
-    def run(self, item: Item) -> Row:
-        """The row of one trial."""
-        start = time.perf_counter()
-        trial = self.trial(item)
-        return trial_row(item, trial, self._key(item.world), self.specification.config, time.perf_counter() - start)
+    def rows(self, items: Iterable[Item], environment: str, policy: Policy) -> Iterator[Row]:
+        """The rows of trials of one environment and policy, as they end."""
+        config = self.specification.config
+        trained = self._trained(environment) if policy is Policy.POTLP else None
+        for item, trial in self._trials(items, environment, policy):
+            world = _world(environment, self.specification.split.value, item.world)
+            yield batch_row(item, trial, world, self._key(item.world), config, trained)
+
+    def _trials(self, items: Iterable[Item], environment: str, policy: Policy) -> Iterator[tuple[Item, Finished]]:
+        def start(item: Item) -> Start:
+            world = _world(environment, self.specification.split.value, item.world)
+            return Start(world, self._tasks[environment, item.task][1], self._key(item.world), name=item)
+
+        trained = self._trained(environment) if policy is Policy.POTLP else None
+        for trial in run_batch(map(start, items), policy, self.specification.config, estimator=trained):
+            assert isinstance(trial.name, Item)
+            yield trial.name, trial
 
     def trial(self, item: Item) -> Trial:
         """The whole record of a trial, run or made again."""
@@ -140,7 +169,7 @@ class Sweep:
             environment=f"{item.environment}/{self.specification.split.value}",
             seed=item.world,
             arrays=arrays,
-            estimator=self._estimator if policy is Policy.POTLP else None,
+            estimator=self._trained(item.environment) if policy is Policy.POTLP else None,
         )
 
     def _key(self, world: int) -> jax.Array:
@@ -164,12 +193,14 @@ class Sweep:
         path = self.specification.estimator
         return None if path is None else read_estimator(path)
 
+    def _trained(self, environment: str) -> TrainedEstimator:
+        return estimator_for(_generator(environment).propositions, self._estimator)
+
     def _estimator_identity(self) -> str | None:
         """Of the network, so that a store never mixes two. Raises CheckpointError where there is none for a task."""
         if Policy.POTLP not in self.specification.policies:
             return None
-        environments = {cell.environment for cell in self.specification.cells}
-        found = [estimator_for(_generator(name).propositions, self._estimator) for name in sorted(environments)]
+        found = [self._trained(name) for name in sorted({cell.environment for cell in self.specification.cells})]
         return ", ".join(dict.fromkeys(estimator.identity for estimator in found))
 
 
@@ -252,7 +283,7 @@ def _generator(environment: str) -> Generator:
     return make(environment)
 
 
-@lru_cache(maxsize=BLOCK)
+@lru_cache(maxsize=4 * BLOCK)
 def _world(environment: str, split: str, world: int) -> World:
     """The worlds of a block, which every policy visits."""
     generator = _generator(environment)
