@@ -6,11 +6,14 @@ with the library; moves, letters, cost and what was observed when are checked ag
 
 import math
 from collections import deque
+from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from potlp_jax.records import NEVER_SEEN, Outcome, Trial
 from potlp_jax.task.task import Task
+from potlp_jax.world.grid import World
 from tests.reference.dijkstra import grid_moves
 from tests.reference.ltl_semantics import word_satisfies, word_violates
 
@@ -24,15 +27,22 @@ def problems_of(trial: Trial, task: Task) -> list[str]:
 
 
 def _moves(trial: Trial) -> list[str]:
-    free = (~np.asarray(trial.world.occupied)).tolist()
+    cost = path_cost(trial.world, trial.path)
+    if cost is None:
+        return ["illegal move"]
+    return [] if math.isclose(cost, trial.cost, rel_tol=1e-9, abs_tol=1e-9) else [f"cost {trial.cost}, moves {cost}"]
+
+
+def path_cost(world: World, path: Sequence[tuple[int, int]]) -> float | None:
+    """What the moves of a path cost, None where one of them does not exist in the world."""
+    free = (~np.asarray(world.occupied)).tolist()
     cost = 0.0
-    for before, after in zip(trial.path[:-1], trial.path[1:], strict=True):
+    for before, after in pairwise(path):
         step = dict(grid_moves(free, before)).get(after)
         if step is None or not free[after[0]][after[1]]:
-            return [f"illegal move {before} -> {after}"]
+            return None
         cost += step
-    cost *= float(trial.world.resolution)
-    return [] if math.isclose(cost, trial.cost, rel_tol=1e-9, abs_tol=1e-9) else [f"cost {trial.cost}, moves {cost}"]
+    return cost * float(world.resolution)
 
 
 def _observation(trial: Trial) -> list[str]:

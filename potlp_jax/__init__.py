@@ -8,10 +8,12 @@ The public names, from a formula to a trial:
 * planning: ``product_transitions``, ``product_distances``, ``Estimates``, ``PlanningProblem``, ``enumerate_actions``,
   ``SearchConfig``, ``Plan``, ``plan_actions``, ``solve_exact``, ``bound_exact``, ``Bounds``, ``ProblemTooLargeError``,
   ``DecisionConfig``, ``Policy``, ``decide``
-* a whole trial: ``TrialConfig``, ``run_trial``, ``Trial``, ``Outcome``, ``load_trial``
+* whole trials: ``TrialConfig``, ``run_trial``, ``Trial``, ``Outcome``, ``load_trial``; many at once: ``run_batch``,
+  ``Start``, ``Finished``
 * sentinels and flags: ``NO_ACTION``, ``Status``
 """
 
+from potlp_jax.batch import Finished, Start, run_batch
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.exact import Bounds, ProblemTooLargeError, bound_exact, solve_exact
 from potlp_jax.planning.policies import DecisionConfig, Policy, decide
@@ -35,6 +37,7 @@ __all__ = [
     "Bounds",
     "DecisionConfig",
     "Estimates",
+    "Finished",
     "FrontierConfig",
     "Outcome",
     "Plan",
@@ -43,6 +46,7 @@ __all__ = [
     "ProblemTooLargeError",
     "SearchConfig",
     "SensorConfig",
+    "Start",
     "Status",
     "Subgoals",
     "Task",
@@ -62,6 +66,7 @@ __all__ = [
     "plan_actions",
     "product_distances",
     "product_transitions",
+    "run_batch",
     "run_trial",
     "solve_exact",
     "stack_tasks",

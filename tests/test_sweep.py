@@ -19,7 +19,7 @@ from potlp_jax.cli import app
 from potlp_jax.environments import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.planning.policies import Policy
-from potlp_jax.sweep.rows import path_digest
+from potlp_jax.sweep.rows import path_text, read_path
 from potlp_jax.sweep.runner import RESULTS, Sweep, run_sweep
 from potlp_jax.sweep.specification import SpecificationError, read_specification, specification_from_dict
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store, StoreError, process_start
@@ -46,7 +46,7 @@ def _row(item, cost=1.0):
         fallbacks=0,
         status=0,
         key=(0, 2**32 - 1),
-        path="00000000",
+        path="2,3:70",
         configuration="abc",
         versions={"jax": "1"},
         commit="",
@@ -160,7 +160,7 @@ def test_other_files_are_no_store(tmp_path):
     old = Store(tmp_path / "b")
     old._connection.execute("UPDATE facts SET value = 'potlp-sweep-0' WHERE name = 'format'")
     old.close()
-    with pytest.raises(StoreError, match=r"'potlp-sweep-0'.*'potlp-sweep-1'"):
+    with pytest.raises(StoreError, match=r"'potlp-sweep-0'.*'potlp-sweep-2'"):
         Store(tmp_path / "b")
 
 
@@ -192,7 +192,7 @@ def test_a_row_is_what_a_single_trial_gives(finished):
         key = jax.random.fold_in(jax.random.key(0), row.item.world)
         trial = run_trial(world, task, row.item.policy, key)
         assert (row.outcome, row.cost, row.steps) == (trial.outcome, trial.cost, len(trial.path) - 1)
-        assert row.path == path_digest(trial.path)
+        assert read_path(row.path).tolist() == [list(cell) for cell in trial.path]
         assert row.decisions == len(trial.decisions)
 
 
@@ -323,7 +323,7 @@ def test_the_report_holds_tables_plots_and_replays_of_the_trials_as_they_were(fi
     assert not re.findall(r"""<(?:img|script|link)[^>]*(?:src|href)\s*=\s*["'](?!data:)""", text)
     data = re.findall(r'<script type="application/json" id="replay-0-\d">(.*?)</script>', text)
     rows = [row for row in _rows(finished) if row.item.policy == "optimistic"]
-    paths = {path_digest([tuple(cell) for cell in json.loads(entry)["path"]]) for entry in data}
+    paths = {path_text([tuple(cell) for cell in json.loads(entry)["path"]]) for entry in data}
     assert len(data) == 2
     assert paths <= {row.path for row in rows}
 

@@ -103,48 +103,59 @@ def table_by_portals(
     # The active cells follow the distinct sources at once, so that no lane of the sweeps stays empty between them.
     keys = jax.lax.dynamic_update_slice(jnp.pad(starts, ((0, capacity), (0, 0))), active.cells, (distinct, 0))
     lengths = arrivals(keys, distinct + active.count, ends)
-    from_starts = lengths[place]
     from_active = jax.lax.dynamic_slice_in_dim(lengths, distinct, capacity)
     usable = jnp.concatenate([exists, jnp.ones(target_cells.shape[0], bool)])
-    from_starts = jnp.where(usable[None, :] & real[:, None], from_starts, jnp.inf)
+    from_active = jnp.where(exists[:, None] & usable[None, :], from_active, jnp.inf)
+    entering = transitions[ends[:, 0], ends[:, 1]]
+    order = jnp.argsort(~real, stable=True)
 
+    def solve(number, table):
+        source = order[number]
+        from_start = jnp.where(usable, lengths[place[source]], jnp.inf)
+        costs, finish = _costs_of_source(from_start, source_states[source], from_active, entering, accepting)
+        here = jnp.all(target_cells == source_cells[source][None, :], axis=1)
+        at_source = jnp.where(jnp.arange(states) == source_states[source], 0.0, jnp.inf)
+        costs = jnp.where(here[:, None], jnp.minimum(costs, at_source[None, :]), costs)
+        return table[0].at[source].set(costs), table[1].at[source].set(finish)
+
+    nothing = (
+        jnp.full((source_states.shape[0], target_cells.shape[0], states), jnp.inf, jnp.float32),
+        jnp.full(source_states.shape, jnp.inf, jnp.float32),
+    )
+    return jax.lax.fori_loop(0, jnp.sum(real, dtype=jnp.int32), solve, nothing)
+
+
+def _costs_of_source(
+    from_start: Float32[Array, " N"],
+    state: Int32[Array, ""],
+    from_active: Float32[Array, "A N"],
+    entering: Int32[Array, "N Z"],
+    accepting: Bool[Array, " Z"],
+) -> tuple[Float32[Array, "T Z"], Float32[Array, ""]]:
+    """Costs from one source in ``state`` to the targets, which follow the active cells among the ends; to acceptance.
+
+    ``from_start`` and ``from_active`` are the costs of entering each end over neutral cells.
+    """
+    capacity, states = from_active.shape[0], accepting.shape[0]
     own = jnp.arange(states, dtype=jnp.int32)
-    at_source = jnp.where(own[None, :] == source_states[:, None], 0.0, jnp.inf).astype(jnp.float32)
-    first = at_source[:, :, None] + from_starts[:, None, :]
-    to_active, to_targets = from_active[:, :capacity], from_active[:, capacity:]
-    entering_active = transitions[active.cells[:, 0], active.cells[:, 1]]
-    entering_targets = transitions[target_cells[:, 0], target_cells[:, 1]]
+    first = jnp.where(own[:, None] == state, from_start[None, :], jnp.inf)
 
     def relax(carry):
         best, _ = carry
-        arrived = _min_plus(best, to_active, active.count)
-        better = jnp.minimum(best, _enter(jnp.minimum(arrived, first[:, :, :capacity]), entering_active))
+        arrived = jnp.min(best[:, :, None] + from_active[None, :, :capacity], axis=1)
+        better = jnp.minimum(best, _enter(jnp.minimum(arrived, first[:, :capacity]), entering[:capacity]))
         return better, jnp.any(better < best)
 
-    best = _enter(first[:, :, :capacity], entering_active)
-    best, _ = jax.lax.while_loop(lambda carry: carry[1], relax, (best, active.count > 0))
-    arrived = jnp.minimum(_min_plus(best, to_targets, active.count), first[:, :, capacity:])
-    travel = jnp.swapaxes(_enter(arrived, entering_targets), 1, 2)
-    here = jnp.all(target_cells[None] == source_cells[:, None], axis=2)
-    travel = jnp.where(here[:, :, None], jnp.minimum(travel, at_source[:, None, :]), travel)
-    finish = jnp.min(jnp.where(accepting[None, :], jnp.minimum(jnp.min(best, axis=2), at_source), jnp.inf), axis=1)
-    return travel, finish
+    best = _enter(first[:, :capacity], entering[:capacity])
+    best, _ = jax.lax.while_loop(lambda carry: carry[1], relax, (best, jnp.any(jnp.isfinite(best))))
+    arrived = jnp.min(best[:, :, None] + from_active[None, :, capacity:], axis=1)
+    travel = _enter(jnp.minimum(arrived, first[:, capacity:]), entering[capacity:])
+    at_source = jnp.where(own == state, 0.0, jnp.inf)
+    finish = jnp.min(jnp.where(accepting, jnp.minimum(jnp.min(best, axis=1), at_source), jnp.inf))
+    return travel.T, finish
 
 
-def _min_plus(
-    best: Float32[Array, "Q Z A"], lengths: Float32[Array, "A N"], count: Int32[Array, ""]
-) -> Float32[Array, "Q Z N"]:
-    """Cost of arriving at each end from the best of the first ``count`` active cells, per state before arriving."""
-
-    def through(index, arrived):
-        return jnp.minimum(arrived, best[:, :, index, None] + lengths[index][None, None, :])
-
-    start = jnp.full((*best.shape[:2], lengths.shape[1]), jnp.inf, jnp.float32)
-    return jax.lax.fori_loop(0, count, through, start)
-
-
-def _enter(arrived: Float32[Array, "Q Z N"], entering: Int32[Array, "N Z"]) -> Float32[Array, "Q Z N"]:
+def _enter(arrived: Float32[Array, "Z N"], entering: Int32[Array, "N Z"]) -> Float32[Array, "Z N"]:
     """Costs by state before entering become costs by state after; ``entering[n, z]`` is the state that follows."""
     states = entering.shape[1]
-    into = [jnp.min(jnp.where(entering.T[None] == state, arrived, jnp.inf), axis=1) for state in range(states)]
-    return jnp.stack(into, axis=1)
+    return jnp.stack([jnp.min(jnp.where(state == entering.T, arrived, jnp.inf), axis=0) for state in range(states)])

@@ -1,7 +1,6 @@
 """A finished trial as the row that the statistics need of it."""
 
 import subprocess
-import zlib
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -12,6 +11,7 @@ from jaxtyping import Int32, PRNGKeyArray
 
 from potlp_jax.batch import Finished
 from potlp_jax.learning.estimator import TrainedEstimator
+from potlp_jax.planning.sweeps import NEIGHBOURS
 from potlp_jax.records import Trial
 from potlp_jax.sweep.specification import configuration_hash
 from potlp_jax.sweep.store import Item, Row
@@ -32,7 +32,7 @@ def trial_row(item: Item, trial: Trial, key: PRNGKeyArray, config: TrialConfig, 
         fallbacks=sum(decision.fallback for decision in trial.decisions),
         status=trial.status,
         key=_words(key),
-        path=path_digest(trial.path),
+        path=path_text(trial.path),
         configuration=configuration_hash(config),
         versions=trial.versions,
         commit=source_commit(),
@@ -59,7 +59,7 @@ def batch_row(
         fallbacks=trial.fallbacks,
         status=trial.status,
         key=_words(key),
-        path=path_digest(trial.path),
+        path=path_text(trial.path),
         configuration=configuration_hash(config),
         versions=versions() | ({} if estimator is None else {"estimator": estimator.identity}),
         commit=source_commit(),
@@ -72,9 +72,19 @@ def trial_budget(world: World, factor: float) -> float:
     return factor * float(np.sum(np.asarray(world.extent))) * float(world.resolution)
 
 
-def path_digest(path: Sequence[tuple[int, int]] | Int32[np.ndarray, "steps 2"]) -> str:
-    """Eight hexadecimal digits that tell paths apart."""
-    return f"{zlib.crc32(np.asarray(path, np.int32).tobytes()):08x}"
+def path_text(path: Sequence[tuple[int, int]] | Int32[np.ndarray, "steps 2"]) -> str:
+    """A path as text: its first cell, and one digit for each move, by its place in ``sweeps.NEIGHBOURS``."""
+    cells = np.asarray(path, np.int32)
+    numbers = {move: str(number) for number, move in enumerate(NEIGHBOURS)}
+    moves = np.diff(cells, axis=0).tolist()
+    return f"{cells[0, 0]},{cells[0, 1]}:" + "".join(numbers[row, column] for row, column in moves)
+
+
+def read_path(text: str) -> Int32[np.ndarray, "steps 2"]:
+    """The cells of a path that ``path_text`` wrote."""
+    start, _, moves = text.partition(":")
+    steps = [tuple(map(int, start.split(","))), *(NEIGHBOURS[int(move)] for move in moves)]
+    return np.cumsum(np.array(steps, np.int32), axis=0, dtype=np.int32)
 
 
 @lru_cache(maxsize=1)

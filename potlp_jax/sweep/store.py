@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-FORMAT = "potlp-sweep-1"
+FORMAT = "potlp-sweep-2"
 LEASE: float = 600.0
 """Seconds after which a claim of another host is void."""
 
@@ -46,7 +46,7 @@ class Item:
 class Row:
     """The result of one trial. Costs are in units of the resolution; ``seconds`` is the wall time it took.
 
-    ``key`` holds the words of the trial's key; ``path`` is a digest of the cells that were entered, in order.
+    ``key`` holds the words of the trial's key; ``path`` holds the cells that were entered (``rows.read_path``).
     """
 
     item: Item
