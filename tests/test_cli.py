@@ -263,7 +263,7 @@ def test_task_that_is_never_possible_fails(monkeypatch):
 
 
 def test_unknown_environment_lists_the_known_ones():
-    with pytest.raises(WorldError, match="toy, firefighting, rooms"):
+    with pytest.raises(WorldError, match="toy, firefighting, delivery, rooms"):
         make("castle")
 
 

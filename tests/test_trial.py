@@ -71,7 +71,7 @@ def test_trials_keep_their_promises(policy):
 
 def test_an_episode_compiles_nothing_new():
     """After one trial of each policy, another world and another task run with the programs that are there."""
-    programs = (trial_module._decide, robot._follow, robot._observe, robot.photograph, look)
+    programs = (trial_module._decide, robot.follow, robot._observe, robot.photograph, look)
 
     def run_all(number):
         for policy in Policy:

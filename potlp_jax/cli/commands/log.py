@@ -1,5 +1,6 @@
 """``potlp log ...``: options and help texts of the commands about robots' logs; what they do is in ``log.py``."""
 
+import importlib
 import importlib.util
 from pathlib import Path
 from types import ModuleType
@@ -53,9 +54,8 @@ def _commands() -> ModuleType:
     """What the commands do."""
     if importlib.util.find_spec("rosbags") is None:
         fail("logs are read by rosbags, which is not installed: pip install 'potlp-jax[logs]'", FAILED)
-    from potlp_jax.cli import log
-
-    return log
+    # By its full name: the package's own attribute of this name is this module.
+    return importlib.import_module("potlp_jax.cli.log")
 
 
 @app.command(
