@@ -18,7 +18,6 @@ error; in a folder it is left out, with a warning.
 """
 
 import itertools
-import re
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
@@ -42,6 +41,7 @@ from potlp_jax.environments.academic import (
 from potlp_jax.environments.base import host_generators
 from potlp_jax.environments.floorplan_xml import FloorPlan, PlanDoor, PlanRoom, read_kinds, read_plan
 from potlp_jax.environments.map_server import GridFrame, MapError, MapWarning
+from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.places import Polygon, component_labels
 from potlp_jax.environments.splits import FLOOR_PLAN_PREFIX
 from potlp_jax.world.grid import World
@@ -216,16 +216,8 @@ def parse_spec(spec: str) -> FloorPlanConfig:
     Raises:
         MapError: the text is not of that form.
     """
-    path, *options = spec.removeprefix(FLOOR_PLAN_PREFIX).split(",")
     usage = "write floorplan:FILE.xml (or a folder)[,resolution=METRES][,kinds=FILE.yaml]"
-    if not spec.startswith(FLOOR_PLAN_PREFIX) or not path:
-        raise MapError(spec, "", f"names no plan; {usage}")
-    values: dict[str, str] = {}
-    for option in options:
-        match = re.fullmatch(r"(resolution|kinds)=(.+)", option)
-        if match is None or match[1] in values:
-            raise MapError(spec, option, f"is no option, or given twice; {usage}")
-        values[match[1]] = match[2]
+    path, values = parse_options(spec, FLOOR_PLAN_PREFIX, "plan", ("resolution", "kinds"), usage)
     try:
         resolution = float(values.get("resolution", FloorPlanConfig.resolution))
     except ValueError as error:

@@ -20,7 +20,6 @@ named: in ``CleanMap.cut_off``, and by a warning where a world is made of the ma
 Costs are in metres, since ``World.resolution`` is the size of a cell in metres.
 """
 
-import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -33,6 +32,7 @@ from scipy import ndimage
 
 from potlp_jax.environments.base import host_generators
 from potlp_jax.environments.map_server import GridFrame, MapError, MapWarning, OccupancyMap, load_map
+from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.places import Places, Point, component_labels, load_places, nearest_free, place_letters
 from potlp_jax.world.grid import World, make_world
 
@@ -178,16 +178,8 @@ def parse_spec(spec: str) -> RosMapConfig:
     Raises:
         MapError: the text is not of that form.
     """
-    file, *options = spec.removeprefix(PREFIX).split(",")
     usage = "write map:FILE.yaml[,places=FILE][,resolution=METRES][,radius=METRES]"
-    if not spec.startswith(PREFIX) or not file:
-        raise MapError(spec, "", f"names no map; {usage}")
-    values: dict[str, str] = {}
-    for option in options:
-        match = re.fullmatch(r"(places|resolution|radius)=(.+)", option)
-        if match is None or match[1] in values:
-            raise MapError(spec, option, f"is no option, or given twice; {usage}")
-        values[match[1]] = match[2]
+    file, values = parse_options(spec, PREFIX, "map", ("places", "resolution", "radius"), usage)
     try:
         numbers = {name: float(values[name]) for name in ("resolution", "radius") if name in values}
     except ValueError as error:

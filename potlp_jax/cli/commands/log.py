@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from potlp_jax.cli.commands.options import Json
+from potlp_jax.cli.commands.options import EstimatorFile, Json, Simulations
 from potlp_jax.cli.output import FAILED, clear_errors, fail
 
 app = typer.Typer(
@@ -158,12 +158,8 @@ def replay_command(
             show_default=False,
         ),
     ] = None,
-    simulations: Annotated[
-        int | None, typer.Option("--simulations", min=1, help="Simulations per decision of policies that search.")
-    ] = None,
-    estimator: Annotated[
-        Path | None, typer.Option("--estimator", help="Trained estimator for the policy potlp.")
-    ] = None,
+    simulations: Simulations = None,
+    estimator: EstimatorFile = None,
     map_topic: MapTopic = None,
     image_topic: ImageTopic = None,
     base_frame: BaseFrame = None,
