@@ -18,6 +18,7 @@ from potlp_jax.planning.product import (
     one_letter_successors,
     product_distances,
     product_transitions,
+    reachable_cells,
 )
 from potlp_jax.planning.sweeps import DIAGONAL, Wildcard
 from potlp_jax.task.task import TaskSizes
@@ -57,6 +58,7 @@ def maps(draw):
 
 _distances = jax.jit(product_distances)
 _grid = jax.jit(grid_distances)
+_reachable = jax.jit(reachable_cells)
 
 
 @jax.jit
@@ -343,6 +345,16 @@ def test_corners_are_not_cut():
     free = np.array([[True, True], [True, True]])
     cost = np.asarray(_grid(jnp.asarray(free), jnp.array([0, 0], jnp.int32), jnp.float32(1)))
     assert cost[1, 1] == pytest.approx(DIAGONAL)
+
+
+@settings(max_examples=40, deadline=None)
+@given(maps(), st.sampled_from(sorted(tasks)))
+def test_reachable_cells_ignore_letters(world, text):
+    free, letters, source = jnp.asarray(world[0]), jnp.asarray(world[1]), jnp.asarray(world[2], jnp.int32)
+    arrays, state = tasks[text].padded(SIZES), jnp.int32(tasks[text].dfa.initial)
+    _, distances = _solve(arrays, letters, free, source, state)
+    found = _reachable(free, source, jnp.any(jnp.isfinite(distances), axis=2))
+    np.testing.assert_array_equal(found, np.isfinite(_grid(free, source, jnp.float32(1))))
 
 
 def test_trap_letters_are_never_entered():

@@ -26,10 +26,10 @@ from potlp_jax.planning.pouct import Plan, plan_actions
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.product import (
     distance_table,
-    grid_distances,
     one_letter_successors,
     product_distances,
     product_transitions,
+    reachable_cells,
 )
 from potlp_jax.planning.search_graph import SearchConfig
 from potlp_jax.planning.sweeps import Wildcard
@@ -138,8 +138,9 @@ def assess(
     moves = product_transitions(task, belief.letters, belief.free)
     transitions = jnp.where(task.accepting[None, None, :], NO_STATE, moves)
     distances = product_distances(transitions, belief.free, cell[None], state[None], belief.resolution)[0]
-    reachable = jnp.isfinite(grid_distances(belief.free, cell, belief.resolution))
-    subgoals = find_subgoals(belief, reachable, jnp.min(distances, axis=2), config)
+    nearest = jnp.min(distances, axis=2)
+    reachable = reachable_cells(belief.free, cell, jnp.isfinite(nearest))
+    subgoals = find_subgoals(belief, reachable, nearest, config)
     finish = jnp.where(task.accepting[None, None, :], distances, jnp.inf)
     finish_cell, finish_state = _unravel(jnp.argmin(finish.reshape(-1)), finish.shape)
     return Situation(

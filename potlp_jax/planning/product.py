@@ -175,6 +175,21 @@ def grid_distances(
     return product_distances(transitions, free, cell[None, :], source, resolution)[0, :, :, 0]
 
 
+def reachable_cells(
+    free: Bool[Array, "H W"], cell: Int32[Array, "2"], within: Bool[Array, "H W"]
+) -> Bool[Array, "H W"]:
+    """Free cells that can be reached from ``cell``, letters ignored; ``within`` are cells known to be among them.
+
+    Where no move leads out of ``within``, as where no letter forbids a way, nothing is solved.
+    """
+    within = within.at[cell[0], cell[1]].set(True)
+    costs = jnp.where(within, 0.0, jnp.inf).astype(jnp.float32)[:, :, None]
+    leads_out = free & ~within & jnp.isfinite(Links(free).cheapest_arrival(costs)[:, :, 0])
+    return jax.lax.cond(
+        jnp.any(leads_out), lambda: jnp.isfinite(grid_distances(free, cell, jnp.float32(1.0))), lambda: within
+    )
+
+
 def _layers_first(transitions: Int32[Array, "H W Z"]) -> Int32[Array, "Z H W 1"]:
     return jnp.moveaxis(transitions, -1, 0)[..., None]
 

@@ -6,6 +6,7 @@ nothing else, so workers may be killed, started again, or belong to several comm
 """
 
 import dataclasses
+import itertools
 import multiprocessing
 import os
 import signal
@@ -37,6 +38,9 @@ IMPOSSIBLE_IN_A_ROW: int = 100
 
 BLOCK: int = 8
 """Trials, or worlds to look at, that a worker claims at once."""
+
+PORTION: int = 32
+"""Worlds of each task that all policies visit before the next ones."""
 
 WAIT: float = 0.3
 """Seconds between looks at the store while there is nothing to claim."""
@@ -88,23 +92,28 @@ class Sweep:
         return False
 
     def _run_trials(self) -> bool:
-        """Run the missing trials of one environment and policy; a row is written as soon as a trial has ended."""
-        for environment in dict.fromkeys(cell.environment for cell in self.specification.cells):
-            for policy in self.specification.policies:
+        """Run the missing trials of one policy in a portion of the worlds; each is written as soon as it has ended.
+
+        All policies visit a portion before the next one: the pairs of the first worlds are complete early, and the
+        rate so far tells the time left.
+        """
+        environments = dict.fromkeys(cell.environment for cell in self.specification.cells)
+        for first in range(0, self.specification.worlds, PORTION):
+            for environment, policy in itertools.product(environments, self.specification.policies):
                 any_ran = False
-                for row in self.rows(self._claimed(environment, policy), environment, policy):
+                for row in self.rows(self._claimed(environment, policy, first), environment, policy):
                     self.store.finish([row])
                     any_ran = True
                 if any_ran:
                     return True
         return False
 
-    def _claimed(self, environment: str, policy: Policy) -> Iterator[Item]:
-        """Trials that are missing, claimed a few at a time, as they are asked for."""
+    def _claimed(self, environment: str, policy: Policy, first: int) -> Iterator[Item]:
+        """Trials that are missing in the portion from the ``first`` world on, claimed a few at a time."""
         for cell in self.specification.cells:
             if cell.environment != environment:
                 continue
-            worlds = self._worlds(self.store.possible(environment, cell.task))
+            worlds = self._worlds(self.store.possible(environment, cell.task))[first : first + PORTION]
             missing = [Item(environment, cell.task, policy.value, world) for world in worlds]
             while missing and (block := self.store.claim(missing, BLOCK)):
                 yield from block
