@@ -19,6 +19,7 @@ ORDER = (
     "trial_config",
     "robot",
     "trial",
+    "batch_step",
     "batch",
     "replay",
     "logs",
