@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from scipy import ndimage
 
 from eval.contact_sheet import Cell, draw_plan, mark_bearings
-from potlp_jax.environments.academic import KIND_OF_PERSON, Floor, Kind, Placement
+from potlp_jax.environments.academic import PEOPLE, Floor, Kind, Placement
 from potlp_jax.environments.delivery import Delivery
 from potlp_jax.environments.floorplan import FloorPlanConfig, FloorPlans
 from potlp_jax.environments.splits import Split, world_key
@@ -73,7 +73,7 @@ def choose_views(shown: Furnished) -> Iterator[View]:
         yield View("in a hallway, before the door of a lit room", world, lit[0])
     if dark:
         yield View("in a hallway, before the door of a dark room", world, dark[len(dark) // 2])
-    for name, kind in KIND_OF_PERSON.items():
+    for name, (kind,) in PEOPLE.rooms.items():
         yield View(f"with the {name}, in a lit {kind.name.lower()}", world, placement.cells[name])
     empty = [room for room in floor.rooms_of(Kind.LAB) if room not in placement.rooms.values()]
     for room in empty[:1]:
@@ -96,7 +96,7 @@ def draw_sheet(shown: list[Furnished], views: list[View], path: Path) -> None:
     figure = new_figure(_WIDTH, height)
     for number, one in enumerate(shown):
         place = figure.add_axes(_box(number, _COLUMNS, 0.0, _PLAN_HEIGHT, height))
-        draw_plan(place, one.world, Delivery.propositions, one.placement.start, wall_colours=True)
+        draw_plan(place, one.world, PEOPLE.propositions, one.placement.start, wall_colours=True)
         place.set_title(one.title[:40], size=8, color=INK, pad=2)
     _draw_views(figure, views, plan_rows * _PLAN_HEIGHT, height)
     figure.savefig(path, dpi=90, pil_kwargs={"quality": _QUALITY} if path.suffix.lower() in (".jpg", ".jpeg") else None)

@@ -28,6 +28,18 @@ class TrialConfig:
     revealed: bool = False
 
 
+def with_settings(config: Any, settings: Mapping[str, Any]) -> Any:
+    """A configuration with some of its fields changed, nested mappings for nested configurations.
+
+    For settings that are known to be right, such as a generator's; ``sweep.specification`` checks those of users.
+    """
+    changes = {
+        name: with_settings(getattr(config, name), value) if isinstance(value, Mapping) else value
+        for name, value in settings.items()
+    }
+    return dataclasses.replace(config, **changes)
+
+
 def trial_config_from_dict(data: Mapping[str, Any]) -> TrialConfig:
     """The configuration that a record keeps, as ``dataclasses.asdict`` wrote it."""
     decision = data["decision"]

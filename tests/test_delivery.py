@@ -12,9 +12,8 @@ from scipy import ndimage
 
 from potlp_jax.environments import make
 from potlp_jax.environments.academic import (
-    KIND_OF_PERSON,
     NO_ROOM,
-    PROPOSITIONS,
+    PEOPLE,
     Floor,
     FurnishConfig,
     Kind,
@@ -90,11 +89,11 @@ def test_people_are_in_rooms_of_their_kind(worlds):
     for world, floor, placement in worlds:
         letters = np.asarray(world.letters)[: floor.rooms.shape[0], : floor.rooms.shape[1]]
         assert np.asarray(world.letters).sum() == letters.sum(), "nobody is in the padding"
-        for bit, name in enumerate(PROPOSITIONS):
+        for bit, name in enumerate(PEOPLE.propositions):
             cells = letters >> bit & 1 == 1
             rooms = np.unique(floor.rooms[cells])
             assert rooms.tolist() == [placement.rooms[name]]
-            assert floor.kinds[rooms[0]] is KIND_OF_PERSON[name]
+            assert floor.kinds[rooms[0]] in PEOPLE.rooms[name]
             assert cells[placement.cells[name]]
             assert 1 <= np.count_nonzero(cells) <= 9
         assert np.unique(letters).tolist() == [0, 1, 2, 4]
@@ -103,17 +102,17 @@ def test_people_are_in_rooms_of_their_kind(worlds):
 def test_everybody_is_everywhere_sometimes():
     """In one building, people and start move with the key; every room of the right kind is taken at some time."""
     floor = Delivery.toy().draw_floor(_key(0))
-    seen = {name: set() for name in PROPOSITIONS}
+    seen = {name: set() for name in PEOPLE.propositions}
     starts = set()
     for index in range(60):
-        _, placement = furnish(floor, _key(index), FurnishConfig(), floor.rooms.shape)
+        _, placement = furnish(floor, _key(index), PEOPLE, FurnishConfig(), floor.rooms.shape)
         starts.add(placement.start)
         assert floor.kind_of_cell[placement.start] == Kind.HALLWAY
         for name, room in placement.rooms.items():
             seen[name].add(room)
     assert len(starts) > 20
     for name, rooms in seen.items():
-        assert rooms == set(floor.rooms_of(KIND_OF_PERSON[name])) or len(rooms) > 8
+        assert rooms == set(floor.rooms_of(PEOPLE.rooms[name][0])) or len(rooms) > 8
 
 
 def test_light_is_on_where_somebody_is_and_in_hallways(worlds):
@@ -200,7 +199,7 @@ def test_floors_vary_as_real_ones_do(floors):
 def test_hallways_are_one_piece(floors):
     for floor in floors:
         assert ndimage.label(_hallways(floor))[1] == 1
-        assert not missing_kinds(floor)
+        assert not missing_kinds(floor, PEOPLE)
 
 
 def test_the_dead_end_counter_counts_dead_ends():
@@ -299,10 +298,10 @@ def test_impossible_furnishings_are_refused(floors):
     with pytest.raises(WorldError, match="hallway_light"):
         FurnishConfig(hallway_light=(0.9, 0.1))
     with pytest.raises(WorldError, match="does not fit"):
-        furnish(floors[0], _key(0), FurnishConfig(), (10, 10))
+        furnish(floors[0], _key(0), PEOPLE, FurnishConfig(), (10, 10))
     floor = Floor(np.zeros((4, 4), np.int32), np.zeros((4, 4), bool), (Kind.HALLWAY,), 0.5)
     with pytest.raises(WorldError, match="office, lab, classroom"):
-        furnish(floor, _key(0), FurnishConfig(), (4, 4))
+        furnish(floor, _key(0), PEOPLE, FurnishConfig(), (4, 4))
 
 
 def test_floors_without_rooms_are_refused():

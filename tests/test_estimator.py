@@ -96,7 +96,9 @@ def test_subgoals_side_by_side_fail_together_with_what_their_sum_leaves():
     assert np.all(raised >= np.asarray(chances) - 1e-6)
 
 
-def test_answers_equal_the_network_asked_pair_by_pair(world, task, trained):
+@pytest.mark.parametrize("resolution", [1.0, 0.5])
+def test_answers_equal_the_network_asked_pair_by_pair(world, task, trained, resolution):
+    world = dataclasses.replace(world, resolution=jnp.float32(resolution))
     belief = observe(BeliefMap.unobserved(world), world, world.start, NEAR.sensor)
     subgoals = find_subgoals(belief, belief.free, jnp.zeros(world.shape), FrontierConfig())
     eyes = look(trained.start(*world.shape), render(world, world.start), belief, world.start)
@@ -119,7 +121,7 @@ def test_answers_equal_the_network_asked_pair_by_pair(world, task, trained):
                 trained.params,
                 centred[None],
                 residual[None],
-                jnp.float32(distances[((row, column), 0)])[None],
+                jnp.float32(resolution * distances[((row, column), 0)])[None],
                 jnp.asarray([stay], jnp.int8),
                 jnp.asarray([go], jnp.int8),
             )

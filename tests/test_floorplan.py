@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from potlp_jax.cli.inputs import read_split
 from potlp_jax.environments import make
-from potlp_jax.environments.academic import KIND_OF_PERSON, NO_ROOM, Kind, missing_kinds
+from potlp_jax.environments.academic import NO_ROOM, PEOPLE, Kind, missing_kinds
 from potlp_jax.environments.floorplan import FloorPlanConfig, FloorPlans, PlanFloor, rasterise
 from potlp_jax.environments.floorplan_xml import read_kinds, read_plan
 from potlp_jax.environments.map_server import MapError, MapWarning
@@ -275,7 +275,7 @@ def test_worlds_on_a_plan_are_delivery_worlds(tmp_path):
         world, found, placement = generator.generate_with_layout(world_key(Split.TEST, index, generator.name))
         starts.add(placement.start)
         letters = np.asarray(world.letters)
-        for bit, (name, kind) in enumerate(KIND_OF_PERSON.items()):
+        for bit, (name, (kind,)) in enumerate(PEOPLE.rooms.items()):
             assert {found.floor.kinds[room] for room in found.floor.rooms[letters == 1 << bit]} == {kind}
             assert np.asarray(world.appearance.light)[placement.cells[name]] == 1.0
         assert float(world.resolution) == 0.5
@@ -481,7 +481,7 @@ def test_rooms_of_the_corpora_keep_their_size(corpus):
 
 
 def test_enough_plans_of_the_corpora_have_all_kinds_of_rooms(corpus):
-    assert sum(not missing_kinds(found.floor) for found in corpus[2]) == USABLE
+    assert sum(not missing_kinds(found.floor, PEOPLE) for found in corpus[2]) == USABLE
 
 
 def test_a_folder_of_the_corpora_becomes_buildings(external_data):

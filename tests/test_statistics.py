@@ -1,5 +1,6 @@
 """Paired statistics against figures worked out by hand and a plain NumPy bootstrap."""
 
+import dataclasses
 import json
 import math
 
@@ -167,3 +168,30 @@ def test_unpaired_or_missing_policies_are_refused():
         Comparison.from_results({"baseline": _trials(BASELINE)})
     with pytest.raises(ValueError, match="unequally many"):
         Comparison.from_results(_results(ours=_trials(OURS[:2])))
+
+
+def test_trials_of_one_cluster_are_no_independent_trials():
+    """Every trial four times over, in clusters of four, says no more than once."""
+
+    def compared(times, clusters=None):
+        results = {
+            "known-map": _trials(np.tile(KNOWN, times)),
+            "baseline": _trials(np.tile(BASELINE, times)),
+            "ours": _trials(np.tile(OURS, times)),
+        }
+        return _row(Comparison.from_results(results, clusters=clusters, resamples=500).satisfied, "ours")
+
+    once, clustered, apart = compared(1), compared(4, ["x", "y", "z"] * 4), compared(4)
+    assert dataclasses.astuple(clustered)[1:] == pytest.approx(dataclasses.astuple(once)[1:])
+    assert apart.trial_savings_error < 0.6 * once.trial_savings_error
+    assert apart.attainable_high - apart.attainable_low < once.attainable_high - once.attainable_low
+
+
+def test_clusters_that_are_dropped_leave_no_trace():
+    results = _results(ours=_trials(OURS, ["satisfied", "stuck", "satisfied"]))
+    row = _row(Comparison.from_results(results, clusters=["a", "b", "c"], resamples=100).satisfied, "ours")
+    assert row.trial_savings == pytest.approx(3 / 8)
+    # Deviations 1/8 and -1/8.
+    assert row.trial_savings_error == pytest.approx(1 / 8)
+    with pytest.raises(ValueError, match="2 clusters are named for 3 worlds"):
+        Comparison.from_results(results, clusters=["a", "b"])

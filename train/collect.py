@@ -45,6 +45,7 @@ from potlp_jax.learning.formulas import HELD_OUT, TaskDistribution
 from potlp_jax.learning.sampling import Pose, Recorder, ViewConfig, record_views
 from potlp_jax.learning.weights import WeightBounds
 from potlp_jax.trial import versions
+from potlp_jax.trial_config import TrialConfig, with_settings
 from potlp_jax.world.grid import World
 from potlp_jax.world.panorama import CameraConfig, Disturbance, disturb, render
 from train.explorer import Explorer, ExplorerConfig
@@ -243,7 +244,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     enable_compilation_cache()
     generator = make(options.environment)
+    frontiers = with_settings(TrialConfig(), generator.settings).decision.frontiers
     config = CollectConfig(
+        frontiers=frontiers,
+        explorer=ExplorerConfig(frontiers=frontiers),
         seed=options.seed,
         worlds_per_shard=options.worlds_per_shard,
         views_per_world=options.views_per_world,

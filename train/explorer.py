@@ -8,6 +8,7 @@ way to what is known and back. Nothing is learned or searched.
 
 import dataclasses
 from collections.abc import Iterator, Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -43,12 +44,14 @@ class ExplorerConfig:
         replan_distance: travelled, at least, between poses while the map changes.
         travel_factor: times the sum of the map's sides is travelled at most.
         sensor: the mapping sensor.
+        frontiers: which components of the frontier it may choose from.
     """
 
     random_frontier: float = 0.5
     replan_distance: float = 4.0
     travel_factor: float = 6.0
     sensor: SensorConfig = SensorConfig()
+    frontiers: FrontierConfig = FrontierConfig()
 
 
 class Explorer:
@@ -108,7 +111,9 @@ class Explorer:
         """Where to go, in which state of the task; None if no task that was tried leads anywhere."""
         for _ in range(_TASKS_TRIED):
             if not self._is_decided():
-                situation = _assess(belief, jnp.asarray(cell, jnp.int32), jnp.int32(self._state), self._arrays)
+                situation = _assess(
+                    belief, jnp.asarray(cell, jnp.int32), jnp.int32(self._state), self._arrays, self._config.frontiers
+                )
                 if np.isfinite(situation.finish_cost):
                     return situation, _cell(situation.finish_cell), int(situation.finish_state)
                 distances = np.asarray(situation.distances)
@@ -132,12 +137,11 @@ class Explorer:
         return _cell(cells[0 if nearest else int(self._rng.integers(len(cells)))])
 
 
-_FRONTIERS = FrontierConfig()
-
-
-@jax.jit
-def _assess(belief: BeliefMap, cell: Int32[Array, "2"], state: Int32[Array, ""], task) -> Situation:
-    return assess(belief, cell, state, task, _FRONTIERS)
+@partial(jax.jit, static_argnames="frontiers")
+def _assess(
+    belief: BeliefMap, cell: Int32[Array, "2"], state: Int32[Array, ""], task, frontiers: FrontierConfig
+) -> Situation:
+    return assess(belief, cell, state, task, frontiers)
 
 
 @jax.jit

@@ -104,7 +104,9 @@ def compare_policies(
     policies = _read_policies(default_policy(generator) if policy_names is None else policy_names)
     trained = read_trained_estimator(estimator)
     task = read_environment_task(generator, task_name)
-    setting = _Setting(environment, generator, split, seed, task, policies, trial_config(simulations), trained)
+    setting = _Setting(
+        environment, generator, split, seed, task, policies, trial_config(simulations, generator), trained
+    )
     folder = output_folder(out)
     pairs = _run(setting, trials)
     comparison = compare_pairs(pairs, [policy.value for policy in policies])

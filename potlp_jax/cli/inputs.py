@@ -10,7 +10,7 @@ from potlp_jax.environments.splits import MAX_INDEX, Split, check_split, default
 from potlp_jax.learning.estimator import TrainedEstimator, read_estimator, shipped_estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task, shipped_tasks
-from potlp_jax.trial_config import TrialConfig
+from potlp_jax.trial_config import TrialConfig, with_settings
 from potlp_jax.world.grid import World
 
 
@@ -74,9 +74,9 @@ def make_world(generator: Generator, split: Split, seed: int) -> World:
     return generator.generate(world_key(split, seed, generator.name))
 
 
-def trial_config(simulations: int | None) -> TrialConfig:
-    """The default configuration, with another number of simulations if one is given."""
-    config = TrialConfig()
+def trial_config(simulations: int | None, generator: Generator | None = None) -> TrialConfig:
+    """What the generator's worlds call for, with another number of simulations if one is given."""
+    config = TrialConfig() if generator is None else with_settings(TrialConfig(), generator.settings)
     if simulations is None:
         return config
     search = dataclasses.replace(config.decision.search, simulations=simulations)

@@ -53,7 +53,7 @@ def run_one(
             task,
             policy,
             jax.random.key(seed),
-            trial_config(simulations),
+            trial_config(simulations, generator),
             environment=f"{environment}/{split}",
             seed=seed,
             estimator=trained,

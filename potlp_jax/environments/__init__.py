@@ -7,8 +7,10 @@ FAMILIES: tuple[str, ...] = (
     "toy",
     "firefighting",
     "delivery",
+    "parcels",
     "rooms",
     "map:FILE.yaml",
+    "parcels:FILE.yaml",
     "floorplan:FILE.xml",
 )
 """The names that ``make`` understands."""
@@ -18,8 +20,9 @@ def make(name: str) -> Generator:
     """The generator of a family of worlds, as named on the command line.
 
     Args:
-        name: ``toy``, ``firefighting``, ``delivery``, ``rooms``, ``map:FILE.yaml`` for worlds on a ROS map, or
-            ``floorplan:FILE.xml`` for delivery worlds on a real floor plan (or on those of a folder).
+        name: ``toy``, ``firefighting``, ``delivery``, ``parcels``, ``rooms``, ``map:FILE.yaml`` for a ROS map,
+            ``parcels:FILE.yaml`` for deliveries to its rooms, or ``floorplan:FILE.xml`` for delivery worlds on a real
+            floor plan (or on those of a folder).
 
     Raises:
         WorldError: there is no such family.
@@ -38,6 +41,10 @@ def make(name: str) -> Generator:
         from potlp_jax.environments.delivery import Delivery
 
         return Delivery()
+    if name == "parcels":
+        from potlp_jax.environments.delivery import Delivery
+
+        return Delivery.parcels()
     if name == "rooms":
         from potlp_jax.environments.rooms import Rooms
 
@@ -46,6 +53,10 @@ def make(name: str) -> Generator:
         from potlp_jax.environments.ros_map import RosMap
 
         return RosMap.from_spec(name)
+    if name.startswith("parcels:"):
+        from potlp_jax.environments.mapped_rooms import MappedRooms
+
+        return MappedRooms.from_spec(name)
     if name.startswith("floorplan:"):
         from potlp_jax.environments.floorplan import FloorPlans
 

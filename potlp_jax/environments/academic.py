@@ -17,6 +17,7 @@ import dataclasses
 import enum
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any
 
 import cv2
 import jax.numpy as jnp
@@ -31,12 +32,6 @@ Cell = tuple[int, int]
 NO_ROOM: int = -1
 """Number of no room: the cell is an obstacle."""
 
-PROPOSITIONS: tuple[str, ...] = ("professor", "grad", "undergrad")
-"""In the order of the letters' bits."""
-
-TASKS: Mapping[str, str] = MappingProxyType({"1": "F professor & F grad & F undergrad"})
-"""The task of Bradley et al. 2021, section V-B."""
-
 
 class Kind(enum.IntEnum):
     """What a room is for; where two meet at a wall, the larger value gives its colour."""
@@ -48,10 +43,41 @@ class Kind(enum.IntEnum):
     CLASSROOM = 4
 
 
-KIND_OF_PERSON: Mapping[str, Kind] = MappingProxyType(
-    {"professor": Kind.OFFICE, "grad": Kind.LAB, "undergrad": Kind.CLASSROOM}
+@dataclasses.dataclass(frozen=True)
+class Errand:
+    """What there is to do on a floor.
+
+    Attributes:
+        rooms: the kinds of room in which each proposition may hold, in the order of the letters' bits. No two hold in
+            the same room.
+        tasks: formulas by number.
+    """
+
+    rooms: Mapping[str, tuple[Kind, ...]]
+    tasks: Mapping[str, str]
+
+    @property
+    def propositions(self) -> tuple[str, ...]:
+        """In the order of the letters' bits."""
+        return tuple(self.rooms)
+
+
+PEOPLE: Errand = Errand(
+    rooms=MappingProxyType({"professor": (Kind.OFFICE,), "grad": (Kind.LAB,), "undergrad": (Kind.CLASSROOM,)}),
+    tasks=MappingProxyType({"1": "F professor & F grad & F undergrad"}),
 )
-"""Where each of ``PROPOSITIONS`` can be."""
+"""Bradley et al. 2021, section V-B."""
+
+_ANY_ROOM = (Kind.OTHER, Kind.OFFICE, Kind.LAB, Kind.CLASSROOM)
+
+PARCELS: Errand = Errand(
+    rooms=MappingProxyType({"document": _ANY_ROOM, "package": _ANY_ROOM}),
+    tasks=MappingProxyType({"1": "F document & F package", "2": "F (document & F package)"}),
+)
+"""Bradley et al. 2021, section V-C: a document and a package for two people, in any order or the document first."""
+
+MANY_DOORS: Mapping[str, Any] = MappingProxyType({"decision": {"frontiers": {"max_subgoals": 32}}})
+"""Settings of trials: from a hallway one sees 18 to 27 doors at a time, in the mean of a trial."""
 
 _WALL_COLOURS = {
     Kind.HALLWAY: (208, 204, 194),
@@ -107,11 +133,13 @@ class FurnishConfig:
 
     Attributes:
         person_radius: a person is met on a square of ``2 * person_radius + 1`` cells a side, inside of the room.
+        coloured: whether walls and floors tell the kind of a room; else all look like rooms of no special kind.
         hallway_light: bounds of the hallways' brightness, drawn once a world.
         tint: largest shift of each colour, per world; tint_noise: of the brightness, per cell (both of 255).
     """
 
     person_radius: int = 1
+    coloured: bool = True
     hallway_light: tuple[float, float] = (0.6, 1.0)
     tint: int = 16
     tint_noise: int = 3
@@ -141,32 +169,40 @@ class Placement:
     hallway_light: float
 
 
-def missing_kinds(floor: Floor) -> tuple[Kind, ...]:
-    """The kinds of room that the task needs and the floor does not have."""
-    return tuple(kind for kind in (Kind.HALLWAY, *KIND_OF_PERSON.values()) if not floor.rooms_of(kind))
+def missing_kinds(floor: Floor, errand: Errand) -> tuple[tuple[Kind, ...], ...]:
+    """Of what the errand needs a room: the kinds of which the floor has none, or too few for all who need one."""
+    needed = [(Kind.HALLWAY,), *errand.rooms.values()]
+    rooms = {kinds: [number for kind in kinds for number in floor.rooms_of(kind)] for kinds in needed}
+    return tuple(kinds for kinds in rooms if len(rooms[kinds]) < needed.count(kinds))
 
 
-def furnish(floor: Floor, key: PRNGKeyArray, config: FurnishConfig, shape: tuple[int, int]) -> tuple[World, Placement]:
+def furnish(
+    floor: Floor, key: PRNGKeyArray, errand: Errand, config: FurnishConfig, shape: tuple[int, int]
+) -> tuple[World, Placement]:
     """The floor with people, a start, light and colours, all drawn by key; costs are in metres.
 
     The world's arrays have ``shape``: what is missing is solid and no part of its ``extent``. Two floors of one shape
     cost one compilation.
 
     Raises:
-        WorldError: a kind of room that somebody or the robot needs is missing, or the floor is larger than ``shape``.
+        WorldError: a room that somebody or the robot needs is missing, or the floor is larger than ``shape``.
     """
-    missing = missing_kinds(floor)
+    missing = missing_kinds(floor, errand)
     if missing:
-        names = ", ".join(kind.name.lower() for kind in missing)
-        raise WorldError(f"the floor has no room of kind {names}, which the delivery task needs")
+        raise WorldError(f"the floor has too few rooms of kind {name_kinds(missing)}, which the errand needs")
     extent = floor.rooms.shape
     floor = _padded(floor, shape)
     people_rng, look_rng = host_generators(key, 2)
-    placement = _place_people(floor, people_rng, config)
+    placement = _place_people(floor, people_rng, errand, config)
     look = _appearance(floor, placement, look_rng, config)
     letters = _letters(floor, placement, config)
     world = make_world(floor.occupied, letters, placement.start, floor.resolution, look)
     return dataclasses.replace(world, extent=jnp.asarray(np.array(extent, np.int32))), placement
+
+
+def name_kinds(missing: tuple[tuple[Kind, ...], ...]) -> str:
+    """What ``missing_kinds`` found, in words."""
+    return ", ".join(" or ".join(kind.name.lower() for kind in kinds) for kinds in missing)
 
 
 def _padded(floor: Floor, shape: tuple[int, int]) -> Floor:
@@ -177,11 +213,13 @@ def _padded(floor: Floor, shape: tuple[int, int]) -> Floor:
     return dataclasses.replace(floor, rooms=rooms, doors=np.pad(floor.doors, missing))
 
 
-def _place_people(floor: Floor, rng: np.random.Generator, config: FurnishConfig) -> Placement:
+def _place_people(floor: Floor, rng: np.random.Generator, errand: Errand, config: FurnishConfig) -> Placement:
     hallway = np.isin(floor.rooms, floor.rooms_of(Kind.HALLWAY)) & ~floor.doors
     start = _draw_cell(rng, hallway)
-    rooms = {name: floor.rooms_of(kind) for name, kind in KIND_OF_PERSON.items()}
-    chosen = {name: numbers[int(rng.integers(len(numbers)))] for name, numbers in rooms.items()}
+    chosen: dict[str, int] = {}
+    for name, kinds in errand.rooms.items():
+        vacant = [room for kind in kinds for room in floor.rooms_of(kind) if room not in chosen.values()]
+        chosen[name] = vacant[int(rng.integers(len(vacant)))]
     cells = {name: _draw_cell(rng, (floor.rooms == number) & ~floor.doors) for name, number in chosen.items()}
     low, high = config.hallway_light
     light = low + (high - low) * float(rng.random())
@@ -196,8 +234,7 @@ def _draw_cell(rng: np.random.Generator, allowed: Bool[np.ndarray, "H W"]) -> Ce
 def _letters(floor: Floor, placement: Placement, config: FurnishConfig) -> Int32[np.ndarray, "H W"]:
     letters = np.zeros(floor.rooms.shape, np.int32)
     reach = config.person_radius
-    for bit, name in enumerate(PROPOSITIONS):
-        row, column = placement.cells[name]
+    for bit, (name, (row, column)) in enumerate(placement.cells.items()):
         patch = (slice(max(row - reach, 0), row + reach + 1), slice(max(column - reach, 0), column + reach + 1))
         letters[patch] |= np.where(floor.rooms[patch] == placement.rooms[name], 1 << bit, 0).astype(np.int32)
     return letters
@@ -209,6 +246,8 @@ def _appearance(floor: Floor, placement: Placement, rng: np.random.Generator, co
     floor_palette = np.array([_FLOOR_COLOURS[kind] for kind in Kind]) + tints[0]
     wall_palette = np.array([_WALL_COLOURS[kind] for kind in Kind]) + tints[1]
     kinds = floor.kind_of_cell
+    if not config.coloured:
+        kinds = np.minimum(kinds, Kind.OTHER).astype(np.int32)
     return Appearance(
         floor_colour=_colours(floor_palette[np.maximum(kinds, 0)] + noise[0]),
         wall_colour=_colours(wall_palette[_kind_of_wall(kinds)] + noise[1]),

@@ -1,6 +1,7 @@
 """What every family of worlds offers."""
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, Protocol, runtime_checkable
 
 import jax
@@ -8,6 +9,9 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from potlp_jax.world.grid import World
+
+NO_SETTINGS: Mapping[str, Any] = MappingProxyType({})
+"""Trials run with the defaults."""
 
 
 @runtime_checkable
@@ -19,6 +23,8 @@ class Generator(Protocol):
         propositions: bit ``i`` of every letter of the family is ``propositions[i]``.
         config: the parameters of the worlds, a frozen dataclass.
         tasks: formulas that belong to the family, by the number (or name) used on the command line.
+        settings: what trials in its worlds need to be different from the defaults: fields of
+            ``trial_config.TrialConfig``, nested as in a sweep's file.
     """
 
     @property
@@ -32,6 +38,9 @@ class Generator(Protocol):
 
     @property
     def tasks(self) -> Mapping[str, str]: ...
+
+    @property
+    def settings(self) -> Mapping[str, Any]: ...
 
     def generate(self, key: PRNGKeyArray) -> World:
         """The world of this key: on the host, the same on every machine. Raises WorldError where none can be made."""

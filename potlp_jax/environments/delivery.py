@@ -14,15 +14,18 @@ are padded to one shape.
 
 import dataclasses
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Int, PRNGKeyArray
 
 from potlp_jax.environments.academic import (
+    MANY_DOORS,
     NO_ROOM,
-    PROPOSITIONS,
-    TASKS,
+    PARCELS,
+    PEOPLE,
+    Errand,
     Floor,
     FurnishConfig,
     Kind,
@@ -111,19 +114,39 @@ class DeliveryConfig:
 
 
 class Delivery:
-    """Generator of academic floors with three people to find."""
+    """Generator of academic floors with people to find: by default the three of section V-B.
 
-    name: str = "delivery"
-    propositions: tuple[str, ...] = PROPOSITIONS
-    tasks: Mapping[str, str] = TASKS
+    Attributes:
+        name: the family's; it separates the seeds.
+        errand: who is to be found, and where they can be.
+    """
 
-    def __init__(self, config: DeliveryConfig | None = None) -> None:
+    settings: Mapping[str, Any] = MANY_DOORS
+
+    def __init__(self, config: DeliveryConfig | None = None, name: str = "delivery", errand: Errand = PEOPLE) -> None:
         self.config = DeliveryConfig() if config is None else config
+        self.name = name
+        self.errand = errand
 
     @classmethod
     def toy(cls) -> "Delivery":
         """Floors of 36 to 48 rows and 48 to 64 columns."""
         return cls(DeliveryConfig(smallest=(36, 48), largest=(48, 64)))
+
+    @classmethod
+    def parcels(cls) -> "Delivery":
+        """Floors with a document and a package to deliver in two rooms of any kind, which nothing but light tells."""
+        return cls(DeliveryConfig(furnishing=FurnishConfig(coloured=False)), "parcels", PARCELS)
+
+    @property
+    def propositions(self) -> tuple[str, ...]:
+        """In the order of the letters' bits."""
+        return self.errand.propositions
+
+    @property
+    def tasks(self) -> Mapping[str, str]:
+        """Formulas by number."""
+        return self.errand.tasks
 
     def generate(self, key: PRNGKeyArray) -> World:
         """The world of this key."""
@@ -133,11 +156,11 @@ class Delivery:
         """The world of this key, its floor without padding, and who is where.
 
         Raises:
-            WorldError: the configuration leaves no space for an office, a laboratory and a classroom.
+            WorldError: the configuration leaves no space for the rooms that the errand needs.
         """
         floor_key, furnish_key = jax.random.split(key)
         floor = self.draw_floor(floor_key)
-        world, placement = furnish(floor, furnish_key, self.config.furnishing, self.config.largest)
+        world, placement = furnish(floor, furnish_key, self.errand, self.config.furnishing, self.config.largest)
         return world, floor, placement
 
     def draw_floor(self, key: PRNGKeyArray) -> Floor:
@@ -145,9 +168,9 @@ class Delivery:
         (rng,) = host_generators(key, 1)
         for _ in range(_ATTEMPTS):
             floor = _Builder(self.config, rng).build()
-            if not missing_kinds(floor):
+            if not missing_kinds(floor, self.errand):
                 return floor
-        raise WorldError(f"no floor of {_ATTEMPTS} had an office, a laboratory and a classroom; make largest larger")
+        raise WorldError(f"no floor of {_ATTEMPTS} had the rooms that {self.name} needs; make largest larger")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,12 +13,13 @@ import dataclasses
 import enum
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, PRNGKeyArray, UInt8
 
-from potlp_jax.environments.base import host_generators
+from potlp_jax.environments.base import NO_SETTINGS, host_generators
 from potlp_jax.world.grid import Appearance, World, WorldError, make_world
 
 Cell = tuple[int, int]
@@ -141,6 +142,7 @@ class Firefighting:
             "4": "!fire U exit",
         }
     )
+    settings: Mapping[str, Any] = NO_SETTINGS
 
     def __init__(self, config: FirefightingConfig | None = None) -> None:
         self.config = FirefightingConfig() if config is None else config

@@ -22,21 +22,23 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Int, Int32, PRNGKeyArray
 
 from potlp_jax.environments.academic import (
+    MANY_DOORS,
     NO_ROOM,
-    PROPOSITIONS,
-    TASKS,
+    PEOPLE,
     Floor,
     FurnishConfig,
     Kind,
     Placement,
     furnish,
     missing_kinds,
+    name_kinds,
 )
 from potlp_jax.environments.base import host_generators
 from potlp_jax.environments.floorplan_xml import FloorPlan, PlanDoor, PlanRoom, read_kinds, read_plan
@@ -145,8 +147,9 @@ class FloorPlans:
         left_out: why files of a folder are no buildings, by name.
     """
 
-    propositions: tuple[str, ...] = PROPOSITIONS
-    tasks: Mapping[str, str] = TASKS
+    propositions: tuple[str, ...] = PEOPLE.propositions
+    tasks: Mapping[str, str] = PEOPLE.tasks
+    settings: Mapping[str, Any] = MANY_DOORS
 
     def __init__(self, config: FloorPlanConfig) -> None:
         """Reads and rasterises the plans.
@@ -193,7 +196,7 @@ class FloorPlans:
         """The world of this key, its building without padding, and who is where."""
         furnish_key = jax.random.fold_in(key, 0)
         floor = self.building(key)
-        world, placement = furnish(floor.floor, furnish_key, self.config.furnishing, self._shape)
+        world, placement = furnish(floor.floor, furnish_key, PEOPLE, self.config.furnishing, self._shape)
         return world, floor, placement
 
     def building(self, key: PRNGKeyArray) -> PlanFloor:
@@ -272,15 +275,14 @@ def _files(path: Path) -> list[Path]:
 def _usable_floor(file: Path, kinds: Mapping[str, Kind], resolution: float) -> PlanFloor:
     plan = read_plan(file)
     found = rasterise(plan, kinds, resolution)
-    missing = missing_kinds(found.floor)
+    missing = missing_kinds(found.floor, PEOPLE)
     if missing:
-        names = ", ".join(kind.name.lower() for kind in missing)
         labels = ", ".join(sorted({room.label for room in plan.rooms}))
         raise MapError(
             file,
             "",
-            f"no room of kind {names} can be reached, and the delivery task needs one. The labels are: {labels}; "
-            f"kinds=FILE.yaml gives them another meaning. ({found.report})",
+            f"no room of kind {name_kinds(missing)} can be reached, and the delivery task needs one. The labels are: "
+            f"{labels}; kinds=FILE.yaml gives them another meaning. ({found.report})",
         )
     return found
 

@@ -15,7 +15,7 @@ own cell always counts. A *polygon* covers the cells whose centre lies inside, b
 carry a proposition.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -123,6 +123,18 @@ def load_places(file: Path | str) -> Places:
     )
 
 
+def load_regions(file: Path | str, names: Sequence[str]) -> dict[str, dict[str, tuple[Region, ...]]]:
+    """Regions by name under each of the keys ``names`` of a YAML file, in the form of the propositions above.
+
+    Raises:
+        MapError: the file cannot be read, has other keys, or a region is none.
+    """
+    file = Path(file)
+    fields = read_yaml(file)
+    _check_known(file, "", fields, tuple(names))
+    return {name: dict(_named_regions(file, name, fields.get(name))) for name in names}
+
+
 def save_places(places: Places, file: Path) -> None:
     """Write what `load_places` reads back as the same propositions, start and tasks. Raises OSError."""
     fields: dict[str, Any] = {
@@ -224,11 +236,16 @@ def _centres(frame: GridFrame) -> tuple[Float64[np.ndarray, "H 1"], Float64[np.n
 
 
 def _propositions(file: Path, value: Any) -> tuple[tuple[str, tuple[Region, ...]], ...]:
+    found = _named_regions(file, "propositions", value)
+    if len(found) > MAX_PROPOSITIONS:
+        raise MapError(file, "propositions", f"{len(found)} of them, at most {MAX_PROPOSITIONS} are possible")
+    return found
+
+
+def _named_regions(file: Path, field: str, value: Any) -> tuple[tuple[str, tuple[Region, ...]], ...]:
     if not isinstance(value, dict) or not value:
-        raise MapError(file, "propositions", "is missing or empty; it maps names to lists of regions")
-    if len(value) > MAX_PROPOSITIONS:
-        raise MapError(file, "propositions", f"{len(value)} of them, at most {MAX_PROPOSITIONS} are possible")
-    return tuple((name, _regions(file, f"propositions: {name}", regions)) for name, regions in value.items())
+        raise MapError(file, field, "is missing or empty; it maps names to lists of regions")
+    return tuple((str(name), _regions(file, f"{field}: {name}", regions)) for name, regions in value.items())
 
 
 def _regions(file: Path, field: str, value: Any) -> tuple[Region, ...]:

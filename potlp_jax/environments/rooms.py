@@ -8,11 +8,12 @@ propositions occur.
 import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int32, PRNGKeyArray
 
-from potlp_jax.environments.base import host_generators
+from potlp_jax.environments.base import NO_SETTINGS, host_generators
 from potlp_jax.world.grid import World, WorldError, make_world, pad_world
 
 
@@ -54,6 +55,7 @@ class Rooms:
     """Generator of floors of rooms."""
 
     name = "rooms"
+    settings: Mapping[str, Any] = NO_SETTINGS
 
     def __init__(self, config: RoomsConfig | None = None) -> None:
         self.config = RoomsConfig() if config is None else config

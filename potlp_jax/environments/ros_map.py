@@ -25,12 +25,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int, Int32, PRNGKeyArray, Shaped
 from scipy import ndimage
 
-from potlp_jax.environments.base import host_generators
+from potlp_jax.environments.base import NO_SETTINGS, host_generators
 from potlp_jax.environments.map_server import GridFrame, MapError, MapWarning, OccupancyMap, load_map
 from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.places import Places, Point, component_labels, load_places, nearest_free, place_letters
@@ -121,6 +122,8 @@ class RosMap:
         image_map: the map as its server would publish it; ``image_map.frame`` converts metres to pixels.
         clean: the grid; ``clean.frame`` converts metres to cells of the worlds.
     """
+
+    settings: Mapping[str, Any] = NO_SETTINGS
 
     def __init__(self, config: RosMapConfig) -> None:
         """Reads and cleans the map, and places the propositions.

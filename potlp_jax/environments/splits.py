@@ -8,8 +8,9 @@ Rule of the project: parameters of an environment are chosen on CALIBRATION; tra
 TRAINING and VALIDATION; TEST is for the figures that are reported, and every run on it is logged. World ``N`` of the
 command line is index ``N`` of VALIDATION unless another split is named.
 
-Real floor plans are test data: no plan is ever trained, tuned or validated on, and ``world_key`` refuses every other
-split for them (``usable_splits``).
+Real buildings, from floor plans or from robots' maps, are test data: none is ever trained, tuned or validated on, and
+``world_key`` refuses every other split for them (``usable_splits``). Only ``map:`` worlds, whose places their owner
+chose, have all splits.
 
 The key of a world makes only the world. What a trial draws comes from the trial's own key.
 """
@@ -41,14 +42,17 @@ class Split(enum.StrEnum):
 FLOOR_PLAN_PREFIX = "floorplan:"
 """How the names of families of worlds on real floor plans begin."""
 
+PARCELS_PREFIX = "parcels:"
+"""How the names of families of worlds in the named rooms of real maps begin."""
+
 
 def usable_splits(family: str) -> tuple[Split, ...]:
     """The splits from which worlds of a family may be drawn."""
-    return (Split.TEST,) if family.startswith(FLOOR_PLAN_PREFIX) else tuple(Split)
+    return (Split.TEST,) if family.startswith((FLOOR_PLAN_PREFIX, PARCELS_PREFIX)) else tuple(Split)
 
 
 def default_split(family: str) -> Split:
-    """Where the command line draws worlds of a family from, unless told: VALIDATION, or TEST for floor plans."""
+    """Where the command line draws worlds of a family from, unless told: VALIDATION, or TEST for real buildings."""
     return Split.VALIDATION if Split.VALIDATION in usable_splits(family) else Split.TEST
 
 
@@ -56,8 +60,8 @@ def check_split(split: Split, family: str) -> None:
     """Raises WorldError where worlds of the family must not be drawn from the split."""
     if split not in usable_splits(family):
         raise WorldError(
-            f"{family}: real floor plans are test data, and {split} worlds cannot be drawn from them; "
-            f"use the split {Split.TEST}, and {Split.TRAINING} worlds of a generator (delivery)"
+            f"{family}: real buildings are test data, and {split} worlds cannot be drawn from them; "
+            f"use the split {Split.TEST}, and {Split.TRAINING} worlds of a generator (delivery, parcels)"
         )
 
 

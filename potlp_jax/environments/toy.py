@@ -7,11 +7,12 @@ door, so that both tasks can be satisfied in every world. What the configuration
 import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from potlp_jax.environments.base import host_generators
+from potlp_jax.environments.base import NO_SETTINGS, host_generators
 from potlp_jax.world.grid import World, WorldError, make_world
 
 Cell = tuple[int, int]
@@ -46,6 +47,7 @@ class Toy:
     name: str = "toy"
     propositions: tuple[str, ...] = ("goal", "hazard")
     tasks: Mapping[str, str] = MappingProxyType({"1": "F goal", "2": "!hazard U goal"})
+    settings: Mapping[str, Any] = NO_SETTINGS
 
     def __init__(self, config: ToyConfig | None = None) -> None:
         self.config = ToyConfig() if config is None else config

@@ -49,7 +49,8 @@ class NetworkEstimator:
     def __call__(self, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays) -> Estimates:
         """Estimates of every real (subgoal, class); padded pairs have P_S = 0. At least one look must be remembered.
 
-        The network counts in cells. Subgoals are asked one after the other, so that padded ones cost nothing.
+        The network counts in the unit of the worlds that it learned from, which is the belief's: cells or metres.
+        Subgoals are asked one after the other, so that padded ones cost nothing.
         """
         network = EstimatorNetwork(self.config)
         places = places_of_looks(self.views, look_of_subgoals(self.views, subgoals))
@@ -80,12 +81,12 @@ class NetworkEstimator:
         chances = exclusive_chances(jnp.where(task.class_mask[None, :], probability, 0.0), subgoals)
         return Estimates(
             success_probability=chances,
-            success_cost=success_cost * belief.resolution,
-            failure_cost=failure_cost * belief.resolution,
+            success_cost=success_cost,
+            failure_cost=failure_cost,
         )
 
     def distances(self, belief: BeliefMap, subgoals: Subgoals) -> Float32[Array, " S"]:
-        """From where each subgoal was seen to the subgoal through known space, letters ignored, in cells.
+        """From where each subgoal was seen to the subgoal through known space, letters ignored, in the belief's unit.
 
         0 where masked, or where known space does not lead there.
         """
@@ -118,10 +119,10 @@ def exclusive_chances(chances: Float32[Array, "S C"], subgoals: Subgoals) -> Flo
 
 
 def _distances(belief: BeliefMap, poses: Int32[Array, "S 2"], subgoals: Subgoals) -> Float32[Array, " S"]:
-    """From each pose to its subgoal through known space, letters ignored, in cells; 0 where masked."""
+    """From each pose to its subgoal through known space, letters ignored; 0 where masked."""
     open_cells = jnp.where(belief.free, 0, NO_STATE).astype(jnp.int32)[:, :, None]
     states = jnp.where(subgoals.mask, 0, NO_STATE).astype(jnp.int32)
-    fields = product_distances(open_cells, belief.free, poses, states, jnp.float32(1.0))
+    fields = product_distances(open_cells, belief.free, poses, states, belief.resolution)
     count = jnp.arange(poses.shape[0], dtype=jnp.int32)
     distance = fields[count, subgoals.cells[:, 0], subgoals.cells[:, 1], 0]
     return jnp.where(jnp.isfinite(distance), distance, 0.0)

@@ -29,8 +29,6 @@ from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.panorama import bearing
 from potlp_jax.world.sensing import SensorConfig, visible
 
-_FRONTIERS = FrontierConfig()
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ViewConfig:
@@ -43,6 +41,7 @@ class ViewConfig:
         tasks_per_world: drawn for the outcome classes.
         classes: outcome classes per view, at most; staying_sets: distinct sets of staying letters among them.
         image_format, quality: of the encoded images: ``jpeg`` or ``png``; quality is JPEG's.
+        frontiers: which components of the frontier are subgoals.
     """
 
     views_per_world: int = 12
@@ -52,6 +51,7 @@ class ViewConfig:
     staying_sets: int = 4
     image_format: str = "jpeg"
     quality: int = JPEG_QUALITY
+    frontiers: FrontierConfig = FrontierConfig()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,11 +74,13 @@ class Scene:
     in_view: Bool[Array, " S"]
 
 
-@jax.jit
-def survey(world: World, belief: BeliefMap, cell: Int32[Array, "2"]) -> Scene:
+@partial(jax.jit, static_argnames="frontiers")
+def survey(
+    world: World, belief: BeliefMap, cell: Int32[Array, "2"], frontiers: FrontierConfig = FrontierConfig()
+) -> Scene:
     """The subgoals of a belief by known-space distance, letters ignored. The camera sees without limit of range."""
     distances = grid_distances(belief.free, cell, belief.resolution)
-    subgoals = find_subgoals(belief, jnp.isfinite(distances), distances, _FRONTIERS)
+    subgoals = find_subgoals(belief, jnp.isfinite(distances), distances, frontiers)
     seen = visible(world.occupied, cell, SensorConfig(range_cells=float(sum(world.shape))))
     index = jnp.arange(subgoals.mask.shape[0], dtype=jnp.int32)[:, None, None]
     in_view = jnp.any((subgoals.component[None] == index) & seen[None], axis=(1, 2))
@@ -180,7 +182,7 @@ def record_views(
             return
         if pose.travelled < due:
             continue
-        scene = survey(world, pose.belief, jnp.asarray(pose.cell, jnp.int32))
+        scene = survey(world, pose.belief, jnp.asarray(pose.cell, jnp.int32), config.frontiers)
         if unexplored is not None:
             answered = jnp.asarray(settled(world, pose.belief, scene.subgoals, unexplored))
             scene = dataclasses.replace(scene, in_view=scene.in_view & answered)

@@ -1,6 +1,6 @@
 """What a store holds, paired: the same worlds for every policy."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 
 from potlp_jax.sweep.statistics import Comparison, TrialResult
 from potlp_jax.sweep.store import Row
@@ -21,9 +21,13 @@ def pair_rows(rows: Sequence[Row], policies: Sequence[str]) -> list[Pair]:
     ]
 
 
-def compare_pairs(pairs: Sequence[Pair], policies: Sequence[str]) -> Comparison:
-    """The paired comparison (docs/model.md, section 8)."""
-    return Comparison.from_results({policy: [_result(pair[policy]) for pair in pairs] for policy in policies})
+def compare_pairs(
+    pairs: Sequence[Pair], policies: Sequence[str], clusters: Sequence[Hashable] | None = None
+) -> Comparison:
+    """The paired comparison (docs/model.md, section 8). ``clusters`` names, for each pair, what it shares with others,
+    such as its building."""
+    results = {policy: [_result(pair[policy]) for pair in pairs] for policy in policies}
+    return Comparison.from_results(results, clusters=clusters)
 
 
 def _result(row: Row) -> TrialResult:

@@ -7,7 +7,7 @@
     split: validation              # optional, as are all below
     first_world: 0
     estimator: out/fit/estimator.npz
-    settings:                      # any field of potlp_jax.trial_config.TrialConfig
+    settings:                      # any field of TrialConfig; others are what the environment calls for
       replan_distance: 4
       decision: {search: {simulations: 300}}
 
@@ -30,7 +30,7 @@ from potlp_jax.environments import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
-from potlp_jax.trial_config import TrialConfig, trial_config_from_dict
+from potlp_jax.trial_config import TrialConfig, trial_config_from_dict, with_settings
 from potlp_jax.world.grid import WorldError
 
 
@@ -156,7 +156,7 @@ def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = 
         split=split,
         first_world=_number(data, "first_world", 0, where, default=0),
         estimator=None if estimator is None else folder / estimator,
-        config=_settings(TrialConfig, data.get("settings", {}), f"{where}: settings"),
+        config=_settings(_common_config(environments, where), data.get("settings", {}), f"{where}: settings"),
         seed=_number(data, "seed", 0, where, default=0),
     )
 
@@ -210,24 +210,39 @@ def _formula(environment: str, task: Any, where: str) -> str:
     return formula
 
 
-def _settings(kind: Any, data: Any, where: str) -> Any:
-    """A frozen configuration from a mapping of some of its fields; everything else keeps its default."""
+def _common_config(environments: Sequence[str], where: str) -> TrialConfig:
+    """What all environments call for."""
+    configs = {name: with_settings(TrialConfig(), make(name).settings) for name in environments}
+    first = configs[environments[0]]
+    for name, config in configs.items():
+        if config != first:
+            raise SpecificationError(
+                f"{where}: environments: trials in {environments[0]} and {name} need different settings, and a sweep "
+                "has one; make a sweep of each"
+            )
+    return first
+
+
+def _settings(config: Any, data: Any, where: str) -> Any:
+    """A frozen configuration with some of its fields changed."""
     if not isinstance(data, Mapping):
         raise SpecificationError(f"{where}: give a mapping, found {data!r}")
-    hints = typing.get_type_hints(kind)
+    hints = typing.get_type_hints(type(config))
     for name in data:
         if name not in hints:
             raise SpecificationError(f"{where}: unknown field {name!r}; known: {', '.join(hints)}")
-    values = {name: _setting(hints[name], value, f"{where}.{name}") for name, value in data.items()}
+    values = {
+        name: _setting(hints[name], getattr(config, name), value, f"{where}.{name}") for name, value in data.items()
+    }
     try:
-        return kind(**values)
+        return dataclasses.replace(config, **values)
     except ValueError as error:
         raise SpecificationError(f"{where}: {error}") from error
 
 
-def _setting(hint: Any, value: Any, where: str) -> Any:
+def _setting(hint: Any, current: Any, value: Any, where: str) -> Any:
     if dataclasses.is_dataclass(hint):
-        return _settings(hint, value, where)
+        return _settings(current, value, where)
     if isinstance(hint, type) and issubclass(hint, Enum):
         known = [entry.value for entry in hint]
         if value not in known:

@@ -8,11 +8,11 @@ import dataclasses
 import math
 import warnings
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from scipy.stats import DegenerateDataWarning, bootstrap
 
 from potlp_jax.types import Status
@@ -48,7 +48,8 @@ class PolicyRow:
 
     ``attainable_share`` is the share of the attainable savings, (Σ baseline − Σ ours) / (Σ baseline − Σ known map),
     with its bootstrap interval ``attainable_low`` .. ``attainable_high``; ``net_savings`` is 1 − Σ ours / Σ baseline;
-    ``trial_savings`` is the mean of 1 − ours / baseline, with the standard error of that mean.
+    ``trial_savings`` is the mean of 1 − ours / baseline, with the standard error of that mean. Interval and error take
+    clusters of trials to be independent, not the trials in them.
     """
 
     policy: str
@@ -87,13 +88,21 @@ class Comparison:
 
     @classmethod
     def from_results(
-        cls, results: Mapping[str, Sequence[TrialResult]], *, resamples: int = RESAMPLES, seed: int = 0
+        cls,
+        results: Mapping[str, Sequence[TrialResult]],
+        *,
+        clusters: Sequence[Hashable] | None = None,
+        resamples: int = RESAMPLES,
+        seed: int = 0,
     ) -> "Comparison":
         """Compare the policies that are the keys of ``results``; entry ``i`` of each is its trial in world ``i``.
+
+        ``clusters[i]`` names what world ``i`` shares with others, such as its building; None: every world is by itself.
 
         Raises ValueError where the baseline or the known map is missing, or the policies have unequally many trials.
         """
         _check(results)
+        cluster = _numbered(clusters, len(results[BASELINE]))
         costs = {policy: np.array([trial.cost for trial in trials], float) for policy, trials in results.items()}
         budgets = {policy: np.array([trial.budget for trial in trials], float) for policy, trials in results.items()}
         ended = {
@@ -105,8 +114,10 @@ class Comparison:
         charged = {policy: np.where(ended[policy], costs[policy], budgets[policy]) for policy in results}
         return cls(
             worlds=len(kept),
-            satisfied=_table({policy: values[kept] for policy, values in costs.items()}, len(kept), resamples, seed),
-            charged=_table(charged, len(kept), resamples, seed),
+            satisfied=_table(
+                {policy: values[kept] for policy, values in costs.items()}, cluster[kept], len(kept), resamples, seed
+            ),
+            charged=_table(charged, cluster, len(kept), resamples, seed),
             outcomes={policy: _count([trial.outcome for trial in trials]) for policy, trials in results.items()},
             losses={policy: _count_losses(trials) for policy, trials in results.items()},
         )
@@ -128,14 +139,22 @@ def attainable_interval(
     baseline: Float64[np.ndarray, " B"],
     known_map: Float64[np.ndarray, " B"],
     *,
+    clusters: Int64[np.ndarray, " B"] | None = None,
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> tuple[float, float]:
     """95 % paired bootstrap percentile interval of ``attainable_share``; NaNs where it is undefined.
 
+    ``clusters`` numbers what is resampled as a whole; None: each trial is.
+
     A resample that holds no attainable savings counts toward both tails: where more than a tail is made of such
     resamples there is no interval, rather than one that looks narrow because it ignores them.
     """
+    if clusters is not None:
+        # The share is a ratio of sums, so a cluster counts by the sums of its trials.
+        ours, baseline, known_map = (np.bincount(clusters, values) for values in (ours, baseline, known_map))
+        held = np.bincount(clusters) > 0
+        ours, baseline, known_map = ours[held], baseline[held], known_map[held]
     if len(ours) < 2:
         return math.nan, math.nan
     with warnings.catch_warnings():
@@ -167,19 +186,28 @@ def _share(ours: np.ndarray, baseline: np.ndarray, known_map: np.ndarray, axis: 
     return np.where(some, (baseline.sum(axis) - ours.sum(axis)) / np.where(some, attainable, 1.0), np.nan)
 
 
-def _table(costs: Mapping[str, np.ndarray], worlds: int, resamples: int, seed: int) -> Table:
+def _table(
+    costs: Mapping[str, np.ndarray], clusters: Int64[np.ndarray, " B"], worlds: int, resamples: int, seed: int
+) -> Table:
     pairs = len(costs[BASELINE])
     rows = tuple(
-        _row(policy, ours, costs[BASELINE], costs[KNOWN_MAP], resamples, seed) for policy, ours in costs.items()
+        _row(policy, ours, costs[BASELINE], costs[KNOWN_MAP], clusters, resamples, seed)
+        for policy, ours in costs.items()
     )
     return Table(pairs=pairs, dropped=worlds - pairs, rows=rows)
 
 
 def _row(
-    policy: str, ours: np.ndarray, baseline: np.ndarray, known_map: np.ndarray, resamples: int, seed: int
+    policy: str,
+    ours: np.ndarray,
+    baseline: np.ndarray,
+    known_map: np.ndarray,
+    clusters: Int64[np.ndarray, " B"],
+    resamples: int,
+    seed: int,
 ) -> PolicyRow:
     pairs = len(ours)
-    low, high = attainable_interval(ours, baseline, known_map, resamples=resamples, seed=seed)
+    low, high = attainable_interval(ours, baseline, known_map, clusters=clusters, resamples=resamples, seed=seed)
     # Where the baseline has nothing to walk, the task held at the start and nothing can be saved.
     savings = 1 - np.divide(ours, baseline, out=np.ones(pairs), where=baseline > 0)
     return PolicyRow(
@@ -189,9 +217,30 @@ def _row(
         attainable_high=high,
         net_savings=float(1 - ours.sum() / baseline.sum()) if baseline.sum() > 0 else math.nan,
         trial_savings=float(savings.mean()) if pairs else math.nan,
-        trial_savings_error=float(savings.std(ddof=1) / math.sqrt(pairs)) if pairs > 1 else math.nan,
+        trial_savings_error=_error_of_mean(savings, clusters),
         mean_cost=float(ours.mean()) if pairs else math.nan,
     )
+
+
+def _error_of_mean(values: Float64[np.ndarray, " B"], clusters: Int64[np.ndarray, " B"]) -> float:
+    """Standard error of the mean of values whose clusters are independent; NaN with fewer than two clusters.
+
+    With a cluster for each value this is the usual one (Liang and Zeger 1986, with the factor for few clusters).
+    """
+    count = len(np.unique(clusters))
+    if count < 2:
+        return math.nan
+    deviations = np.bincount(clusters, values - values.mean())
+    return float(math.sqrt(count / (count - 1) * np.sum(deviations**2)) / len(values))
+
+
+def _numbered(clusters: Sequence[Hashable] | None, count: int) -> Int64[np.ndarray, " B"]:
+    if clusters is None:
+        return np.arange(count)
+    if len(clusters) != count:
+        raise ValueError(f"{len(clusters)} clusters are named for {count} worlds; name one for each")
+    numbers = {name: number for number, name in enumerate(dict.fromkeys(clusters))}
+    return np.array([numbers[name] for name in clusters], np.int64)
 
 
 def _check(results: Mapping[str, Sequence[TrialResult]]) -> None:

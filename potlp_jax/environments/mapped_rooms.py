@@ -1,0 +1,166 @@
+"""Parcels to deliver in a real building: a ROS map whose rooms are known by name, to the simulator alone.
+
+The third experiment of Bradley et al. 2021 (section V-C), with a simulated robot: a document and a package are for two
+people in two rooms, drawn at random; those rooms are lit, others are dark. ``parcels:FILE.yaml`` takes the rooms from
+``FILE.rooms.yaml`` beside it, in map metres and in the form of ``environments.places``:
+
+    rooms:
+      "3.422": [{polygon: [[12.0, 3.5], [15.2, 3.5], [15.2, 8.0], [12.0, 8.0]]}]
+      "3.424": [{polygon: [[8.9, 3.5], [11.8, 3.5], [11.8, 8.0], [8.9, 8.0]]}]
+
+What belongs to no room is hallway: there the robot starts. Where rooms overlap, the first listed has the cells. Options
+follow after commas: ``parcels:FILE.yaml,rooms=OTHER.yaml,resolution=0.25,radius=0.1``.
+
+A map has no colours: walls and floors look like those of ``parcels``, the generator that the estimator learns from.
+"""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from potlp_jax.environments.academic import MANY_DOORS, NO_ROOM, PARCELS, Floor, FurnishConfig, Kind, Placement, furnish
+from potlp_jax.environments.delivery import DeliveryConfig
+from potlp_jax.environments.map_server import GridFrame, MapError, MapWarning, load_map
+from potlp_jax.environments.options import parse_options
+from potlp_jax.environments.places import Region, load_regions
+from potlp_jax.environments.ros_map import CleanMap, clean_map
+from potlp_jax.environments.splits import PARCELS_PREFIX
+from potlp_jax.world.grid import World
+from potlp_jax.world.panorama import CameraConfig
+
+PERSON_RADIUS = 0.5
+"""Metres around a person's cell, along rows and columns, on which the person is met."""
+
+LEAST_ROOM = 2.0
+"""Square metres that the robot must be able to reach of a room."""
+
+LEARNED_RESOLUTION = DeliveryConfig().resolution
+"""Metres a cell in the worlds of ``parcels``, whose camera this one equals."""
+
+REPLAN_DISTANCE = 2.0
+"""Metres between decisions, as there."""
+
+_HALLWAY = 0
+
+
+@dataclass(frozen=True)
+class MappedRoomsConfig:
+    """Which map, and how it becomes a grid.
+
+    Attributes:
+        file: the map's YAML.
+        rooms: YAML of its rooms; None: ``FILE.rooms.yaml`` beside the map.
+        resolution: size of a working cell in metres, not finer than the map's pixels.
+        radius: the robot's radius in metres, by which obstacles grow.
+    """
+
+    file: str | Path
+    rooms: str | Path | None = None
+    resolution: float = 0.2
+    radius: float = 0.1
+
+
+class MappedRooms:
+    """Worlds in one real building; they differ in who is where, the start, light and tints.
+
+    Attributes:
+        name: ``parcels:`` and the name of the map's file.
+        clean: the grid; ``clean.frame`` converts metres to cells.
+        floor: which room each cell belongs to.
+        rooms: names of the floor's rooms, by number, the hallways first.
+        left_out: rooms of the file of which too little can be reached.
+    """
+
+    propositions: tuple[str, ...] = PARCELS.propositions
+    tasks: Mapping[str, str] = PARCELS.tasks
+
+    def __init__(self, config: MappedRoomsConfig) -> None:
+        """Reads the map and its rooms.
+
+        Raises:
+            MapError: one of them cannot be used, or fewer than two rooms can be reached.
+
+        Warns:
+            MapWarning: rooms are left out, because the robot can reach less than ``LEAST_ROOM`` of them.
+        """
+        self.config = config
+        file = Path(config.rooms) if config.rooms is not None else Path(config.file).with_suffix(".rooms.yaml")
+        regions = load_regions(file, ("rooms",))["rooms"]
+        self.clean: CleanMap = clean_map(load_map(config.file), config.resolution, config.radius)
+        self.name = f"{PARCELS_PREFIX}{Path(config.file).stem}"
+        self.rooms, self.left_out, self.floor = _floor(regions, self.clean)
+        if len(self.rooms) < 3 or not np.any(self.floor.rooms == _HALLWAY):
+            raise MapError(
+                file,
+                "rooms",
+                f"two rooms and a hallway outside of them are needed; of {', '.join(regions)} the robot can reach "
+                f"{', '.join(self.rooms[1:]) or 'none'}",
+            )
+        if self.left_out:
+            warnings.warn(
+                f"{file}: the robot can reach less than {LEAST_ROOM:g} m2 of {', '.join(self.left_out)}; nobody will "
+                "be there",
+                MapWarning,
+                stacklevel=2,
+            )
+        reach = max(1, round(PERSON_RADIUS / config.resolution))
+        self._furnishing = FurnishConfig(person_radius=reach, coloured=False)
+
+    @classmethod
+    def from_spec(cls, spec: str) -> "MappedRooms":
+        """From ``parcels:FILE.yaml``, with options ``,rooms=...``, ``,resolution=...``, ``,radius=...``.
+
+        Raises:
+            MapError: the text is not of that form, or see the class.
+        """
+        usage = "write parcels:FILE.yaml[,rooms=FILE][,resolution=METRES][,radius=METRES]"
+        file, values = parse_options(spec, PARCELS_PREFIX, "map", ("rooms", "resolution", "radius"), usage)
+        try:
+            numbers = {name: float(values[name]) for name in ("resolution", "radius") if name in values}
+        except ValueError as error:
+            raise MapError(spec, "", f"{error}; {usage}") from error
+        return cls(MappedRoomsConfig(file, values.get("rooms"), **numbers))
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """Camera and replanning as in ``parcels``, in metres, and room for as many doors."""
+        scale, camera = LEARNED_RESOLUTION / self.config.resolution, CameraConfig()
+        lengths = {
+            name: getattr(camera, name) * scale for name in ("far", "eye_height", "wall_height", "texture_reach")
+        }
+        return {**MANY_DOORS, "camera": lengths, "replan_distance": REPLAN_DISTANCE / self.config.resolution}
+
+    def generate(self, key: PRNGKeyArray) -> World:
+        """The world of this key."""
+        return self.generate_with_layout(key)[0]
+
+    def generate_with_layout(self, key: PRNGKeyArray) -> tuple[World, Placement]:
+        """The world of this key, and who is where."""
+        return furnish(self.floor, key, PARCELS, self._furnishing, self.floor.rooms.shape)
+
+
+def _floor(
+    regions: Mapping[str, tuple[Region, ...]], clean: CleanMap
+) -> tuple[tuple[str, ...], tuple[str, ...], Floor]:
+    """Names of the rooms that can be used, the hallways first, of those that cannot, and the floor."""
+    numbers = np.where(clean.free, _HALLWAY, NO_ROOM).astype(np.int32)
+    used, left_out = ["hallway"], []
+    for name, parts in regions.items():
+        covered = np.any([part.covers(clean.free, clean.frame) for part in parts], axis=0) & (numbers == _HALLWAY)
+        if _area(covered.sum(), clean.frame) < LEAST_ROOM:
+            left_out.append(name)
+        else:
+            numbers[covered] = len(used)
+            used.append(name)
+    kinds = (Kind.HALLWAY,) + (Kind.OTHER,) * (len(used) - 1)
+    doors = np.zeros(numbers.shape, bool)
+    return tuple(used), tuple(left_out), Floor(numbers, doors, kinds, clean.frame.resolution)
+
+
+def _area(cells: int, frame: GridFrame) -> float:
+    return float(cells) * frame.resolution**2
