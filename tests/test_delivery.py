@@ -305,5 +305,5 @@ def test_impossible_furnishings_are_refused(floors):
 
 
 def test_floors_without_rooms_are_refused():
-    with pytest.raises(WorldError, match="had an office"):
+    with pytest.raises(WorldError, match="had the rooms that delivery needs"):
         Delivery(DeliveryConfig(smallest=(36, 48), largest=(40, 56), outdoors=1.0)).generate(_key(0))

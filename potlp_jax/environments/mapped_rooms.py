@@ -25,7 +25,7 @@ from jaxtyping import PRNGKeyArray
 
 from potlp_jax.environments.academic import MANY_DOORS, NO_ROOM, PARCELS, Floor, FurnishConfig, Kind, Placement, furnish
 from potlp_jax.environments.delivery import DeliveryConfig
-from potlp_jax.environments.map_server import GridFrame, MapError, MapWarning, load_map
+from potlp_jax.environments.map_server import MapError, MapWarning, load_map
 from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.places import Region, load_regions
 from potlp_jax.environments.ros_map import CleanMap, clean_map
@@ -152,7 +152,7 @@ def _floor(
     used, left_out = ["hallway"], []
     for name, parts in regions.items():
         covered = np.any([part.covers(clean.free, clean.frame) for part in parts], axis=0) & (numbers == _HALLWAY)
-        if _area(covered.sum(), clean.frame) < LEAST_ROOM:
+        if np.count_nonzero(covered) * clean.frame.resolution**2 < LEAST_ROOM:
             left_out.append(name)
         else:
             numbers[covered] = len(used)
@@ -160,7 +160,3 @@ def _floor(
     kinds = (Kind.HALLWAY,) + (Kind.OTHER,) * (len(used) - 1)
     doors = np.zeros(numbers.shape, bool)
     return tuple(used), tuple(left_out), Floor(numbers, doors, kinds, clean.frame.resolution)
-
-
-def _area(cells: int, frame: GridFrame) -> float:
-    return float(cells) * frame.resolution**2
