@@ -12,6 +12,9 @@ from itertools import pairwise
 import numpy as np
 
 from potlp_jax.records import NEVER_SEEN, Outcome, Trial
+from potlp_jax.sweep.rows import read_path
+from potlp_jax.sweep.statistics import SATISFIED
+from potlp_jax.sweep.store import Row
 from potlp_jax.task.task import Task
 from potlp_jax.world.grid import World
 from tests.reference.dijkstra import grid_moves
@@ -31,6 +34,20 @@ def _moves(trial: Trial) -> list[str]:
     if cost is None:
         return ["illegal move"]
     return [] if math.isclose(cost, trial.cost, rel_tol=1e-9, abs_tol=1e-9) else [f"cost {trial.cost}, moves {cost}"]
+
+
+def problems_of_row(row: Row, world: World, propositions: Sequence[str]) -> list[str]:
+    """What is wrong with a trial of a sweep: its moves, its cost, its word. A violation begins with 'violates'."""
+    path, problems = read_path(row.path), []
+    cost = path_cost(world, [(int(row), int(column)) for row, column in path])
+    if cost is None or abs(cost - row.cost) > 1e-6 * max(cost, 1.0):
+        problems.append(f"moves of {row.item}: they cost {cost}, the row says {row.cost}")
+    word = np.asarray(world.letters)[path[:, 0], path[:, 1]].tolist()
+    if word_satisfies(row.item.task, propositions, word) != (row.outcome == SATISFIED):
+        problems.append(f"outcome of {row.item}: {row.outcome} is not what the word says")
+    if len(word) > 1 and word_violates(row.item.task, propositions, word):
+        problems.append(f"violates: {row.item}")
+    return problems
 
 
 def path_cost(world: World, path: Sequence[tuple[int, int]]) -> float | None:

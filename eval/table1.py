@@ -15,30 +15,26 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections import defaultdict
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from eval.audit import path_cost
+from eval.savings import SWEEP_COMMAND, audit, figures, policy_row, write_specification
 from potlp_jax.environments import make
-from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.environments.splits import Split
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.results import compare_pairs, pair_rows
-from potlp_jax.sweep.rows import read_path, source_commit
+from potlp_jax.sweep.rows import source_commit
 from potlp_jax.sweep.runner import RESULTS
-from potlp_jax.sweep.statistics import SATISFIED, PolicyRow
+from potlp_jax.sweep.statistics import PolicyRow
 from potlp_jax.sweep.store import Row, Store
 from potlp_jax.trial import versions
 from potlp_jax.view.comparisons import scatter_costs
 from potlp_jax.view.style import new_figure, save_figure
-from potlp_jax.world.grid import World
-from tests.reference.ltl_semantics import word_satisfies, word_violates
 
 ENVIRONMENT = "firefighting"
 POLICIES = [policy.value for policy in Policy]
@@ -50,12 +46,9 @@ PAPER = {
 }
 """Averages of the paper's Table I: known map, baseline, share of the attainable savings, net and per-trial savings."""
 
-_POTLP = "from potlp_jax.cli import main; main()"
-
 
 def run(folder: Path, split: Split, worlds: int, first_world: int, processes: int) -> None:
     """Run the sweep to its end, with one kill on the way, and keep when it ran."""
-    folder.mkdir(parents=True, exist_ok=True)
     specification = {
         "environments": [ENVIRONMENT],
         "tasks": [int(task) for task in PAPER],
@@ -64,9 +57,8 @@ def run(folder: Path, split: Split, worlds: int, first_world: int, processes: in
         "split": split.value,
         "first_world": first_world,
     }
-    file = folder / "sweep.yaml"
-    file.write_text(json.dumps(specification))
-    command = [sys.executable, "-c", _POTLP, "sweep", str(file), "--out", str(folder), "--processes", str(processes)]
+    file = write_specification(folder, specification)
+    command = [*SWEEP_COMMAND, str(file), "--out", str(folder), "--processes", str(processes)]
     kill_at = len(PAPER) * len(POLICIES) * worlds // 3
     while _count(folder) < len(PAPER) * len(POLICIES) * worlds:
         _run_once(command, folder, kill_at if not _spans(folder) else None)
@@ -103,31 +95,6 @@ def _count(folder: Path) -> int:
     return count
 
 
-def audit(rows: Sequence[Row], split: Split) -> list[str]:
-    """What is wrong with any trial: its moves, its cost, its word. Violations among them begin with 'violates'."""
-    propositions = make(ENVIRONMENT).propositions
-    problems = []
-    for row in rows:
-        world = _world(split.value, row.item.world)
-        path = read_path(row.path)
-        where = f"{row.item}"
-        word = np.asarray(world.letters)[path[:, 0], path[:, 1]].tolist()
-        cost = path_cost(world, [(int(r), int(c)) for r, c in path])
-        if cost is None or abs(cost - row.cost) > 1e-6 * max(cost, 1.0):
-            problems.append(f"moves of {where}: they cost {cost}, the row says {row.cost}")
-        if word_satisfies(row.item.task, propositions, word) != (row.outcome == SATISFIED):
-            problems.append(f"outcome of {where}: {row.outcome} is not what the word says")
-        if len(word) > 1 and word_violates(row.item.task, propositions, word):
-            problems.append(f"violates: {where}")
-    return problems
-
-
-@lru_cache(maxsize=4)
-def _world(split: str, world: int) -> World:
-    generator = make(ENVIRONMENT)
-    return generator.generate(world_key(split, world, generator.name))
-
-
 def results(folder: Path) -> dict[str, Any]:
     """Table, audit and times of what is finished."""
     store = Store(folder / RESULTS)
@@ -141,8 +108,7 @@ def results(folder: Path) -> dict[str, Any]:
         pairs = pair_rows([row for row in rows if row.item.task == tasks[number]], POLICIES)
         comparison = compare_pairs(pairs, POLICIES)
         tables[number] = {"task": tasks[number], "paper": PAPER[number], **comparison.to_dict()}
-    rows.sort(key=lambda row: row.item.world)
-    problems = audit(rows, split)
+    problems = audit(rows, make(ENVIRONMENT), split)
     return {
         "specification": specification,
         "estimator": facts["estimator"],
@@ -179,10 +145,8 @@ def markdown(found: dict[str, Any]) -> str:
     lines.append("|---|---|---|---|---|---|---|")
     for number, table in found["tables"].items():
         for entry in table["satisfied"]["rows"]:
-            known: dict[str, Any] = {name: np.nan if value is None else value for name, value in entry.items()}
-            row = PolicyRow(**known)
-            figures = f"{row.mean_cost:.1f} | {_figures(row)} | {_paper(number, row)}"
-            lines.append(f"| {number} | {row.policy} | {figures} |")
+            row = policy_row(entry)
+            lines.append(f"| {number} | {row.policy} | {row.mean_cost:.1f} | {figures(row)} | {_paper(number, row)} |")
     spans = ", ".join(
         f"{span['rows']} rows in {span['seconds'] / 60:.1f} min{' (killed)' if span['killed'] else ''}"
         for span in found["spans"]
@@ -197,16 +161,6 @@ def markdown(found: dict[str, Any]) -> str:
             f"| {policy} | {times['trials']} | {times['seconds_per_trial']:.2f} | {times['decisions_per_trial']:.1f} |"
         )
     return "\n".join(lines)
-
-
-def _figures(row: PolicyRow) -> str:
-    if row.policy == Policy.BASELINE:
-        return "| |"
-    share = f"{100 * row.attainable_share:.1f} % ({100 * row.attainable_low:.0f} to {100 * row.attainable_high:.0f})"
-    return (
-        f"{share} | {100 * row.net_savings:.1f} % | "
-        f"{100 * row.trial_savings:.1f} ± {100 * row.trial_savings_error:.1f} %"
-    )
 
 
 def _paper(number: str, row: PolicyRow) -> str:

@@ -25,7 +25,12 @@ HELD_OUT: Mapping[str, tuple[str, ...]] = MappingProxyType(
             "!fire U (alarm | extinguisher)",
             "(!fire U extinguisher) & (!fire U exit)",
             "(!exit U (alarm | extinguisher)) & F exit",
-        )
+        ),
+        "delivery": (
+            "F grad & F (professor & F undergrad)",
+            "!undergrad U professor",
+            "F (professor | grad)",
+        ),
     }
 )
 """Formulas by family whose languages no training task equals: for asking whether the estimator generalises."""

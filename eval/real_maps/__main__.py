@@ -1,0 +1,184 @@
+"""Parcels delivered by a simulated robot on real maps, after the real-world experiment (Bradley et al. 2021, V-C).
+
+    python -m eval.real_maps --out out/real-maps --maps MAPS
+    python -m eval.real_maps --out out/real-maps --maps MAPS --worlds 5
+
+``MAPS`` is a folder with the maps ``uma_rooms``, ``gdc_3ne``, ``gdc_floor2`` and ``intel_lab``; the rooms of the first
+and last are drawn by hand (the YAML files beside this one), those of the others come from the labels in MAPS/labels.
+A document and a package are in two rooms, which are lit; the camera has noise, and another exposure and colour balance
+in every picture. The paper ran 5 trials per planner: the first 5 of each task and map are set apart. The network
+learned on generated floors only. ``--report`` writes NAME.json, and NAME.png: the first world in which the nearest room
+is dark, as the baseline and as PO-TLP solve it.
+"""
+
+import argparse
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from eval.contact_sheet import draw_plan
+from eval.real_maps.gdc import LABELS, rooms_from_labels
+from eval.savings import TABLE_HEAD, audit, compare_first, read_rows, sweep, table_lines
+from potlp_jax.environments.academic import PARCELS
+from potlp_jax.environments.mapped_rooms import MappedRooms
+from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.planning.policies import Policy
+from potlp_jax.planning.product import grid_distances
+from potlp_jax.sweep.results import Pair, pair_rows
+from potlp_jax.sweep.rows import read_path, source_commit
+from potlp_jax.trial import versions
+from potlp_jax.view.maps import draw_ends
+from potlp_jax.view.style import ROBOT, new_figure, save_figure
+
+MAPS = ("uma_rooms", "gdc_3ne", "gdc_floor2", "intel_lab")
+POLICIES = [Policy.KNOWN_MAP.value, Policy.BASELINE.value, Policy.ORACLE.value, Policy.POTLP.value]
+FIRST = 5
+CAMERA = {"noise": 6.0, "exposure": 0.15, "colour": 0.05}
+"""Disturbances of every picture (``world.panorama.Disturbance``)."""
+
+
+def environment_of(maps: Path, name: str, out: Path) -> str:
+    """The environment of a map; its rooms file is written into ``out`` where it is made from labels."""
+    rooms = Path(__file__).with_name(f"{name}.rooms.yaml")
+    if name in LABELS:
+        rooms = out / f"{name}.rooms.yaml"
+        rooms.write_text(json.dumps(rooms_from_labels(maps, name)))
+    return f"parcels:{maps / name}.yaml,rooms={rooms}"
+
+
+def specification(environment: str, worlds: int) -> dict[str, Any]:
+    """A sweep over test worlds of one map."""
+    return {
+        "environments": [environment],
+        "tasks": [int(task) for task in PARCELS.tasks],
+        "policies": POLICIES,
+        "worlds": worlds,
+        "split": Split.TEST.value,
+        "settings": {"disturbance": CAMERA},
+    }
+
+
+def first_room(generator: MappedRooms, path: np.ndarray) -> int:
+    """Number of the room that a path enters first; 0 (the hallways) where it enters none."""
+    rooms = generator.floor.rooms[path[:, 0], path[:, 1]]
+    return int(rooms[np.argmax(rooms > 0)])
+
+
+def nearest_room(generator: MappedRooms, world: Any) -> int:
+    """Number of the room whose entrance is nearest to the start."""
+    distance = np.asarray(grid_distances(~world.occupied, world.start, world.resolution))
+    inside = generator.floor.rooms > 0
+    return int(generator.floor.rooms[inside][np.argmin(distance[inside])])
+
+
+def contrast(generator: MappedRooms, pairs: list[Pair]) -> dict[str, Any]:
+    """How often each planner enters first the nearest room, and a lit one, in worlds whose nearest room is dark."""
+    found = {policy: {"nearest": 0, "lit": 0} for policy in POLICIES}
+    dark, example = 0, None
+    for pair in pairs:
+        number = pair[Policy.BASELINE].item.world
+        world, placement = generator.generate_with_layout(world_key(Split.TEST, number, generator.name))
+        nearest, lit = nearest_room(generator, world), set(placement.rooms.values())
+        if nearest in lit:
+            continue
+        dark += 1
+        for policy in POLICIES:
+            entered = first_room(generator, read_path(pair[policy].path))
+            found[policy]["nearest"] += entered == nearest
+            found[policy]["lit"] += entered in lit
+        entered = {policy: first_room(generator, read_path(pair[policy].path)) for policy in POLICIES}
+        if example is None and entered[Policy.BASELINE] == nearest and entered[Policy.POTLP] in lit:
+            example = number
+    return {"worlds": dark, "first_entered": found, "example": example}
+
+
+def draw_contrast(generator: MappedRooms, pair: Pair, file: Path) -> None:
+    """The paths of the baseline and of PO-TLP in one world; lit rooms are bright."""
+    number = pair[Policy.BASELINE].item.world
+    world = generator.generate(world_key(Split.TEST, number, generator.name))
+    figure = new_figure(11.0, 6.0)
+    for place, policy in enumerate((Policy.BASELINE, Policy.POTLP)):
+        axes = figure.add_subplot(1, 2, place + 1)
+        path = [(int(row), int(column)) for row, column in read_path(pair[policy].path)]
+        draw_plan(axes, world, generator.propositions, path[0])
+        axes.plot(*np.array(path, float).T[::-1], color=ROBOT, lw=1.5)
+        draw_ends(axes, path)
+        axes.set_title(f"{policy}: {pair[policy].cost:.1f} m", fontsize=10)
+    save_figure(figure, file)
+
+
+def results_of(generator: MappedRooms, folder: Path, worlds: int) -> dict[str, Any]:
+    """Tables of one map, the audit, and the contrast."""
+    rows = read_rows(folder)
+    problems = audit(rows, generator, Split.TEST)
+    pairs = pair_rows([row for row in rows if row.item.task == PARCELS.tasks["1"]], POLICIES)
+    return {
+        "rooms": len(generator.rooms) - 1,
+        "cells": generator.floor.rooms.shape,
+        "tables": [
+            compare_first(rows, formula, POLICIES, count, lambda world: world)
+            for formula in PARCELS.tasks.values()
+            for count in sorted({min(FIRST, worlds), worlds})
+        ],
+        "contrast": contrast(generator, pairs),
+        "audited": len(rows),
+        "problems": problems,
+        "commits": sorted({row.commit for row in rows}),
+    }
+
+
+def markdown(results: Mapping[str, Any]) -> str:
+    """The tables as they stand in docs/results."""
+    lines = []
+    for name, found in results["maps"].items():
+        lines += ["", f"### {name}: {found['rooms']} rooms, {found['cells'][0]} × {found['cells'][1]} cells", ""]
+        lines.append(TABLE_HEAD)
+        for table in found["tables"]:
+            lines += table_lines(table, POLICIES)
+        dark = found["contrast"]
+        entered = "; ".join(
+            f"{policy} {counts['nearest']} and {counts['lit']}" for policy, counts in dark["first_entered"].items()
+        )
+        lines += [
+            "",
+            f"{found['audited']} trials audited: {len(found['problems'])} problems. In {dark['worlds']} worlds the "
+            f"nearest room is dark; it, and a lit room, was entered first by: {entered}.",
+        ]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder of the sweeps")
+    parser.add_argument("--maps", type=Path, required=True, help="folder of the maps")
+    parser.add_argument("--worlds", type=int, default=50, help="per map and task")
+    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--report", type=Path, help="without suffix: where results and picture go")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    jax.config.update("jax_platforms", "cpu")
+    found, example = {}, None
+    for name in MAPS:
+        environment = environment_of(options.maps, name, options.out)
+        sweep(options.out / name, specification(environment, options.worlds), options.processes)
+        generator = MappedRooms.from_spec(environment)
+        found[name] = results_of(generator, options.out / name, options.worlds)
+        if example is None and found[name]["contrast"]["example"] is not None:
+            rows = [row for row in read_rows(options.out / name) if row.item.task == PARCELS.tasks["1"]]
+            wanted = found[name]["contrast"]["example"]
+            example = generator, next(p for p in pair_rows(rows, POLICIES) if p[Policy.BASELINE].item.world == wanted)
+    results = {"maps": found, "camera": CAMERA, "versions": versions(), "reported_at": source_commit()}
+    print(markdown(results))
+    if options.report is not None:
+        options.report.with_suffix(".json").write_text(json.dumps(results, indent=1) + "\n")
+        if example is not None:
+            draw_contrast(*example, options.report.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()

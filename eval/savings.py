@@ -1,0 +1,101 @@
+"""What experiments on savings share: a sweep by its command, its tables clustered by building, its audit."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eval.audit import problems_of_row
+from potlp_jax.environments.base import Generator
+from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.planning.policies import Policy
+from potlp_jax.sweep.results import compare_pairs, pair_rows
+from potlp_jax.sweep.runner import RESULTS
+from potlp_jax.sweep.statistics import PolicyRow
+from potlp_jax.sweep.store import Row, Store
+
+SWEEP_COMMAND = (sys.executable, "-c", "from potlp_jax.cli import main; main()", "sweep")
+"""``potlp sweep``, by the interpreter that runs."""
+
+TABLE_HEAD = (
+    "| task | policy | worlds | mean cost | share of attainable savings (95 %) | net | per trial (± SE) |\n"
+    "|---|---|---|---|---|---|---|"
+)
+
+
+def write_specification(folder: Path, specification: Mapping[str, Any]) -> Path:
+    """A sweep's file in its folder; JSON is YAML."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "sweep.yaml"
+    file.write_text(json.dumps(specification))
+    return file
+
+
+def sweep(folder: Path, specification: Mapping[str, Any], processes: int) -> None:
+    """Run what is missing of a sweep. Raises SystemExit where the command fails."""
+    file = write_specification(folder, specification)
+    command = [*SWEEP_COMMAND, str(file), "--out", str(folder), "--processes", str(processes)]
+    if subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode:
+        raise SystemExit(f"the sweep of {folder} failed; what is finished is kept there")
+
+
+def read_rows(folder: Path) -> list[Row]:
+    """All rows of a sweep."""
+    store = Store(folder / RESULTS)
+    rows = store.rows()
+    store.close()
+    return rows
+
+
+def compare_first(
+    rows: Sequence[Row], task: str, policies: Sequence[str], worlds: int, building: Callable[[int], Hashable]
+) -> dict[str, Any]:
+    """The comparison of the first worlds of a task, clustered by ``building(world)``; ``buildings`` counts them."""
+    pairs = pair_rows([row for row in rows if row.item.task == task], policies)[:worlds]
+    buildings = [building(pair[Policy.BASELINE].item.world) for pair in pairs]
+    comparison = compare_pairs(pairs, policies, buildings)
+    return {"task": task, "buildings": len(set(buildings)), **comparison.to_dict()}
+
+
+def audit(rows: Sequence[Row], generator: Generator, split: Split) -> list[str]:
+    """What is wrong with any trial. Violations of the task among it begin with 'violates'."""
+    problems, number, world = [], None, None
+    for row in sorted(rows, key=lambda row: row.item.world):
+        if row.item.world != number:
+            number = row.item.world
+            world = generator.generate(world_key(split, number, generator.name))
+        assert world is not None
+        problems += problems_of_row(row, world, generator.propositions)
+    return problems
+
+
+def table_lines(table: Mapping[str, Any], policies: Sequence[str]) -> list[str]:
+    """Rows of a Markdown table below ``TABLE_HEAD``."""
+    found = {entry["policy"]: entry for entry in table["satisfied"]["rows"]}
+    lines = []
+    for policy in policies:
+        row = policy_row(found[policy])
+        worlds = f"{table['satisfied']['pairs']} in {table['buildings']} buildings"
+        lines.append(f"| `{table['task']}` | {policy} | {worlds} | {row.mean_cost:.1f} | {figures(row)} |")
+    return lines
+
+
+def policy_row(entry: Mapping[str, Any]) -> PolicyRow:
+    """A row as ``Comparison.to_dict`` wrote it."""
+    known: dict[str, Any] = {name: np.nan if value is None else value for name, value in entry.items()}
+    return PolicyRow(**known)
+
+
+def figures(row: PolicyRow) -> str:
+    """Share, net and per-trial savings, as cells of a table; the baseline has none."""
+    if row.policy == Policy.BASELINE:
+        return "| |"
+    share = f"{100 * row.attainable_share:.1f} % ({100 * row.attainable_low:.0f} to {100 * row.attainable_high:.0f})"
+    return (
+        f"{share} | {100 * row.net_savings:.1f} % | "
+        f"{100 * row.trial_savings:.1f} ± {100 * row.trial_savings_error:.1f} %"
+    )
