@@ -212,7 +212,7 @@ def letter_name(letter: int, propositions: Sequence[str]) -> str:
 
 def describe_outcome(trial: Trial) -> str:
     """Environment, policy, cost and how the trial ended, in one line; of a path only the name is left."""
-    environment = re.sub(r"^(map|floorplan):(?:[^,]*/)?([^/,]+)/?(,.*)?(/\w+)$", r"\1:\2\4", trial.environment)
+    environment = re.sub(r"^(map|floorplan|parcels):(?:[^,]*/)?([^/,]+)/?(,.*)?(/\w+)$", r"\1:\2\4", trial.environment)
     seed = "" if trial.seed is None else f", seed {trial.seed}"
     return f"{environment}{seed}  ·  policy {trial.policy}  ·  cost {trial.cost:.1f}  ·  {trial.outcome.value}"
 
