@@ -95,7 +95,7 @@ def test_max_positive_literals_reaches_the_task():
         (("task", "F b", "--propositions", "a"), "unknown proposition"),
         (("task", "missing.hoa"), "missing.hoa"),
         (("task", "F a", "--svg", "picture.docx"), "docx"),
-        (("run", "castle"), "toy, firefighting, delivery, rooms, map:FILE.yaml, floorplan:FILE.xml"),
+        (("run", "castle"), "toy, firefighting, delivery, parcels, rooms, map:FILE.yaml, parcels:FILE.yaml, floorplan:FILE.xml"),
         (("run", "map:missing.yaml"), "missing.yaml"),
         (("run", "floorplan:missing.xml"), "missing.xml: cannot be read"),
         (("run", "floorplan:"), "names no plan"),
@@ -263,7 +263,7 @@ def test_task_that_is_never_possible_fails(monkeypatch):
 
 
 def test_unknown_environment_lists_the_known_ones():
-    with pytest.raises(WorldError, match="toy, firefighting, delivery, rooms"):
+    with pytest.raises(WorldError, match="toy, firefighting, delivery, parcels, rooms"):
         make("castle")
 
 
