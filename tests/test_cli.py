@@ -95,7 +95,7 @@ def test_max_positive_literals_reaches_the_task():
         (("task", "F b", "--propositions", "a"), "unknown proposition"),
         (("task", "missing.hoa"), "missing.hoa"),
         (("task", "F a", "--svg", "picture.docx"), "docx"),
-        (("run", "castle"), "toy, firefighting, delivery, parcels, rooms, map:FILE.yaml, parcels:FILE.yaml, floorplan:FILE.xml"),
+        (("run", "castle"), ", ".join(FAMILIES)),
         (("run", "map:missing.yaml"), "missing.yaml"),
         (("run", "floorplan:missing.xml"), "missing.xml: cannot be read"),
         (("run", "floorplan:"), "names no plan"),
