@@ -18,7 +18,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from eval.contact_sheet import draw_plan
@@ -161,7 +160,6 @@ def main() -> None:
     parser.add_argument("--report", type=Path, help="without suffix: where results and picture go")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    jax.config.update("jax_platforms", "cpu")
     found, example = {}, None
     for name in MAPS:
         environment = environment_of(options.maps, name, options.out)
