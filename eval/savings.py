@@ -76,11 +76,11 @@ def audit(rows: Sequence[Row], generator: Generator, split: Split) -> list[str]:
 def table_lines(table: Mapping[str, Any], policies: Sequence[str]) -> list[str]:
     """Rows of a Markdown table below ``TABLE_HEAD``."""
     found = {entry["policy"]: entry for entry in table["satisfied"]["rows"]}
-    lines = []
+    task, lines = table["task"].replace("|", "\\|"), []
     for policy in policies:
         row = policy_row(found[policy])
         worlds = f"{table['satisfied']['pairs']} in {table['buildings']} buildings"
-        lines.append(f"| `{table['task']}` | {policy} | {worlds} | {row.mean_cost:.1f} | {figures(row)} |")
+        lines.append(f"| `{task}` | {policy} | {worlds} | {row.mean_cost:.1f} | {figures(row)} |")
     return lines
 
 

@@ -1,6 +1,7 @@
 """The names and signatures that code outside of this repository relies on."""
 
 import inspect
+import pickle
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 import potlp_jax
+from potlp_jax.environments import FAMILIES, make
 
 
 def _parameters(function):
@@ -63,3 +65,10 @@ def test_a_problem_is_made_from_arrays_and_planned_inside_jit():
     assert float(result.value) == pytest.approx(3 + 0.9 * 2 + 0.1 * failed, rel=1e-5)
     assert np.isinf(np.asarray(result.q_values)[-1])
     assert int(result.status) == 0
+
+
+@pytest.mark.parametrize("name", [name for name in FAMILIES if ":" not in name])
+def test_generators_go_to_other_processes(name):
+    generator = make(name)
+    copy = pickle.loads(pickle.dumps(generator))
+    assert (copy.name, copy.propositions, copy.tasks) == (generator.name, generator.propositions, generator.tasks)

@@ -45,7 +45,7 @@ class Kind(enum.IntEnum):
 
 @dataclasses.dataclass(frozen=True)
 class Errand:
-    """What there is to do on a floor.
+    """What there is to do on a floor. Plain values, because generators go to other processes.
 
     Attributes:
         rooms: the kinds of room in which each proposition may hold, in the order of the letters' bits. No two hold in
@@ -63,16 +63,16 @@ class Errand:
 
 
 PEOPLE: Errand = Errand(
-    rooms=MappingProxyType({"professor": (Kind.OFFICE,), "grad": (Kind.LAB,), "undergrad": (Kind.CLASSROOM,)}),
-    tasks=MappingProxyType({"1": "F professor & F grad & F undergrad"}),
+    rooms={"professor": (Kind.OFFICE,), "grad": (Kind.LAB,), "undergrad": (Kind.CLASSROOM,)},
+    tasks={"1": "F professor & F grad & F undergrad"},
 )
 """Bradley et al. 2021, section V-B."""
 
 _ANY_ROOM = (Kind.OTHER, Kind.OFFICE, Kind.LAB, Kind.CLASSROOM)
 
 PARCELS: Errand = Errand(
-    rooms=MappingProxyType({"document": _ANY_ROOM, "package": _ANY_ROOM}),
-    tasks=MappingProxyType({"1": "F document & F package", "2": "F (document & F package)"}),
+    rooms={"document": _ANY_ROOM, "package": _ANY_ROOM},
+    tasks={"1": "F document & F package", "2": "F (document & F package)"},
 )
 """Bradley et al. 2021, section V-C: a document and a package for two people, in any order or the document first."""
 
