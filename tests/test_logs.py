@@ -21,12 +21,13 @@ from potlp_jax.learning.sampling import Pose, Recorder, ViewConfig, record_views
 from potlp_jax.learning.weights import WeightBounds
 from potlp_jax.logs import writing
 from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
-from potlp_jax.logs.drive import Eyes, GridConfig
+from potlp_jax.logs.drive import Eyes
 from potlp_jax.logs.errors import LogError
 from potlp_jax.logs.inspection import inspect
 from potlp_jax.logs.log import Log, LogConfig
 from potlp_jax.logs.replaying import LoggedRobot, from_first_picture, replay
 from potlp_jax.logs.transforms import Transforms, headings, quaternion_of
+from potlp_jax.logs.working_grid import GridConfig
 from potlp_jax.logs.writing import BagFormat
 from potlp_jax.planning.paths import KnownPath
 from potlp_jax.planning.policies import Policy

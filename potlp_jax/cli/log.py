@@ -20,10 +20,11 @@ from potlp_jax.cli.run import RECORD
 from potlp_jax.cli.view import PAGE
 from potlp_jax.environments.places import load_places
 from potlp_jax.learning.estimator import TrainedEstimator, shipped_estimator
-from potlp_jax.logs.drive import Drive, GridConfig, read_drive
+from potlp_jax.logs.drive import Drive, read_drive
 from potlp_jax.logs.inspection import inspect
 from potlp_jax.logs.log import Log, LogConfig
 from potlp_jax.logs.replaying import replay
+from potlp_jax.logs.working_grid import GridConfig
 from potlp_jax.logs.writing import BagFormat, write_trial
 from potlp_jax.planning.policies import Policy
 from potlp_jax.records import load_trial

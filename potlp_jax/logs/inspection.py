@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from potlp_jax.logs.drive import vertical_field
 from potlp_jax.logs.errors import LogError
 from potlp_jax.logs.log import (
     IMAGE_TYPE,
@@ -16,6 +15,7 @@ from potlp_jax.logs.log import (
     TRANSFORM_TYPES,
     Log,
 )
+from potlp_jax.logs.pictures import vertical_field
 
 GAP_FACTOR, GAP_SECONDS = 5.0, 2.0
 """A pause is a gap if it is so many times the topic's usual interval, and so long."""

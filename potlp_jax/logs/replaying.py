@@ -9,8 +9,9 @@ from jaxtyping import Array, Int32, PRNGKeyArray, UInt8
 
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for
 from potlp_jax.learning.labels import TrueMapEstimator
-from potlp_jax.logs.drive import Cell, Drive, Eyes
+from potlp_jax.logs.drive import Drive, Eyes
 from potlp_jax.logs.errors import LogError
+from potlp_jax.logs.poses import Cell
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.paths import KnownPath
 from potlp_jax.planning.policies import Policy

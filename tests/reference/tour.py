@@ -9,8 +9,9 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from potlp_jax.environments.places import load_places
 from potlp_jax.environments.toy import Toy, ToyConfig
 from potlp_jax.logs import writing
-from potlp_jax.logs.drive import GridConfig, read_drive
+from potlp_jax.logs.drive import read_drive
 from potlp_jax.logs.log import SECOND, Log, LogConfig, typestore
+from potlp_jax.logs.working_grid import GridConfig
 from potlp_jax.logs.writing import BagFormat, labels_text, write_drive
 from potlp_jax.records import NEVER_SEEN
 from potlp_jax.robot import photograph

@@ -1,0 +1,86 @@
+"""Which picture of a log belongs to which cell of the robot's path, and where it looks."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from potlp_jax.environments.map_server import GridFrame
+from potlp_jax.logs.errors import LogError
+from potlp_jax.logs.log import SECOND, Log, Picture
+from potlp_jax.logs.poses import Cell, Poses
+from potlp_jax.logs.transforms import headings
+
+_OPTICAL = ("_optical", "_optical_frame")
+
+
+def vertical_field(width: int, height: int, log: Log) -> float:
+    """Angle from the lower to the upper edge of a picture, in radians.
+
+    Raises:
+        LogError: with square pixels it were more than a half circle.
+    """
+    if log.config.vertical_field is not None:
+        return math.radians(log.config.vertical_field)
+    field = 2 * math.pi * height / width
+    if field > math.pi * (1 + 1e-9):
+        raise LogError(
+            f"{log.path}: {log.image_topic}: a picture of {width} x {height} pixels is not equirectangular with square "
+            "pixels, for it would reach over more than a half circle: give the angle from its lower to its upper edge, "
+            "--vertical-field DEGREES"
+        )
+    return min(field, math.pi)
+
+
+def match_pictures(
+    log: Log, poses: Poses, path: list[Cell], times: Int64[np.ndarray, "N"], frame: GridFrame, notes: list[str]
+) -> tuple[dict[int, Picture], dict[int, float]]:
+    """The picture taken nearest to the middle of each cell of the path, and where its middle looks."""
+    taken = [picture for picture in log.pictures if times[0] <= picture.time <= poses.times[-1]]
+    if not taken:
+        notes.append("no picture: policies that look, and datasets, need a topic of type sensor_msgs/CompressedImage")
+        return {}, {}
+    moments = np.array([picture.time for picture in taken])
+    gap = int(log.config.longest_gap * SECOND)
+    after = np.clip(np.searchsorted(poses.times, moments), 1, max(len(poses.times) - 1, 1))
+    around = np.stack([poses.times[after - 1], poses.times[np.minimum(after, len(poses.times) - 1)]])
+    is_near = np.min(np.abs(around - moments), axis=0) <= gap
+    if not is_near.all():
+        notes.append(f"{log.image_topic}: {np.sum(~is_near)} of {len(taken)} pictures are passed over: no pose is near")
+    assert log.map_frame is not None
+    assert log.base_frame is not None
+    base = log.transforms.poses(log.map_frame, log.base_frame, moments)
+    looks = _headings(log, taken, moments, base, notes)
+    steps = np.searchsorted(times, moments, side="right") - 1
+    pictures: dict[int, Picture] = {}
+    bearings: dict[int, float] = {}
+    nearest: dict[int, float] = {}
+    for index in np.flatnonzero(is_near):
+        step = int(steps[index])
+        distance = math.dist(frame.cell_to_metres(*path[step]), base[index, :2, 3])
+        if distance < nearest.get(step, math.inf):
+            nearest[step], pictures[step] = distance, taken[index]
+            # Headings grow counter-clockwise with y upward, bearings clockwise with rows downward.
+            bearings[step] = -(float(looks[index]) - frame.yaw)
+    return pictures, bearings
+
+
+def _headings(
+    log: Log,
+    pictures: list[Picture],
+    times: Int64[np.ndarray, "N"],
+    base: Float64[np.ndarray, "N 4 4"],
+    notes: list[str],
+) -> Float64[np.ndarray, "N"]:
+    """Where the middle of each picture looks, in the frame of the map."""
+    camera = pictures[0].frame_id
+    assert log.map_frame is not None
+    if log.config.camera_yaw is not None:
+        return headings(base, optical=False) + math.radians(log.config.camera_yaw)
+    if camera and log.transforms.chain(log.map_frame, camera) is not None:
+        return headings(log.transforms.poses(log.map_frame, camera, times), camera.endswith(_OPTICAL))
+    notes.append(
+        f"{log.image_topic}: no transform says where the camera {camera!r} looks: the middle of its pictures is taken "
+        "to look ahead; give --camera-yaw DEGREES otherwise"
+    )
+    return headings(base, optical=False)

@@ -1,0 +1,133 @@
+"""Where a robot was, by its log, and the cells that it entered."""
+
+import heapq
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from scipy import ndimage
+
+from potlp_jax.environments.places import component_labels
+from potlp_jax.logs.errors import LogError
+from potlp_jax.logs.log import SECOND, Log
+from potlp_jax.logs.working_grid import WorkingGrid
+
+Cell = tuple[int, int]
+
+FARTHEST_SNAP = 2.0
+"""Cells, beyond the robot's radius, from the nearest free cell at which a pose still counts as being in it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Where the robot was, in metres in the frame of the map."""
+
+    times: Int64[np.ndarray, "N"]
+    points: Float64[np.ndarray, "N 2"]
+
+
+def read_poses(log: Log, notes: list[str]) -> Poses:
+    """The poses of the robot in the frame of the map; gaps in time are noted.
+
+    Raises:
+        LogError: nothing says where the robot's frame lies in that of the map, at any time.
+    """
+    base, frame = log.base_frame, log.map_frame
+    assert frame is not None
+    known = ", ".join(sorted(log.transforms.frames)) or "none"
+    if base is None:
+        raise LogError(
+            f"{log.path}: has no pose: record /tf and /tf_static, or nav_msgs/Odometry in the frame of the map, or "
+            f"name the robot's frame with --base-frame; its frames: {known}"
+        )
+    if log.transforms.chain(frame, base) is None:
+        raise LogError(
+            f"{log.path}: nothing says where {base!r} lies in {frame!r}, the frame of {log.map_topic}: record /tf, in "
+            f"which localisation or mapping publishes {frame} -> odom; its frames: {known}"
+        )
+    times = log.transforms.times(frame, base)
+    if not len(times):
+        raise LogError(f"{log.path}: {base!r} never moves in {frame!r}: its transforms are all static; record /tf")
+    gaps = np.diff(times) / SECOND
+    long = gaps[gaps > log.config.longest_gap]
+    if len(long):
+        notes.append(
+            f"pose: {len(long)} gaps of more than {log.config.longest_gap:g} s, the longest of {long.max():.1f} s; the "
+            "way across is taken to be the shortest in the final map"
+        )
+    return Poses(times, log.transforms.poses(frame, base, times)[:, :2, 3])
+
+
+def drive_path(
+    poses: Poses, grid: WorkingGrid, log: Log, radius: float, notes: list[str]
+) -> tuple[list[Cell], Int64[np.ndarray, "N"]]:
+    """Cells entered, and for each the number of the pose by which it was; poses that are passed over are noted.
+
+    Raises:
+        LogError: no pose is in free space.
+    """
+    frame = grid.frame
+    across, up = frame.to_grid(poses.points).T
+    inside = (across >= 0) & (across < frame.width) & (up >= 0) & (up < frame.height)
+    rows, columns = frame.height - 1 - np.floor(up).astype(int), np.floor(across).astype(int)
+    labels = component_labels(grid.free)
+    reached = labels[rows[inside], columns[inside]]
+    on_free = reached[reached > 0]
+    if not len(on_free):
+        raise LogError(
+            f"{log.path}: none of {len(inside)} poses is in free space of the last map: is it of the same run, and "
+            f"{log.base_frame!r} the robot's frame?"
+        )
+    main = labels == np.bincount(on_free).argmax()
+    found = ndimage.distance_transform_edt(~main, return_indices=True)
+    assert found is not None
+    distance, nearest = found
+    numbers = np.flatnonzero(inside)
+    near = distance[rows[numbers], columns[numbers]] <= FARTHEST_SNAP + radius / frame.resolution
+    numbers = numbers[near]
+    if len(numbers) < len(inside):
+        notes.append(
+            f"pose: {len(inside) - len(numbers)} of {len(inside)} poses are passed over: they are not in, or near, the "
+            "space that the robot could reach in the last map"
+        )
+    snapped = nearest[:, rows[numbers], columns[numbers]].T
+    path: list[Cell] = []
+    entered: list[int] = []
+    for number, cell in zip(numbers.tolist(), map(tuple, snapped.tolist()), strict=True):
+        if path and cell == path[-1]:
+            continue
+        way = [cell] if not path else _way(main, path[-1], cell)
+        path += way
+        entered += [number] * len(way)
+    return path, np.array(entered)
+
+
+def _way(free: Bool[np.ndarray, "H W"], start: Cell, goal: Cell) -> list[Cell]:
+    """Cells of a shortest way, the start left out: 8-connected, corners not cut. Both are in one component."""
+    best, came_from = {start: 0.0}, {}
+    queue = [(0.0, start)]
+    while queue:
+        _, cell = heapq.heappop(queue)
+        if cell == goal:
+            break
+        for there, length in _moves(free, cell):
+            cost = best[cell] + length
+            if cost < best.get(there, math.inf):
+                best[there], came_from[there] = cost, cell
+                heapq.heappush(queue, (cost + math.dist(there, goal), there))
+    way = [goal]
+    while way[-1] != start:
+        way.append(came_from[way[-1]])
+    return way[-2::-1]
+
+
+def _moves(free: Bool[np.ndarray, "H W"], cell: Cell) -> Iterator[tuple[Cell, float]]:
+    """Neighbours, and how far they are. The outermost cells are never free."""
+    row, column = cell
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            open_sides = free[row + down, column] and free[row, column + right]
+            if (down or right) and free[row + down, column + right] and open_sides:
+                yield (row + down, column + right), math.hypot(down, right)
