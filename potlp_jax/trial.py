@@ -76,7 +76,7 @@ def run_trial(
         seed=seed,
         status=loop.status,
         config=dataclasses.asdict(config),
-        versions=versions() | ({} if trained is None else {"estimator": trained.identity}),
+        versions=versions(trained),
     )
 
 
@@ -273,9 +273,10 @@ def _action_records(move: Move) -> tuple[ActionRecord, ...]:
     return tuple(records)
 
 
-def versions() -> dict[str, str]:
-    """Versions of what a trial's figures depend on."""
-    return {name: importlib.metadata.version(name) for name in ("potlp-jax", "jax", "numpy")}
+def versions(estimator: TrainedEstimator | None = None) -> dict[str, str]:
+    """Versions of what a trial's figures depend on; with the estimator's identity where it looked with one."""
+    libraries = {name: importlib.metadata.version(name) for name in ("potlp-jax", "jax", "numpy")}
+    return libraries if estimator is None else libraries | {"estimator": estimator.identity}
 
 
 def planning_key(key: PRNGKeyArray) -> PRNGKeyArray:

@@ -12,6 +12,7 @@ import sys
 import time
 
 import jax
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -323,7 +324,7 @@ def test_the_report_holds_tables_plots_and_replays_of_the_trials_as_they_were(fi
     assert not re.findall(r"""<(?:img|script|link)[^>]*(?:src|href)\s*=\s*["'](?!data:)""", text)
     data = re.findall(r'<script type="application/json" id="replay-0-\d">(.*?)</script>', text)
     rows = [row for row in _rows(finished) if row.item.policy == "optimistic"]
-    paths = {path_text([tuple(cell) for cell in json.loads(entry)["path"]]) for entry in data}
+    paths = {path_text(np.array(json.loads(entry)["path"], np.int32)) for entry in data}
     assert len(data) == 2
     assert paths <= {row.path for row in rows}
 

@@ -1,7 +1,7 @@
 """A finished trial as the row that the statistics need of it."""
 
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 
@@ -10,34 +10,27 @@ import numpy as np
 from jaxtyping import Int32, PRNGKeyArray
 
 from potlp_jax.batch import Finished
-from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.planning.sweeps import NEIGHBOURS
 from potlp_jax.records import Trial
 from potlp_jax.sweep.specification import configuration_hash
 from potlp_jax.sweep.store import Item, Row
-from potlp_jax.trial import versions
 from potlp_jax.trial_config import TrialConfig
 from potlp_jax.world.grid import World
 
 
 def trial_row(item: Item, trial: Trial, key: PRNGKeyArray, config: TrialConfig, seconds: float) -> Row:
     """The row of a trial that was run with this key and configuration and took so many seconds."""
-    return Row(
-        item=item,
-        outcome=trial.outcome.value,
+    finished = Finished(
+        name=item,
+        outcome=trial.outcome,
         cost=trial.cost,
-        budget=trial_budget(trial.world, config.budget_factor),
-        steps=len(trial.path) - 1,
+        path=np.asarray(trial.path, np.int32),
         decisions=len(trial.decisions),
         fallbacks=sum(decision.fallback for decision in trial.decisions),
         status=trial.status,
-        key=_words(key),
-        path=path_text(trial.path),
-        configuration=configuration_hash(config),
-        versions=trial.versions,
-        commit=source_commit(),
         seconds=seconds,
     )
+    return batch_row(item, finished, trial.world, key, config, trial.versions)
 
 
 def batch_row(
@@ -46,9 +39,9 @@ def batch_row(
     world: World,
     key: PRNGKeyArray,
     config: TrialConfig,
-    estimator: TrainedEstimator | None,
+    versions: Mapping[str, str],
 ) -> Row:
-    """The same of a trial that ran in a batch; ``estimator`` is what it looked with."""
+    """The row of a trial that ran in a batch; ``versions`` are those of the libraries and of what it looked with."""
     return Row(
         item=item,
         outcome=trial.outcome.value,
@@ -61,7 +54,7 @@ def batch_row(
         key=_words(key),
         path=path_text(trial.path),
         configuration=configuration_hash(config),
-        versions=versions() | ({} if estimator is None else {"estimator": estimator.identity}),
+        versions=dict(versions),
         commit=source_commit(),
         seconds=trial.seconds,
     )
@@ -72,12 +65,11 @@ def trial_budget(world: World, factor: float) -> float:
     return factor * float(np.sum(np.asarray(world.extent))) * float(world.resolution)
 
 
-def path_text(path: Sequence[tuple[int, int]] | Int32[np.ndarray, "steps 2"]) -> str:
+def path_text(path: Int32[np.ndarray, "steps 2"]) -> str:
     """A path as text: its first cell, and one digit for each move, by its place in ``sweeps.NEIGHBOURS``."""
-    cells = np.asarray(path, np.int32)
     numbers = {move: str(number) for number, move in enumerate(NEIGHBOURS)}
-    moves = np.diff(cells, axis=0).tolist()
-    return f"{cells[0, 0]},{cells[0, 1]}:" + "".join(numbers[row, column] for row, column in moves)
+    moves = np.diff(path, axis=0).tolist()
+    return f"{path[0, 0]},{path[0, 1]}:" + "".join(numbers[row, column] for row, column in moves)
 
 
 def read_path(text: str) -> Int32[np.ndarray, "steps 2"]:

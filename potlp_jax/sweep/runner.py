@@ -27,7 +27,7 @@ from potlp_jax.sweep.rows import batch_row
 from potlp_jax.sweep.specification import Cell, Specification
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store
 from potlp_jax.task.task import Task, TaskArrays, TaskSizes
-from potlp_jax.trial import run_trial
+from potlp_jax.trial import run_trial, versions
 from potlp_jax.world.grid import World, WorldError
 
 RESULTS: str = "results.sqlite"
@@ -153,7 +153,7 @@ class Sweep:
         trained = self._trained(environment) if policy is Policy.POTLP else None
         for item, trial in self._trials(items, environment, policy):
             world = _world(environment, self.specification.split.value, item.world)
-            yield batch_row(item, trial, world, self._key(item.world), config, trained)
+            yield batch_row(item, trial, world, self._key(item.world), config, versions(trained))
 
     def _trials(self, items: Iterable[Item], environment: str, policy: Policy) -> Iterator[tuple[Item, Finished]]:
         def start(item: Item) -> Start:
