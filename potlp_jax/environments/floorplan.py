@@ -220,12 +220,8 @@ def parse_spec(spec: str) -> FloorPlanConfig:
         MapError: the text is not of that form.
     """
     usage = "write floorplan:FILE.xml (or a folder)[,resolution=METRES][,kinds=FILE.yaml]"
-    path, values = parse_options(spec, FLOOR_PLAN_PREFIX, "plan", ("resolution", "kinds"), usage)
-    try:
-        resolution = float(values.get("resolution", FloorPlanConfig.resolution))
-    except ValueError as error:
-        raise MapError(spec, "resolution", f"{error}; {usage}") from error
-    return FloorPlanConfig(path, resolution, values.get("kinds"))
+    path, values = parse_options(spec, FLOOR_PLAN_PREFIX, "plan", {"resolution": float, "kinds": str}, usage)
+    return FloorPlanConfig(path, **values)
 
 
 def rasterise(plan: FloorPlan, kinds: Mapping[str, Kind], resolution: float) -> PlanFloor:

@@ -119,12 +119,9 @@ class MappedRooms:
             MapError: the text is not of that form, or see the class.
         """
         usage = "write parcels:FILE.yaml[,rooms=FILE][,resolution=METRES][,radius=METRES]"
-        file, values = parse_options(spec, PARCELS_PREFIX, "map", ("rooms", "resolution", "radius"), usage)
-        try:
-            numbers = {name: float(values[name]) for name in ("resolution", "radius") if name in values}
-        except ValueError as error:
-            raise MapError(spec, "", f"{error}; {usage}") from error
-        return cls(MappedRoomsConfig(file, values.get("rooms"), **numbers))
+        options = {"rooms": str, "resolution": float, "radius": float}
+        file, values = parse_options(spec, PARCELS_PREFIX, "map", options, usage)
+        return cls(MappedRoomsConfig(file, **values))
 
     @property
     def settings(self) -> Mapping[str, Any]:

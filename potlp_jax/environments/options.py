@@ -1,24 +1,37 @@
 """Environments that are named with options: ``PREFIX:PATH,option=value,...``."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping
+from typing import Any
 
 from potlp_jax.environments.map_server import MapError
 
 
-def parse_options(spec: str, prefix: str, kind: str, names: Sequence[str], usage: str) -> tuple[str, dict[str, str]]:
-    """The path (of a ``kind`` of file) and the options of a name; ``usage`` ends every message.
+def parse_options(
+    spec: str, prefix: str, kind: str, options: Mapping[str, type[str] | type[float]], usage: str
+) -> tuple[str, dict[str, Any]]:
+    """The path (of a ``kind`` of file) and the values of the options that a name gives.
+
+    Args:
+        spec: the name.
+        prefix: how names of this family begin.
+        kind: what the path leads to, for messages.
+        options: the type of each option.
+        usage: ends every message.
 
     Raises:
-        MapError: the text is not of that form, or an option is unknown or given twice.
+        MapError: the text is not of that form, or an option is unknown, given twice, or no number where it must be.
     """
-    path, *options = spec.removeprefix(prefix).split(",")
+    path, *given = spec.removeprefix(prefix).split(",")
     if not spec.startswith(prefix) or not path:
         raise MapError(spec, "", f"names no {kind}; {usage}")
-    values: dict[str, str] = {}
-    for option in options:
-        match = re.fullmatch(rf"({'|'.join(names)})=(.+)", option)
+    values: dict[str, Any] = {}
+    for text in given:
+        match = re.fullmatch(rf"({'|'.join(options)})=(.+)", text)
         if match is None or match[1] in values:
-            raise MapError(spec, option, f"is no option, or given twice; {usage}")
-        values[match[1]] = match[2]
+            raise MapError(spec, text, f"is no option, or given twice; {usage}")
+        try:
+            values[match[1]] = options[match[1]](match[2])
+        except ValueError as error:
+            raise MapError(spec, match[1], f"{error}; {usage}") from error
     return path, values

@@ -182,12 +182,8 @@ def parse_spec(spec: str) -> RosMapConfig:
         MapError: the text is not of that form.
     """
     usage = "write map:FILE.yaml[,places=FILE][,resolution=METRES][,radius=METRES]"
-    file, values = parse_options(spec, PREFIX, "map", ("places", "resolution", "radius"), usage)
-    try:
-        numbers = {name: float(values[name]) for name in ("resolution", "radius") if name in values}
-    except ValueError as error:
-        raise MapError(spec, "", f"{error}; {usage}") from error
-    return RosMapConfig(file, values.get("places"), **numbers)
+    file, values = parse_options(spec, PREFIX, "map", {"places": str, "resolution": float, "radius": float}, usage)
+    return RosMapConfig(file, **values)
 
 
 def clean_map(
