@@ -133,7 +133,7 @@ class FurnishConfig:
 
     Attributes:
         person_radius: a person is met on a square of ``2 * person_radius + 1`` cells a side, inside of the room.
-        coloured: whether walls and floors tell the kind of a room; else all look like rooms of no special kind.
+        coloured: whether walls and floors tell the kind of a room; else hallways and rooms all look alike.
         hallway_light: bounds of the hallways' brightness, drawn once a world.
         tint: largest shift of each colour, per world; tint_noise: of the brightness, per cell (both of 255).
     """
@@ -245,9 +245,7 @@ def _appearance(floor: Floor, placement: Placement, rng: np.random.Generator, co
     noise = rng.integers(-config.tint_noise, config.tint_noise + 1, size=(2, *floor.rooms.shape, 1))
     floor_palette = np.array([_FLOOR_COLOURS[kind] for kind in Kind]) + tints[0]
     wall_palette = np.array([_WALL_COLOURS[kind] for kind in Kind]) + tints[1]
-    kinds = floor.kind_of_cell
-    if not config.coloured:
-        kinds = np.minimum(kinds, Kind.OTHER).astype(np.int32)
+    kinds = floor.kind_of_cell if config.coloured else np.full_like(floor.rooms, Kind.OTHER)
     return Appearance(
         floor_colour=_colours(floor_palette[np.maximum(kinds, 0)] + noise[0]),
         wall_colour=_colours(wall_palette[_kind_of_wall(kinds)] + noise[1]),
