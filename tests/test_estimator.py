@@ -11,7 +11,6 @@ import pytest
 from potlp_jax.cli.explain import explain_decision
 from potlp_jax.environments import make
 from potlp_jax.environments.splits import world_key
-from potlp_jax.learning.estimator import NEAR as NEAR_CELLS
 from potlp_jax.learning.estimator import (
     SURE,
     estimator_for,
@@ -37,6 +36,9 @@ from potlp_jax.world.sensing import SensorConfig, observe
 from tests.reference.dijkstra import product_distances
 
 TINY = {"first_widths": (4, 4, 4, 4), "second_widths": (4,) * 8, "dense_widths": (8, 8, 8, 8)}
+WITHIN = 16.0
+"""Cells within which subgoals exclude each other."""
+
 NEAR = TrialConfig(sensor=SensorConfig(range_cells=5.0))
 
 
@@ -47,7 +49,7 @@ def generator():
 
 @pytest.fixture(scope="module")
 def trained_file(generator, tmp_path_factory):
-    config = NetworkConfig(propositions=generator.propositions, **TINY)
+    config = NetworkConfig(propositions=generator.propositions, exclusive_within=WITHIN, **TINY)
     path = tmp_path_factory.mktemp("estimator") / "tiny.npz"
     save_estimator(path, EstimatorNetwork(config).init(jax.random.key(3)), config, {})
     return path
@@ -77,7 +79,7 @@ def _with_neighbours(chances, cells):
     """The chances given those of the subgoals near by, one after the other."""
     raised = np.array(chances)
     for s, c in np.ndindex(*chances.shape):
-        group = [chances[t, c] for t in range(len(cells)) if np.hypot(*(cells[s] - cells[t])) <= NEAR_CELLS]
+        group = [chances[t, c] for t in range(len(cells)) if np.hypot(*(cells[s] - cells[t])) <= WITHIN]
         none = np.prod([1 - chance for chance in group])
         if 0 < none < 1:
             power = np.log(max(1 - sum(group), 1 - SURE)) / np.log(none)
@@ -89,11 +91,12 @@ def test_subgoals_side_by_side_fail_together_with_what_their_sum_leaves():
     cells = jnp.asarray([[0, 0], [0, 10], [0, 60], [0, 5]], jnp.int32)
     subgoals = subgoals_at(cells, jnp.asarray([True, True, True, False]), 10, 80)
     chances = jnp.asarray([[0.3, 0.53, 0.0, 0.99], [0.4, 0.54, 0.2, 0.5], [0.3, 0.6, 0.1, 0.2], [0.9, 0.9, 0.9, 0.9]])
-    raised = np.asarray(exclusive_chances(chances, subgoals))
+    raised = np.asarray(exclusive_chances(chances, subgoals, WITHIN))
     np.testing.assert_allclose((1 - raised[0]) * (1 - raised[1]), [0.3, 1 - SURE, 0.8, 0.005], rtol=1e-4)
     np.testing.assert_allclose(raised[2:], chances[2:], rtol=1e-5)
     np.testing.assert_allclose(raised[:3], _with_neighbours(np.asarray(chances)[:3], np.asarray(cells)[:3]), rtol=1e-4)
     assert np.all(raised >= np.asarray(chances) - 1e-6)
+    np.testing.assert_allclose(exclusive_chances(chances, subgoals, 0.0), chances, rtol=1e-5)
 
 
 @pytest.mark.parametrize("resolution", [1.0, 0.5])

@@ -186,7 +186,7 @@ def fit(training: Samples, validation: Samples, out: Path, arguments: argparse.N
     """Everything after reading the data."""
     config = TrainingConfig(steps=1, seed=arguments.seed, **{name: getattr(arguments, name) for name in _OPTIONS})
     rows, columns, _ = decode(training.images[0]).shape
-    network = EstimatorNetwork(network_config(training, (rows, columns)))
+    network = EstimatorNetwork(network_config(training, (rows, columns), arguments.exclusive_within))
     out.mkdir(parents=True, exist_ok=True)
     epoch = steps_per_epoch(training, config)
     began = time.perf_counter()
@@ -251,6 +251,12 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--epochs", type=int, default=10, help="passes over the panoramas, at most (default 10)")
     found.add_argument("--minutes", type=float, help="plan as many steps as fit into this time")
     found.add_argument("--seed", type=int, default=0, help="of parameters, order and augmentation (default 0)")
+    found.add_argument(
+        "--exclusive-within",
+        type=float,
+        default=0.0,
+        help="cells within which subgoals exclude each other, as eval.exclusion measures it (default 0: nowhere)",
+    )
     for name, field in _OPTIONS.items():
         found.add_argument(
             f"--{name.replace('_', '-')}", type=field.type, default=field.default, help=argparse.SUPPRESS

@@ -7,6 +7,7 @@ inside jit, with the panoramas seen so far. Which propositions an estimator know
 import dataclasses
 import functools
 import hashlib
+import math
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -30,9 +31,6 @@ from potlp_jax.world.panorama import bearing
 
 MEMORY: int = 32
 """Panoramas that are remembered. A trial takes 14 to 100, of which seldom more than a dozen still show a frontier."""
-
-NEAR: int = 16
-"""Cells between two subgoals that border the same place."""
 
 SURE: float = 0.97
 """The most that the chances of subgoals side by side come to together."""
@@ -78,9 +76,9 @@ class NetworkEstimator:
             [jnp.zeros((subgoals.mask.shape[0], classes)), *[jnp.ones((subgoals.mask.shape[0], classes))] * 2]
         )
         probability, success_cost, failure_cost = jax.lax.fori_loop(0, real, ask, nothing)
-        chances = exclusive_chances(jnp.where(task.class_mask[None, :], probability, 0.0), subgoals)
+        probability = jnp.where(task.class_mask[None, :], probability, 0.0)
         return Estimates(
-            success_probability=chances,
+            success_probability=exclusive_chances(probability, subgoals, self.config.exclusive_within),
             success_cost=success_cost,
             failure_cost=failure_cost,
         )
@@ -101,16 +99,17 @@ class NetworkEstimator:
         return dataclasses.replace(self, views=remember(self.views, features, belief, cell))
 
 
-def exclusive_chances(chances: Float32[Array, "S C"], subgoals: Subgoals) -> Float32[Array, "S C"]:
+def exclusive_chances(chances: Float32[Array, "S C"], subgoals: Subgoals, within: float) -> Float32[Array, "S C"]:
     """P_S of subgoals side by side, raised so that, taken as independent, they fail together as rarely as they do.
 
-    Two frontiers within ``NEAR`` cells of each other border the same place, and what is asked for is in one of its
-    parts: both succeed in less than 1 % of the cases, and one of them does with about the sum of their chances
-    (``eval.exclusion``). Eq. 3 takes attempts as independent. The logarithms of the chances to fail are scaled by a
-    common factor, so that all subgoals near one fail together with ``1 - sum``, at least ``1 - SURE``.
+    In fire-fighting buildings two frontiers within 16 cells of each other border the same place, and what is asked for
+    is in one of its parts: both succeed in less than 1 % of the cases, and one of them does with about the sum of their
+    chances (``eval.exclusion``). Eq. 3 takes attempts as independent. The logarithms of the chances to fail are scaled
+    by a common factor, so that all subgoals ``within`` so many cells of one fail together with ``1 - sum``, at least
+    ``1 - SURE``. With ``within`` 0 nothing is raised.
     """
     apart = subgoals.cells[:, None] - subgoals.cells[None, :]
-    near = jnp.sum(apart**2, axis=2) <= NEAR**2
+    near = jnp.sum(apart**2, axis=2) <= math.floor(within**2)
     near = jnp.where(near & subgoals.mask[:, None] & subgoals.mask[None, :], 1.0, 0.0)
     fails = jnp.log1p(-jnp.minimum(chances, jnp.float32(1.0 - 1e-6)))
     independent, together = near @ fails, jnp.log1p(-jnp.minimum(near @ chances, SURE))

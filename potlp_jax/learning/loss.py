@@ -82,8 +82,11 @@ class Evaluation:
     failure_rmse: float
 
 
-def network_config(samples: Samples, image_shape: tuple[int, int]) -> NetworkConfig:
-    """A network for these samples: their propositions, and normalisers from their distances and costs."""
+def network_config(samples: Samples, image_shape: tuple[int, int], exclusive_within: float = 0.0) -> NetworkConfig:
+    """A network for these samples: their propositions, and normalisers from their distances and costs.
+
+    ``exclusive_within`` is in cells, see ``NetworkConfig``; training does not depend on it.
+    """
     step = float(samples.metadata.resolution)
     succeeded, failed = samples.success > 0, (samples.success < 1) & np.isfinite(samples.failure_cost)
     return NetworkConfig(
@@ -93,6 +96,7 @@ def network_config(samples: Samples, image_shape: tuple[int, int]) -> NetworkCon
         success_cost_scale=_spread(samples.success_cost[succeeded], step),
         failure_cost_scale=_spread(samples.failure_cost[failed], step),
         step=step,
+        exclusive_within=exclusive_within,
     )
 
 

@@ -62,6 +62,8 @@ class NetworkConfig:
             (standard deviations over the training data).
         step: the least R_S, one step of the grid, in the unit of cost.
         pixel_mean, pixel_scale: pixels in [0, 1] enter as ``(pixel - pixel_mean) / pixel_scale``.
+        exclusive_within: subgoals so many cells apart exclude each other (``learning.estimator.exclusive_chances``); a
+            property of the buildings, which ``eval.exclusion`` measures. 0: attempts are independent, as in Eq. 3.
     """
 
     propositions: tuple[str, ...]
@@ -75,6 +77,7 @@ class NetworkConfig:
     step: float = 1.0
     pixel_mean: float = 0.5
     pixel_scale: float = 0.25
+    exclusive_within: float = 0.0
 
     def __post_init__(self) -> None:
         for name, count in (
@@ -91,6 +94,8 @@ class NetworkConfig:
         for name in ("distance_scale", "success_cost_scale", "failure_cost_scale", "step", "pixel_scale"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise NetworkError(f"{name} is {getattr(self, name)}; give a positive number")
+        if not (math.isfinite(self.exclusive_within) and self.exclusive_within >= 0):
+            raise NetworkError(f"exclusive_within is {self.exclusive_within}; give a number of cells, 0 for none")
         if not self.propositions:
             raise NetworkError("propositions is empty; name at least one")
 
