@@ -16,6 +16,8 @@ from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from eval.savings import TABLE_HEAD, audit, compare_first, read_rows, sweep, table_lines
 from potlp_jax.environments import make
 from potlp_jax.environments.academic import PEOPLE
@@ -75,8 +77,7 @@ def results_of(folder: Path, environment: str, worlds: Mapping[str, int]) -> dic
         "problems": problems,
         "commits": sorted({row.commit for row in rows}),
         "seconds_per_trial": {
-            policy: sum(row.seconds for row in rows if row.item.policy == policy) / max(1, len(rows) // len(POLICIES))
-            for policy in POLICIES
+            policy: float(np.mean([row.seconds for row in rows if row.item.policy == policy])) for policy in POLICIES
         },
     }
 
