@@ -52,13 +52,20 @@ def read_rows(folder: Path) -> list[Row]:
 
 
 def compare_first(
-    rows: Sequence[Row], task: str, policies: Sequence[str], worlds: int, building: Callable[[int], Hashable]
+    rows: Sequence[Row],
+    task: str,
+    policies: Sequence[str],
+    worlds: int,
+    building: Callable[[int], Hashable] | None = None,
 ) -> dict[str, Any]:
-    """The comparison of the first worlds of a task, clustered by ``building(world)``; ``buildings`` counts them."""
+    """The comparison of the first worlds of a task, clustered by ``building(world)``; ``buildings`` counts them.
+
+    Without it all worlds are of one building, and the figures are of that one.
+    """
     pairs = pair_rows([row for row in rows if row.item.task == task], policies)[:worlds]
-    buildings = [building(pair[Policy.BASELINE].item.world) for pair in pairs]
-    comparison = compare_pairs(pairs, policies, buildings)
-    return {"task": task, "buildings": len(set(buildings)), **comparison.to_dict()}
+    clusters = None if building is None else [building(pair[Policy.BASELINE].item.world) for pair in pairs]
+    comparison = compare_pairs(pairs, policies, clusters)
+    return {"task": task, "buildings": 1 if clusters is None else len(set(clusters)), **comparison.to_dict()}
 
 
 def audit(rows: Sequence[Row], generator: Generator, split: Split) -> list[str]:
@@ -79,7 +86,8 @@ def table_lines(table: Mapping[str, Any], policies: Sequence[str]) -> list[str]:
     task, lines = table["task"].replace("|", "\\|"), []
     for policy in policies:
         row = policy_row(found[policy])
-        worlds = f"{table['satisfied']['pairs']} in {table['buildings']} buildings"
+        buildings = table["buildings"]
+        worlds = f"{table['satisfied']['pairs']} in {buildings} building{'s' if buildings > 1 else ''}"
         lines.append(f"| `{task}` | {policy} | {worlds} | {row.mean_cost:.1f} | {figures(row)} |")
     return lines
 

@@ -12,6 +12,7 @@ from potlp_jax.learning.network import (
     EstimatorNetwork,
     NetworkConfig,
     NetworkError,
+    foveal_window,
     operation_counts,
     parameter_count,
 )
@@ -91,6 +92,37 @@ def test_centring_brings_the_bearing_into_the_centre():
     centre = np.angle(np.exp(1j * left) + np.exp(1j * right))
     error = np.angle(np.exp(1j * (centre + np.asarray(residual) - bearings)))
     np.testing.assert_allclose(error, 0, atol=1e-5)
+
+
+def test_the_fovea_is_what_the_image_shows_at_the_exact_bearing():
+    """Against interpolation in the image itself, without features or rolling."""
+    network = EstimatorNetwork(dataclasses.replace(CONFIG, fovea=5))
+    image = _images(1)[0]
+    bearings = np.append(np.linspace(-np.pi, np.pi, 23), [0.0, np.pi / COLUMNS]).astype(np.float32)
+    features = network.encode(network.init(jax.random.key(0)), image)
+    rolled, residual = network.centre(jnp.broadcast_to(features, (25, *features.shape)), jnp.asarray(bearings))
+    window = np.asarray(foveal_window(rolled[..., -STRIDE * 3 :], residual, 5))
+    rows, width = CONFIG.image_shape
+    normalised = (np.asarray(image) / 255 - CONFIG.pixel_mean) / CONFIG.pixel_scale
+    bands = normalised.reshape(rows // STRIDE, STRIDE, width, 3).mean(axis=1)
+    for bearing, found in zip(bearings, window, strict=True):
+        columns = (bearing + np.pi) * width / (2 * np.pi) - 0.5 + np.arange(-5, 6)
+        for channel in range(3):
+            for band, seen in zip(bands[..., channel], found[..., channel], strict=True):
+                np.testing.assert_allclose(seen, np.interp(columns, np.arange(width), band, period=width), atol=2e-3)
+
+
+def test_the_fovea_changes_answers_and_nothing_of_a_network_without_it(params):
+    network = EstimatorNetwork(dataclasses.replace(CONFIG, fovea=5))
+    wide = network.init(jax.random.key(3))
+    image, (bearing, *rest) = _images(1), _questions((1,))
+    features, residual = network.centre(network.encode(wide, image), bearing)
+    answer = network.answer(wide, features, residual, *rest)
+    blind = network.answer(wide, features.at[..., -STRIDE * 3 :].set(0.0), residual, *rest)
+    assert float(answer.success_logit[0]) != float(blind.success_logit[0])
+    np.testing.assert_array_equal(
+        network.encode(params | {"second": wide["second"]}, image)[..., : -STRIDE * 3], NETWORK.encode(params, image)
+    )
 
 
 def test_one_call_over_subgoals_and_classes_equals_a_loop(params):
@@ -176,6 +208,8 @@ def test_operations_and_parameters_counted_by_hand():
     kernels = 48 * 1 + 4 * 2 + 18 * 3 + 27 * 4 + 9 * 4 + 7 * 9 + 5 + 1 * 2 + 3 * 4 + 6
     biases = (1 + 2 + 3 + 4) + 8 + 4 * 2 + 3
     position = 4
+    _, wide = operation_counts(dataclasses.replace(config, fovea=1))
+    assert wide - second == 2 * ((4 * 3 * 3 + 5) * 64 + 64 * 64 + 64 * 2)
     shapes = jax.eval_shape(EstimatorNetwork(config).init, jax.random.key(0))
     assert parameter_count(shapes) == kernels + biases + position
 
@@ -194,6 +228,8 @@ def test_configuration_survives_json():
         ({"dense_widths": (8,)}, "dense_widths"),
         ({"image_shape": (128, 500)}, "multiples of 64"),
         ({"propositions": ()}, "propositions"),
+        ({"fovea": 60}, "fovea"),
+        ({"exclusive_within": -1.0}, "exclusive_within"),
         ({"success_cost_scale": float("nan")}, "success_cost_scale"),
     ],
 )

@@ -186,7 +186,7 @@ def fit(training: Samples, validation: Samples, out: Path, arguments: argparse.N
     """Everything after reading the data."""
     config = TrainingConfig(steps=1, seed=arguments.seed, **{name: getattr(arguments, name) for name in _OPTIONS})
     rows, columns, _ = decode(training.images[0]).shape
-    network = EstimatorNetwork(network_config(training, (rows, columns), arguments.exclusive_within))
+    network = EstimatorNetwork(network_config(training, (rows, columns), arguments.exclusive_within, arguments.fovea))
     out.mkdir(parents=True, exist_ok=True)
     epoch = steps_per_epoch(training, config)
     began = time.perf_counter()
@@ -256,6 +256,9 @@ def parser() -> argparse.ArgumentParser:
         type=float,
         default=0.0,
         help="cells within which subgoals exclude each other, as eval.exclusion measures it (default 0: nowhere)",
+    )
+    found.add_argument(
+        "--fovea", type=int, default=0, help="columns of pixels beside the subgoal seen at full width (default 0: none)"
     )
     for name, field in _OPTIONS.items():
         found.add_argument(

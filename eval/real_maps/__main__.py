@@ -97,12 +97,13 @@ def contrast(generator: MappedRooms, pairs: list[Pair]) -> dict[str, Any]:
 
 
 def draw_contrast(generator: MappedRooms, pair: Pair, file: Path) -> None:
-    """The paths of the baseline and of PO-TLP in one world; lit rooms are bright."""
+    """The paths of the baseline and of PO-TLP in one world, one above the other; lit rooms are bright."""
     number = pair[Policy.BASELINE].item.world
     world = generator.generate(world_key(Split.TEST, number, generator.name))
-    figure = new_figure(11.0, 6.0)
+    height, width = world.shape
+    figure = new_figure(11.0, 2 * (10.5 * height / width + 0.5))
     for place, policy in enumerate((Policy.BASELINE, Policy.POTLP)):
-        axes = figure.add_subplot(1, 2, place + 1)
+        axes = figure.add_subplot(2, 1, place + 1)
         path = [(int(row), int(column)) for row, column in read_path(pair[policy].path)]
         draw_plan(axes, world, generator.propositions, path[0])
         axes.plot(*np.array(path, float).T[::-1], color=ROBOT, lw=1.5)
@@ -120,7 +121,7 @@ def results_of(generator: MappedRooms, folder: Path, worlds: int) -> dict[str, A
         "rooms": len(generator.rooms) - 1,
         "cells": generator.floor.rooms.shape,
         "tables": [
-            compare_first(rows, formula, POLICIES, count, lambda world: world)
+            compare_first(rows, formula, POLICIES, count)
             for formula in PARCELS.tasks.values()
             for count in sorted({min(FIRST, worlds), worlds})
         ],

@@ -82,10 +82,12 @@ class Evaluation:
     failure_rmse: float
 
 
-def network_config(samples: Samples, image_shape: tuple[int, int], exclusive_within: float = 0.0) -> NetworkConfig:
+def network_config(
+    samples: Samples, image_shape: tuple[int, int], exclusive_within: float = 0.0, fovea: int = 0
+) -> NetworkConfig:
     """A network for these samples: their propositions, and normalisers from their distances and costs.
 
-    ``exclusive_within`` is in cells, see ``NetworkConfig``; training does not depend on it.
+    ``exclusive_within`` and ``fovea`` as in ``NetworkConfig``; training does not depend on the first.
     """
     step = float(samples.metadata.resolution)
     succeeded, failed = samples.success > 0, (samples.success < 1) & np.isfinite(samples.failure_cost)
@@ -97,6 +99,7 @@ def network_config(samples: Samples, image_shape: tuple[int, int], exclusive_wit
         failure_cost_scale=_spread(samples.failure_cost[failed], step),
         step=step,
         exclusive_within=exclusive_within,
+        fovea=fovea,
     )
 
 

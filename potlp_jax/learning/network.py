@@ -13,7 +13,9 @@ subgoal's bearing. What is left of the bearing, at most half a column, enters th
 such a convolution is a matrix product of patches, whose gradient costs a CPU several times less than that of
 overlapping strided kernels. A condition that is constant over the image passes a convolution as one vector per sample,
 so the second stage's first layer adds ``W @ condition`` to every element instead of convolving copies of it. Circular
-padding hides from a convolution where the centre is: a learned bias per spatial element says it. Layers that keep the
+padding hides from a convolution where the centre is: a learned bias per spatial element says it. With ``fovea``, the
+pixels around the subgoal's exact bearing are an input of their own: a door far down a hallway is narrower than a column
+of the features. They travel as further channels of the features, 16 columns of pixels in each. Layers that keep the
 shape have a residual connection. There is no normalisation layer: one panorama's answer never depends on the batch.
 """
 
@@ -40,6 +42,8 @@ _FIRST_KERNELS = (4, 2, 3, 3)
 _FIRST_STRIDES = (4, 2, 2, 1)
 _SECOND_STRIDES = (2, 1, 1, 1, 2, 1, 1, 1)
 _OUTPUTS = 3
+_FINE = STRIDE * 3
+_FOVEA_WIDTHS = (64, 64)
 _SLOPE = 0.1
 
 
@@ -57,6 +61,7 @@ class NetworkConfig:
         first_widths: channels of the four convolutions before phi is joined.
         second_widths: channels of the eight after.
         dense_widths: units of the first four fully connected layers; the fifth has the three outputs.
+        fovea: columns of pixels on each side of the subgoal that are seen at full width; 0 for none.
         distance_scale: the distance is divided by it.
         success_cost_scale, failure_cost_scale: unit of the outputs R_S and R_F, and of their errors in the loss
             (standard deviations over the training data).
@@ -71,6 +76,7 @@ class NetworkConfig:
     first_widths: tuple[int, ...] = (16, 32, 48, 48)
     second_widths: tuple[int, ...] = (32, 32, 32, 32, 48, 48, 48, 48)
     dense_widths: tuple[int, ...] = (128, 64, 64, 32)
+    fovea: int = 0
     distance_scale: float = 30.0
     success_cost_scale: float = 30.0
     failure_cost_scale: float = 30.0
@@ -96,6 +102,8 @@ class NetworkConfig:
                 raise NetworkError(f"{name} is {getattr(self, name)}; give a positive number")
         if not (math.isfinite(self.exclusive_within) and self.exclusive_within >= 0):
             raise NetworkError(f"exclusive_within is {self.exclusive_within}; give a number of cells, 0 for none")
+        if not 0 <= self.fovea <= self.image_shape[1] // 2 - STRIDE:
+            raise NetworkError(f"fovea is {self.fovea}; give a number of columns, less than half the image's")
         if not self.propositions:
             raise NetworkError("propositions is empty; name at least one")
 
@@ -103,7 +111,7 @@ class NetworkConfig:
     def feature_shape(self) -> tuple[int, int, int]:
         """Rows, columns and channels of the first stage's output."""
         rows, columns = self.image_shape
-        return rows // STRIDE, columns // STRIDE, self.first_widths[-1]
+        return rows // STRIDE, columns // STRIDE, self.first_widths[-1] + (_FINE if self.fovea else 0)
 
     def to_json(self) -> dict[str, Any]:
         """The configuration as JSON-able values."""
@@ -191,8 +199,8 @@ class _SecondStage(nn.Module):
     dense_widths: tuple[int, ...]
 
     @nn.compact
-    def __call__(self, features: Array, condition: Array) -> Array:
-        """``[B, rows, columns, F]`` and ``[B, conditions]`` to ``[B, 3]``."""
+    def __call__(self, features: Array, condition: Array, fovea: Array | None) -> Array:
+        """``[B, rows, columns, F]``, ``[B, conditions]`` and the fovea, ``[B, pixels]``, to ``[B, 3]``."""
         x = self._joined(features, condition)
         for width, stride in zip(self.widths[1:], _SECOND_STRIDES[1:], strict=True):
             keeps = stride == 1 and width == x.shape[-1]
@@ -200,6 +208,11 @@ class _SecondStage(nn.Module):
             y = _Convolution(width, 3, stride, gain=0.5 if keeps else 2.0)(x)
             x = x + y if keeps else y
         x = x.reshape(x.shape[0], -1)
+        if fovea is not None:
+            seen = jnp.concatenate([fovea, condition], axis=-1)
+            for width in _FOVEA_WIDTHS:
+                seen = nn.leaky_relu(nn.Dense(width, kernel_init=_deviation(2.0))(seen), _SLOPE)
+            x = jnp.concatenate([x, seen], axis=-1)
         for width in self.dense_widths:
             x = nn.leaky_relu(nn.Dense(width, kernel_init=_deviation(2.0))(x), _SLOPE)
         # Small, so that training starts near the constant prior.
@@ -236,13 +249,12 @@ class EstimatorNetwork:
 
     def _deviations(self) -> Params:
         key = jax.random.key(0)
-        rows, columns, channels = self.config.feature_shape
         pixels = jnp.zeros((1, *self.config.image_shape, 3))
         conditions = jnp.zeros((1, 2 * len(self.config.propositions) + 3))
-        features = jnp.zeros((1, rows, columns, channels))
+        features, fovea = self._parted(jnp.zeros((1, *self.config.feature_shape)), jnp.zeros(1))
         return {
             "first": self._first.init(key, pixels)["params"],
-            "second": self._second.init(key, features, conditions)["params"],
+            "second": self._second.init(key, features, conditions, fovea)["params"],
         }
 
     def encode(
@@ -261,6 +273,10 @@ class EstimatorNetwork:
         flat = normalised.reshape(-1, *normalised.shape[-3:])
         features = self._first.apply({"params": params["first"]}, flat)
         assert isinstance(features, jax.Array)
+        if self.config.fovea:
+            rows, columns, _ = self.config.feature_shape
+            fine = jnp.mean(flat.reshape(-1, rows, STRIDE, columns * STRIDE, 3), axis=2)
+            features = jnp.concatenate([features, fine.reshape(-1, rows, columns, _FINE)], axis=-1)
         return features.reshape(*pixels.shape[:-3], *features.shape[1:])
 
     def centre(
@@ -304,10 +320,9 @@ class EstimatorNetwork:
         scaled = distance / jnp.float32(self.config.distance_scale)
         scalars = jnp.stack([scaled, jnp.sin(angle), jnp.cos(angle)], axis=-1)
         condition = jnp.concatenate([phi_stay.astype(jnp.float32), phi_go.astype(jnp.float32), scalars], axis=-1)
+        coarse, fovea = self._parted(features.reshape(-1, *features.shape[-3:]), residual.reshape(-1))
         outputs = self._second.apply(
-            {"params": params["second"]},
-            features.reshape(-1, *features.shape[-3:]),
-            condition.reshape(-1, condition.shape[-1]),
+            {"params": params["second"]}, coarse, condition.reshape(-1, condition.shape[-1]), fovea
         )
         assert isinstance(outputs, jax.Array)
         logit, success, failure = jnp.moveaxis(outputs.reshape(*distance.shape, _OUTPUTS), -1, 0)
@@ -318,6 +333,15 @@ class EstimatorNetwork:
             failure_cost=jnp.float32(self.config.failure_cost_scale) * jax.nn.softplus(failure),
         )
 
+    def _parted(
+        self, features: Float32[Array, "B feature_rows feature_columns F"], residual: Float32[Array, " B"]
+    ) -> tuple[Array, Array | None]:
+        """The features proper, and the fovea where the network has one."""
+        if not self.config.fovea:
+            return features, None
+        window = foveal_window(features[..., -_FINE:], residual, self.config.fovea)
+        return features[..., :-_FINE], window.reshape(len(window), -1)
+
     @property
     def _first(self) -> _FirstStage:
         return _FirstStage(self.config.first_widths)
@@ -325,6 +349,27 @@ class EstimatorNetwork:
     @property
     def _second(self) -> _SecondStage:
         return _SecondStage(self.config.second_widths, self.config.dense_widths)
+
+
+def foveal_window(
+    fine: Float32[Array, "B feature_rows feature_columns F"], residual: Float32[Array, " B"], reach: int
+) -> Float32[Array, "B feature_rows W 3"]:
+    """The ``W = 2 * reach + 1`` columns of pixels around the subgoal's exact bearing, by linear interpolation.
+
+    ``fine`` has 16 columns of pixels in each column of the features, already rolled by whole columns (``centre``), and
+    ``residual`` is the angle that is left.
+    """
+    batch, rows, columns, _ = fine.shape
+    # The residual is at most half a column of features, and one pixel more is interpolated.
+    half = -(-(reach + 1 + STRIDE // 2) // STRIDE)
+    pixels = fine[:, :, columns // 2 - half : columns // 2 + half].reshape(batch, rows, 2 * half * STRIDE, 3)
+    place = half * STRIDE - 0.5 + residual * jnp.float32(columns * STRIDE / (2 * math.pi))
+    seen = place[:, None] + jnp.arange(-reach, reach + 1, dtype=jnp.float32)[None]
+    left = jnp.floor(seen)
+    part = (seen - left)[:, None, :, None]
+    index = left.astype(jnp.int32)[:, None, :, None]
+    at_left, at_right = (jnp.take_along_axis(pixels, index + step, axis=2) for step in (0, 1))
+    return (1 - part) * at_left + part * at_right
 
 
 def parameter_count(params: Params) -> int:
@@ -340,12 +385,19 @@ def operation_counts(config: NetworkConfig) -> tuple[int, int]:
     once to the inputs and once to the parameters (less the first layer's inputs, which need no gradient).
     """
     first = _convolution_operations(config.image_shape, 3, config.first_widths, _FIRST_KERNELS, _FIRST_STRIDES)
-    rows, columns, channels = config.feature_shape
+    rows, columns, _ = config.feature_shape
+    channels = config.first_widths[-1]
     kernels = (3,) * len(config.second_widths)
     second = _convolution_operations((rows, columns), channels, config.second_widths, kernels, _SECOND_STRIDES)
-    second += 2 * (2 * len(config.propositions) + 3) * config.second_widths[0]
+    conditions = 2 * len(config.propositions) + 3
+    second += 2 * conditions * config.second_widths[0]
     shrink = math.prod(_SECOND_STRIDES)
-    units = [(rows // shrink) * (columns // shrink) * config.second_widths[-1], *config.dense_widths, _OUTPUTS]
+    flat = (rows // shrink) * (columns // shrink) * config.second_widths[-1]
+    if config.fovea:
+        seen = [rows * (2 * config.fovea + 1) * 3 + conditions, *_FOVEA_WIDTHS]
+        second += sum(2 * i * o for i, o in itertools.pairwise(seen))
+        flat += seen[-1]
+    units = [flat, *config.dense_widths, _OUTPUTS]
     return first, second + sum(2 * i * o for i, o in itertools.pairwise(units))
 
 
