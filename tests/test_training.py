@@ -250,8 +250,8 @@ def test_it_learns_64_samples_whose_label_needs_picture_bearing_and_phi():
     samples = synthetic(16, 4, 8)
     network = _network(samples, WIDTHS)
     config = TrainingConfig(
-        steps=300, views_per_batch=16, samples_per_view=4, learning_rate=4e-3, weighting=0.5, patience=0,
-        mirror=0.0, brightness=0.0, colour=0.0, average_decay=0.9,
+        steps=120, views_per_batch=16, samples_per_view=4, learning_rate=6e-3, weighting=0.5, patience=0,
+        mirror=0.0, brightness=0.0, colour=0.0, average_decay=0.88,
     )  # fmt: skip
     step = make_train_step(network, config, DataScale.of(samples))
     state, batch = initial_state(network, config), _batch(samples, 16, 4)

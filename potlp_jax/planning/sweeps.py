@@ -66,11 +66,10 @@ class Sweeper:
         The lowest state whose costs have changed is swept first: states are numbered breadth-first from the initial
         one, so that in most automata each is swept once.
         """
-        count, height, width, _ = self.transitions.shape
-        lane = jnp.arange(cells.shape[0])
-        at_source = jnp.where(states == NO_STATE, jnp.inf, 0.0).astype(jnp.float32)
-        start = jnp.full((count, height + 2, width + 2, cells.shape[0]), jnp.inf, jnp.float32)
-        start = start.at[states, cells[:, 0] + 1, cells[:, 1] + 1, lane].set(at_source)
+        if self.transitions.shape[0] == 1:
+            return self._solve_one_state(cells, states)
+        count = self.transitions.shape[0]
+        start = self._start(cells, states)
         dirty = jnp.any(states[None, :] == jnp.arange(count)[:, None], axis=1) & self.leads_on
 
         def settle(carry):
@@ -81,6 +80,18 @@ class Sweeper:
             return cost, dirty.at[state].set(False) | (improved & self.leads_on)
 
         return jax.lax.while_loop(lambda carry: jnp.any(carry[1]), settle, (start, dirty))[0]
+
+    def _solve_one_state(self, cells, states):
+        """As ``_solve_padded`` where the automaton has one state, which no move leaves."""
+        return self._sweep_to_fixed_point(self._start(cells, states)[0], self.enter[0])[None]
+
+    def _start(self, cells, states):
+        """Costs before the first sweep: 0 at each source."""
+        count, height, width, _ = self.transitions.shape
+        lane = jnp.arange(cells.shape[0])
+        at_source = jnp.where(states == NO_STATE, jnp.inf, 0.0).astype(jnp.float32)
+        start = jnp.full((count, height + 2, width + 2, cells.shape[0]), jnp.inf, jnp.float32)
+        return start.at[states, cells[:, 0] + 1, cells[:, 1] + 1, lane].set(at_source)
 
     def _sweep_to_fixed_point(
         self, cost: Float32[Array, "H2 W2 Q"], enter: Float32[Array, "H W lanes"]
@@ -177,10 +188,8 @@ class Links:
         """As ``cheapest_arrival`` for one row of the grid; ``layer`` has a margin."""
         around = jax.lax.dynamic_slice_in_dim(layer, row, 3)
         width = layer.shape[1] - 2
-        best = jnp.full((width, layer.shape[2]), jnp.inf, jnp.float32)
-        for step, (rows, columns) in zip(self.steps, NEIGHBOURS, strict=True):
-            best = _smaller(around[1 + rows, 1 + columns : 1 + columns + width] + step[row][:, None], best)
-        return best
+        beside = jnp.stack([around[1 + rows, 1 + columns : 1 + columns + width] for rows, columns in NEIGHBOURS])
+        return jnp.min(beside + self.steps[:, row, :, None], axis=0)
 
     def arrival_at(self, layer: Float32[Array, "H W Q"], cells: Int32[Array, "N 2"]) -> Float32[Array, "N Q"]:
         """As ``cheapest_arrival`` for some cells."""
