@@ -28,7 +28,7 @@ from potlp_jax.environments.delivery import DeliveryConfig
 from potlp_jax.environments.map_server import MapError, MapWarning, load_map
 from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.places import Region, load_regions
-from potlp_jax.environments.ros_map import CleanMap, clean_map
+from potlp_jax.environments.ros_map import NARROW_DOORS, CleanMap, clean_map
 from potlp_jax.environments.splits import PARCELS_PREFIX
 from potlp_jax.world.grid import World
 from potlp_jax.world.panorama import CameraConfig
@@ -125,12 +125,14 @@ class MappedRooms:
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """Camera and replanning as in ``parcels``, in metres, and room for as many doors."""
+        """Camera and replanning as in ``parcels``, in metres, room for as many doors, and none too narrow."""
         scale, camera = LEARNED_RESOLUTION / self.config.resolution, CameraConfig()
         lengths = {
             name: getattr(camera, name) * scale for name in ("far", "eye_height", "wall_height", "texture_reach")
         }
-        return {**MANY_DOORS, "camera": lengths, "replan_distance": REPLAN_DISTANCE / self.config.resolution}
+        frontiers = {**MANY_DOORS["decision"]["frontiers"], **NARROW_DOORS["decision"]["frontiers"]}
+        replan_distance = REPLAN_DISTANCE / self.config.resolution
+        return {"decision": {"frontiers": frontiers}, "camera": lengths, "replan_distance": replan_distance}
 
     def generate(self, key: PRNGKeyArray) -> World:
         """The world of this key."""

@@ -25,13 +25,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int, Int32, PRNGKeyArray, Shaped
 from scipy import ndimage
 
-from potlp_jax.environments.base import NO_SETTINGS, host_generators
+from potlp_jax.environments.base import host_generators
 from potlp_jax.environments.map_server import GridFrame, MapError, MapWarning, OccupancyMap, load_map
 from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.places import Places, Point, component_labels, load_places, nearest_free, place_letters
@@ -95,6 +96,11 @@ class CutOff:
     area: float
 
 
+NARROW_DOORS: Mapping[str, Any] = MappingProxyType({"decision": {"frontiers": {"min_size": 1}}})
+"""Settings of trials: after resampling, a door of a real building may be as narrow as one cell, and a frontier is to be
+dropped only where it is smaller than any passage (MODEL.md section 6)."""
+
+
 @dataclass(frozen=True, eq=False)
 class CleanMap:
     """Cells that the robot can reach, all others being obstacles, and where they lie.
@@ -123,7 +129,7 @@ class RosMap:
         clean: the grid; ``clean.frame`` converts metres to cells of the worlds.
     """
 
-    settings: Mapping[str, Any] = NO_SETTINGS
+    settings: Mapping[str, Any] = NARROW_DOORS
 
     def __init__(self, config: RosMapConfig) -> None:
         """Reads and cleans the map, and places the propositions.
