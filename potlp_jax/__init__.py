@@ -7,13 +7,14 @@ The public names, from a formula to a trial:
   ``Subgoals``, ``FrontierConfig``, ``find_subgoals``
 * planning: ``product_transitions``, ``product_distances``, ``Estimates``, ``PlanningProblem``, ``enumerate_actions``,
   ``SearchConfig``, ``Plan``, ``plan_actions``, ``solve_exact``, ``bound_exact``, ``Bounds``, ``ProblemTooLargeError``,
-  ``DecisionConfig``, ``Policy``, ``decide``
+  ``DecisionConfig``, ``Policy``, ``decide``, ``Intention``
 * whole trials: ``TrialConfig``, ``run_trial``, ``Trial``, ``Outcome``, ``load_trial``; many at once: ``run_batch``,
   ``Start``, ``Finished``
 * sentinels and flags: ``NO_ACTION``, ``Status``
 """
 
 from potlp_jax.batch import Finished, Start, run_batch
+from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.exact import Bounds, ProblemTooLargeError, bound_exact, solve_exact
 from potlp_jax.planning.policies import DecisionConfig, Policy, decide
@@ -39,6 +40,7 @@ __all__ = [
     "Estimates",
     "Finished",
     "FrontierConfig",
+    "Intention",
     "Outcome",
     "Plan",
     "PlanningProblem",

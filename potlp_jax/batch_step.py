@@ -20,6 +20,7 @@ from potlp_jax.learning.estimator import NetworkEstimator
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
 from potlp_jax.learning.views import Views, remember
+from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimates, Estimator
 from potlp_jax.planning.policies import (
     Move,
@@ -88,6 +89,7 @@ class Progress:
     fallbacks: Int32[Array, "*batch"]
     status: UInt32[Array, "*batch"]
     outcome: Int8[Array, "*batch"]
+    intention: Intention
 
     @property
     def steps(self) -> Int32[Array, "*batch"]:
@@ -140,6 +142,7 @@ def begin(
         fallbacks=jnp.int32(0),
         status=status_array(),
         outcome=jnp.int8(_RUNNING),
+        intention=Intention.none(),
     )
     scene = Scene(world=world, task=arrays, planning=planning_key(key), sensing=sensing_key(key))
     return scene, _arrive(scene, progress, config)
@@ -172,7 +175,7 @@ def step(scene: Scene, params: Params | None, rules: Rules, progress: Progress) 
     plans = jax.vmap(lambda problem, key: plan_actions(problem, key, decision.search))(problem, keys)
 
     def act(progress: Progress, scene: Scene, *thoughts: Any) -> Progress:
-        move = _phase(progress.running, partial(planned_move, config=decision), *thoughts)
+        move = _phase(progress.running, partial(planned_move, config=decision), *thoughts, progress.intention)
         return _advance(rules, progress, scene, move)
 
     return _each(act, dataclasses.replace(progress, views=views), scene, situation, problem, plans)
@@ -316,4 +319,5 @@ def _went(
         decisions=progress.decisions + 1,
         fallbacks=progress.fallbacks + (move.kind == MoveKind.FALLBACK).astype(jnp.int32),
         status=progress.status | move.status,
+        intention=move.intention,
     )

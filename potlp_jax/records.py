@@ -77,6 +77,8 @@ class Decision:
     ``"none"``. ``choice`` is the index of the chosen action, None unless the policy searches. ``path`` is the part of
     the known-space path that may be executed before the next decision, starting at ``cell``. ``looks`` holds, per
     subgoal, the decision at which the panorama was taken that its estimates come from; empty where none is used.
+    ``preferred`` is the index of the action that the search found, which the robot may not have turned to; None unless
+    the policy searches, and in records that are older than it.
     """
 
     index: int
@@ -95,6 +97,14 @@ class Decision:
     actions: tuple[ActionRecord, ...]
     path: tuple[tuple[int, int], ...]
     looks: tuple[int, ...] = ()
+    preferred: int | None = None
+
+    @property
+    def kept_from(self) -> ActionRecord | None:
+        """What the search found where the robot kept to what it was on its way to instead; else None."""
+        if self.preferred is None or self.preferred == self.choice:
+            return None
+        return next(action for action in self.actions if action.index == self.preferred)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,6 +15,7 @@ from jaxtyping import PRNGKeyArray
 from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator, estimator_for, look
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.views import look_of_subgoals
+from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.history import ActionTerms
 from potlp_jax.planning.policies import Move, MoveKind, Policy, decide
@@ -103,6 +104,7 @@ class Loop:
         self._robot, self._task, self._arrays = robot, task, arrays
         self._policy, self._estimator, self._config = policy, estimator, config
         self._key = planning_key(key)
+        self._intention = Intention.none()
         self._visits: Counter[tuple[tuple[int, int], int, int]] = Counter()
         belief, cell = robot.observe()
         letter = int(belief.letters[cell])
@@ -157,9 +159,11 @@ class Loop:
             self._arrays,
             self._estimator,
             key,
+            self._intention,
             policy=self._policy,
             config=self._config.decision,
         )
+        self._intention = move.intention
         looks = _looks_of(self._estimator, move)
         self.decisions.append(_decision_record(move, index, len(self.path) - 1, cell, self.states[-1], key, looks))
         self.status |= int(move.status)
@@ -173,6 +177,10 @@ class Loop:
             is_frontier=jnp.asarray(kind in (MoveKind.ACTION, MoveKind.FRONTIER, MoveKind.FALLBACK)),
         )
         leg = self._robot.advance(move.path, stop)
+        planned = np.asarray(move.path.cells)[1 : len(leg.cells) + 1]
+        if leg.cells != tuple(as_cell(cell) for cell in planned):
+            # As in a log: a robot that went elsewhere is not on its way to what was chosen.
+            self._intention = Intention.none()
         letters = np.asarray(self._robot.observe()[0].letters)
         for cell in leg.cells:
             letter = int(letters[cell])
@@ -223,7 +231,15 @@ def _decision_record(
         actions=_action_records(move),
         path=tuple(as_cell(entry) for entry in path),
         looks=looks,
+        preferred=_preferred(move),
     )
+
+
+def _preferred(move: Move) -> int | None:
+    """Index of the action that the search found, in the task's own arrays."""
+    if move.search is None or int(move.search.plan.action) == NO_ACTION:
+        return None
+    return _unpadded_index(move, int(move.search.plan.action))
 
 
 def _looks_of(estimator: Estimator | None, move: Move) -> tuple[int, ...]:

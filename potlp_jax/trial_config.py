@@ -51,6 +51,7 @@ def trial_config_from_dict(data: Mapping[str, Any]) -> TrialConfig:
             "disturbance": Disturbance(**data.get("disturbance", {})),
             "decision": DecisionConfig(
                 **{
+                    "commitment": 0.0,  # of records older than the setting
                     **decision,
                     "frontiers": FrontierConfig(**decision["frontiers"]),
                     "search": SearchConfig(**{**decision["search"], "mode": SearchMode(decision["search"]["mode"])}),

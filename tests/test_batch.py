@@ -68,15 +68,18 @@ def ran(request):
 def test_every_trial_is_what_it_is_alone(ran):
     policy, starts, finished, _ = ran
     assert len(finished) == len(starts)
-    alone = {}
+    alone, kept = {}, 0
     for start in starts:
         number, task = start.name
         trial = run_trial(start.world, task, policy, start.key, CONFIG, arrays=start.arrays, estimator=UNTRAINED)
         fallbacks = sum(decision.fallback for decision in trial.decisions)
+        kept += sum(decision.kept_from is not None for decision in trial.decisions)
         path = [list(cell) for cell in trial.path]
         alone[number] = (trial.outcome, trial.cost, path, len(trial.decisions), fallbacks, trial.status)
     assert _figures(finished) == alone
     assert len({entry[3] for entry in alone.values()}) > 1
+    # The way on is remembered from decision to decision, and not in vain.
+    assert kept > 0 or not policy.searches
 
 
 def test_neither_neighbours_nor_order_change_a_trial(ran):

@@ -234,6 +234,7 @@ def test_each_subgoal_is_shown_in_the_centre_of_the_panorama_that_its_estimates_
         looks=(0, last.index),
         actions=tuple(_action(index, 0) for index in range(8)),
         choice=1,
+        preferred=1,
     )
     panoramas = {look: _panorama(seen_from[look], cell) for look, cell in zip(decision.looks, cells, strict=True)}
     figure = draw_panoramas(trial, decision, panoramas)

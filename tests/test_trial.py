@@ -15,16 +15,18 @@ from potlp_jax import trial as trial_module
 from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.learning.estimator import TrainedEstimator, look
+from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning import policies
 from potlp_jax.planning.policies import DecisionConfig, MoveKind, Policy, decide
 from potlp_jax.planning.search_graph import SearchConfig
 from potlp_jax.records import Outcome, RecordError, load_trial
 from potlp_jax.replay import replay_decision
+from potlp_jax.robot import Leg, SimulatedRobot
 from potlp_jax.task.task import Task, TaskSizes
-from potlp_jax.trial import run_trial
+from potlp_jax.trial import Loop, run_trial
 from potlp_jax.trial_config import TrialConfig, trial_config_from_dict
-from potlp_jax.types import Status
+from potlp_jax.types import NO_STATE, Status
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy, make_world, pad_world
 from potlp_jax.world.sensing import SensorConfig
@@ -302,6 +304,26 @@ def test_decide_under_vmap_equals_a_loop():
     for index, world in enumerate(worlds):
         for one, many in zip(jax.jit(cost)(world), together, strict=True):
             np.testing.assert_array_equal(np.asarray(one), np.asarray(many)[index])
+
+
+def test_a_robot_that_goes_elsewhere_is_on_its_way_to_nothing():
+    world, task = ROOMS.generate(world_key(Split.VALIDATION, 0, "rooms")), TASKS[0]
+    robot = SimulatedRobot(world, CONFIG, jax.random.key(0))
+
+    class StayingRobot:
+        observe, panorama = robot.observe, robot.panorama
+
+        def advance(self, path, stop):
+            return Leg(cells=(robot.observe()[1],))
+
+    for follower, stays in ((StayingRobot(), True), (robot, False)):
+        estimator = TrueMapEstimator(world=world)
+        loop = Loop(follower, task, task.padded(SIZES), Policy.ORACLE, estimator, jax.random.key(0), CONFIG)
+        move = loop._decide(*robot.observe())
+        assert int(move.intention.state) == int(task.dfa.transitions[task.dfa.initial, loop.word[0]])
+        loop._advance(robot.observe()[0], move)
+        expected = NO_STATE if stays else int(move.intention.state)
+        assert int(loop._intention.state) == expected
 
 
 def test_an_oracle_without_estimator_is_refused():

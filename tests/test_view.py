@@ -23,7 +23,7 @@ from potlp_jax.task.task import Task
 from potlp_jax.view.animation import frame_steps, save_animation
 from potlp_jax.view.automata import Automaton, draw_automaton
 from potlp_jax.view.comparisons import draw_scatter, loss_lines, outcome_table, savings_table
-from potlp_jax.view.decisions import action_table, decision_to_dict, rank_actions
+from potlp_jax.view.decisions import action_name, action_table, decision_to_dict, describe_decision, rank_actions
 from potlp_jax.view.maps import (
     FREE_SEEN,
     FREE_UNSEEN,
@@ -335,6 +335,18 @@ def test_decision_as_json_is_ranked_and_finite(trial):
 def test_chosen_action_leads_among_equals(trial):
     decision = dataclasses.replace(trial.decisions[0], actions=(_action(0, 5.0), _action(1, 5.0)), choice=1)
     assert [action.index for action in rank_actions(decision)] == [1, 0]
+
+
+def test_a_decision_that_keeps_on_says_what_was_better(trial):
+    actions = (_action(0, 9.0), _action(1, 8.5))
+    keeping = dataclasses.replace(trial.decisions[0], actions=actions, choice=0, preferred=1)
+    turning = dataclasses.replace(keeping, choice=1)
+    assert keeping.kept_from == actions[1]
+    assert describe_decision(trial, keeping).endswith(f"kept although {action_name(actions[1])} is better")
+    # Another choice than the cheapest is none that was kept: the mode of the authors takes the most visited action.
+    for other in (turning, dataclasses.replace(keeping, preferred=0), dataclasses.replace(keeping, preferred=None)):
+        assert other.kept_from is None
+        assert "kept" not in describe_decision(trial, other)
 
 
 def _tree_node(actions=(), value=7.0, **others):

@@ -56,7 +56,7 @@ def _draw(trial: Trial, decision: Decision, out: Path, depth: int, estimator: Tr
     if not decision.actions:
         fail(f"decision {decision.index} of policy {trial.policy} did not search: there is no tree to draw")
     problem, plan, tree = replay_decision(trial, decision.index, estimator)
-    if int(plan.action) != decision.choice:
+    if int(plan.action) != (decision.choice if decision.preferred is None else decision.preferred):
         note("searching again chose another action than recorded: the versions of the software may differ")
     top = tree_top(problem, tree, depth=depth, width=BREADTH)
     save_figure(draw_tree(top, describe_decision(trial, decision), breadth=BREADTH), out)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int32, PRNGKeyArray
 
+from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.policies import DecisionConfig, Move, assess, search_move
 from potlp_jax.task.task import TaskArrays
@@ -64,6 +65,7 @@ def decide_from_estimates(
     state: Int32[Array, ""],
     key: PRNGKeyArray,
     config: DecisionConfig = DecisionConfig(),
+    intention: Intention | None = None,
 ) -> Move:
     """The next move of PO-TLP (Bradley et al. 2021, Algorithm 1): choice and path target.
 
@@ -81,10 +83,12 @@ def decide_from_estimates(
       key: drives the search.
       config: settings; ``config.frontiers`` counts where no action is available and the robot falls back on the
         nearest frontier.
+      intention: ``Move.intention`` of the decision before, for ``config.commitment``; without one the robot chooses
+        afresh.
     """
     situation = assess(belief, cell, state, task, config.frontiers)
     given = dataclasses.replace(situation.subgoals, cells=subgoals.cells, mask=subgoals.mask)
-    return search_move(dataclasses.replace(situation, subgoals=given), estimates, key, config)
+    return search_move(dataclasses.replace(situation, subgoals=given), estimates, key, config, intention)
 
 
 decide_from_estimates_jit = jax.jit(decide_from_estimates, static_argnames="config")

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
+from potlp_jax.planning.commitment import Intention, intention_of, keep_on
 from potlp_jax.planning.estimates import Estimates, Estimator
 from potlp_jax.planning.history import ActionTerms, action_terms, initial_history
 from potlp_jax.planning.paths import KnownPath, shortest_path
@@ -68,12 +69,19 @@ class MoveKind:
 @dataclasses.dataclass(frozen=True)
 class DecisionConfig:
     """Settings of a decision. ``path_horizon`` is the number of moves that a decision hands out at most; None means
-    ``4 (H + W)``. ``dead_end_factor`` times ``(H + W)`` times the resolution is the cost of a dead end (MODEL.md 5)."""
+    ``4 (H + W)``. ``dead_end_factor`` times ``(H + W)`` times the resolution is the cost of a dead end (MODEL.md 5).
+    ``commitment`` is by how much, as a fraction of its expected cost, another action must be cheaper before a robot on
+    its way turns to it; 0: at once, as published."""
 
     frontiers: FrontierConfig = FrontierConfig()
     search: SearchConfig = SearchConfig()
     dead_end_factor: float = 4.0
+    commitment: float = 0.15
     path_horizon: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.commitment < 0.0:
+            raise ValueError(f"commitment is {self.commitment}, must be at least 0")
 
     def horizon(self, height: int, width: int) -> int:
         """Moves in the path of one decision on a map of this size."""
@@ -94,9 +102,10 @@ class Move:
     """Where to go next.
 
     ``kind`` is one of ``MoveKind``; ``target_cell`` and ``target_state`` say where the path leads in the product of
-    known space; ``action`` is the planner's choice (``NO_ACTION`` for policies that do not search). ``value`` is the
-    expected cost to go (for policies that do not search: the cost of the path, or ``inf`` for NONE). ``subgoals`` are
-    those of the current belief; ``search`` is None for policies that do not search.
+    known space; ``action`` is the planner's choice (``NO_ACTION`` for policies that do not search): that of
+    ``search.plan``, or the one that the robot keeps to. ``value`` is the expected cost to go (for policies that do not
+    search: the cost of the path, or ``inf`` for NONE). ``subgoals`` are those of the current belief; ``search`` is None
+    for policies that do not search. ``intention`` is for the next decision.
     """
 
     kind: Int32[Array, "*batch"]
@@ -107,6 +116,7 @@ class Move:
     path: KnownPath
     subgoals: Subgoals
     search: Search | None
+    intention: Intention
     status: UInt32[Array, "*batch"]
 
 
@@ -164,20 +174,22 @@ def decide(
     task: TaskArrays,
     estimator: Estimator | None,
     key: PRNGKeyArray,
+    intention: Intention | None = None,
     *,
     policy: Policy,
     config: DecisionConfig,
 ) -> Move:
     """The next move of ``policy``: pure, for jit and vmap (``policy`` and ``config`` static).
 
-    ``estimator`` answers P_S, R_S and R_F for the policies that search and is None for the others.
+    ``estimator`` answers P_S, R_S and R_F for the policies that search and is None for the others. ``intention`` is
+    that of the move before; without one the robot chooses afresh.
     """
     situation = assess(belief, cell, state, task, config.frontiers)
     if not policy.searches:
         return direct_move(situation, policy, config)
     if estimator is None:
         raise ValueError(f"policy {policy.value!r} needs an estimator")
-    return search_move(situation, estimator(belief, situation.subgoals, task), key, config)
+    return search_move(situation, estimator(belief, situation.subgoals, task), key, config, intention)
 
 
 def direct_move(situation: Situation, policy: Policy, config: DecisionConfig) -> Move:
@@ -251,19 +263,29 @@ def _finish_or_frontier(situation: Situation, config: DecisionConfig) -> Move:
     return _move(situation, config, kind, target_cell, target_state, value)
 
 
-def search_move(situation: Situation, estimates: Estimates, key: PRNGKeyArray, config: DecisionConfig) -> Move:
+def search_move(
+    situation: Situation,
+    estimates: Estimates,
+    key: PRNGKeyArray,
+    config: DecisionConfig,
+    intention: Intention | None = None,
+) -> Move:
     """PO-TLP (Bradley et al. 2021, Algorithm 1): search, and go toward the chosen action's subgoal.
 
     ``estimates`` are those of the situation's subgoals. Where no action is available: the nearest frontier.
     """
     problem = planning_problem(situation, estimates, config)
-    return planned_move(situation, problem, plan_actions(problem, key, config.search), config)
+    plan = plan_actions(problem, key, config.search)
+    return planned_move(situation, problem, plan, Intention.none() if intention is None else intention, config)
 
 
-def planned_move(situation: Situation, problem: PlanningProblem, plan: Plan, config: DecisionConfig) -> Move:
-    """The move that carries out the plan of a situation's problem."""
+def planned_move(
+    situation: Situation, problem: PlanningProblem, plan: Plan, intention: Intention, config: DecisionConfig
+) -> Move:
+    """The move that carries out the plan of a situation's problem, or keeps to what the robot is on its way to."""
     task, subgoals = situation.task, situation.subgoals
     search = Search(problem=problem, plan=plan, terms=action_terms(problem, initial_history(problem)))
+    plan = keep_on(plan, intention, situation.state, subgoals, task, jnp.float32(config.commitment))
 
     frontier_cell, frontier_state, frontier_cost = _nearest_frontier(situation)
     finishes = plan.action == subgoals.mask.shape[0] * task.edge_mask.shape[0]
@@ -285,6 +307,7 @@ def planned_move(situation: Situation, problem: PlanningProblem, plan: Plan, con
         plan.value,
         action=plan.action,
         search=search,
+        intention=intention_of(plan, situation.state, subgoals, task),
         status=status,
     )
 
@@ -323,6 +346,7 @@ def _optimistic(situation: Situation, config: DecisionConfig) -> Move:
         path=known,
         subgoals=situation.subgoals,
         search=None,
+        intention=Intention.none(),
         status=situation.subgoals.status | status_if(kind == MoveKind.NONE, Status.NO_FRONTIER),
     )
 
@@ -359,6 +383,7 @@ def _move(
     value: Float32[Array, ""],
     action: Int32[Array, ""] | None = None,
     search: Search | None = None,
+    intention: Intention | None = None,
     status: UInt32[Array, ""] | None = None,
 ) -> Move:
     goes = kind != MoveKind.NONE
@@ -385,6 +410,7 @@ def _move(
         path=path,
         subgoals=situation.subgoals,
         search=search,
+        intention=Intention.none() if intention is None else intention,
         status=bits | situation.subgoals.status | status_if(~goes, Status.NO_FRONTIER),
     )
 

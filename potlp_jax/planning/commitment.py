@@ -1,0 +1,84 @@
+"""Keeping on: a robot on its way to a subgoal turns to another only where that is cheaper by more than a fraction.
+
+Expected costs change with every look, by errors that have nothing to do with the world, most of all where a frontier
+falls into two. A search that begins anew at every decision pays for each such change with the way back. Errors grow
+with what is still to be paid, so the advantage that is believed is a fraction of it.
+"""
+
+import dataclasses
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float32, Int32
+
+from potlp_jax.planning.pouct import Plan
+from potlp_jax.task.task import TaskArrays
+from potlp_jax.types import NO_ACTION, NO_STATE
+from potlp_jax.world.frontiers import Subgoals
+
+SAME_WITHIN: int = 8
+"""Cells, in rows and in columns, within which a subgoal may be the one of the decision before: frontiers recede as the
+robot nears them, and it decides again after 4 cells."""
+
+
+@struct.dataclass(kw_only=True)
+class Intention:
+    """What the robot is on its way to: the subgoal at ``cell``, to try for the transition ``edge`` beyond it.
+
+    ``state`` is the automaton's state when that was decided, ``NO_STATE`` where the robot is on its way to none.
+    """
+
+    cell: Int32[Array, "*batch 2"]
+    edge: Int32[Array, "*batch"]
+    state: Int32[Array, "*batch"]
+
+    @staticmethod
+    def none() -> "Intention":
+        """Of a robot that has decided nothing yet."""
+        return Intention(cell=jnp.zeros(2, jnp.int32), edge=jnp.int32(0), state=jnp.int32(NO_STATE))
+
+
+def keep_on(
+    plan: Plan,
+    intention: Intention,
+    state: Int32[Array, ""],
+    subgoals: Subgoals,
+    task: TaskArrays,
+    commitment: Float32[Array, ""],
+) -> Plan:
+    """The plan, with the intended action in place of the chosen one where that costs no more than by ``commitment``.
+
+    The intended action tries for the same transition at the subgoal that is nearest to the former one, within
+    ``SAME_WITHIN`` cells. Nothing is kept once the automaton's ``state`` has changed, nor where the plan is to finish.
+    ``commitment`` is a fraction of the expected cost of the chosen action.
+    """
+    count, edges = subgoals.mask.shape[0], task.edge_mask.shape[0]
+    q_values = plan.q_values[: count * edges].reshape(count, edges)[:, intention.edge]
+    away = jnp.max(jnp.abs(subgoals.cells - intention.cell[None]), axis=1)
+    same = subgoals.mask & jnp.isfinite(q_values) & (away <= SAME_WITHIN)
+    subgoal = jnp.argmin(jnp.where(same, away, SAME_WITHIN + 1)).astype(jnp.int32)
+    acts = (plan.action != NO_ACTION) & (plan.action != count * edges)
+    keeps = acts & (intention.state == state) & jnp.any(same) & (q_values[subgoal] <= (1.0 + commitment) * plan.value)
+    chosen = dataclasses.replace(
+        plan,
+        action=subgoal * edges + intention.edge,
+        subgoal=subgoal,
+        from_state=task.edges[intention.edge, 0],
+        to_state=task.edges[intention.edge, 1],
+        value=q_values[subgoal],
+    )
+    names = ("action", "subgoal", "from_state", "to_state", "value")
+    return dataclasses.replace(
+        plan, **{name: jnp.where(keeps, getattr(chosen, name), getattr(plan, name)) for name in names}
+    )
+
+
+def intention_of(plan: Plan, state: Int32[Array, ""], subgoals: Subgoals, task: TaskArrays) -> Intention:
+    """What a robot is on its way to that carries out this plan in the automaton's ``state``."""
+    edges = task.edge_mask.shape[0]
+    acts = (plan.action != NO_ACTION) & (plan.action != subgoals.mask.shape[0] * edges)
+    return Intention(
+        cell=subgoals.cells[jnp.maximum(plan.subgoal, 0)],
+        edge=jnp.where(acts, plan.action % edges, 0),
+        state=jnp.where(acts, state, NO_STATE),
+    )
