@@ -38,6 +38,7 @@ from potlp_jax.task.task import Task
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.ticker import LogLocator, ScalarFormatter
 
 SUBGOALS, GOALS = 8, 3
 DEAD_END_COST = 500.0
@@ -308,6 +309,9 @@ def plot(found: dict[str, list[Rate]], path: Path) -> None:
         ticks = [abscissa(name, rate) for rate in group]
         axis.set_xticks(ticks, [str(tick) for tick in ticks], minor=False)
         axis.minorticks_off()
+        # One decade or less: its powers of ten alone would leave the axis without numbers.
+        axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.yaxis.set_major_formatter(ScalarFormatter())
         axis.grid(alpha=0.25, which="both")
     axes[0].set_ylabel("CPU µs a simulation of one search")
     figure.tight_layout()
