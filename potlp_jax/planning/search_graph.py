@@ -23,12 +23,18 @@ from potlp_jax.planning.history import (
     initial_history,
     terms_of_all,
 )
+from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search_arrays import least_of_each, mix, pack_rows
 from potlp_jax.types import NO_STATE
 
 WINDOW: int = 8
 """Slots of the table of nodes that a history may be found in. Where all are taken the node is not entered: it is then
 not shared between orders, which costs simulations but no correctness."""
+
+OPTIMISM: float = 0.3
+FEW_SUBGOALS: int = 3
+OPTIMISM_OF_FEW: float = 0.7
+"""Optimism of a search that is not told (``SearchConfig.optimism``): of few subgoals, and of more."""
 
 NOWHERE: int = -1
 """Spot of actions that are not attempted beyond a subgoal: finish, and padding."""
@@ -60,6 +66,8 @@ class SearchConfig:
         look at.
       optimism: fraction by which guesses may be too high: the descent takes the action that would be best if they all
         were. 1 looks at everything that the guesses cannot rule out, so that a search that ends by itself is exact.
+        None: .7 in problems of up to 3 subgoals, where one wrong guess weighs more and there is less to look at, else
+        .3 (docs/results/planner.md).
       max_depth: actions per descent; one that gets there is cut, valued by what is known of its last node, and
         flagged.
       tree_capacity: nodes per tree, at least 1; None for one more than simulations. A full tree is flagged.
@@ -70,7 +78,7 @@ class SearchConfig:
     """
 
     simulations: int = 300
-    optimism: float = 0.3
+    optimism: float | None = None
     max_depth: int = 32
     tree_capacity: int | None = None
     guess_failures: int = 24
@@ -82,7 +90,7 @@ class SearchConfig:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"SearchConfig.{name} is {value}, must be at least 1")
-        if not 0 <= self.optimism <= 1:
+        if self.optimism is not None and not 0 <= self.optimism <= 1:
             raise ValueError(f"SearchConfig.optimism is {self.optimism}, must lie in [0, 1]")
         if not self.exploration >= 0:
             raise ValueError(f"SearchConfig.exploration is {self.exploration}, must not be negative")
@@ -166,7 +174,7 @@ class Context:
 
     ``rule`` guesses; ``packed`` holds all of an action's row of the tables (``pack_rows``); ``facts`` holds per action
     the number of the (subgoal, z') where it is attempted and whether its success satisfies the task; ``relevant``
-    masks per state the conditions that later choices can depend on.
+    masks per state the conditions that later choices can depend on; ``optimism`` is that of each problem.
     """
 
     tables: ActionTables
@@ -176,6 +184,7 @@ class Context:
     relevant: UInt32[Array, "*B Z W"]
     root: History
     dead_end_cost: Float32[Array, "*B"]
+    optimism: Float32[Array, "*B"]
     seeds: UInt32[Array, "*B 2"]
 
 
@@ -243,8 +252,17 @@ def prepare(structure: Any, leaves: Sequence[Array], seeds: UInt32[Array, "B 2"]
         relevant=jax.vmap(_relevant_conditions)(tables, reach),
         root=root,
         dead_end_cost=problems.dead_end_cost,
+        optimism=_optimism(problems, config),
         seeds=seeds,
     )
+
+
+def _optimism(problems: PlanningProblem, config: SearchConfig) -> Float32[Array, "B"]:
+    """``SearchConfig.optimism`` of each problem."""
+    subgoals = jnp.sum(problems.subgoal_mask, axis=1, dtype=jnp.int32)
+    if config.optimism is not None:
+        return jnp.full(subgoals.shape, config.optimism, jnp.float32)
+    return jnp.where(subgoals <= FEW_SUBGOALS, OPTIMISM_OF_FEW, OPTIMISM).astype(jnp.float32)
 
 
 def _reachable(tables: ActionTables) -> Bool[Array, "Z Z"]:
@@ -302,7 +320,7 @@ def new_node(context: Context, history: History, config: SearchConfig) -> Node:
         known = terms.distance + chance * terms.success_cost + (1.0 - chance) * terms.failure_cost
         guessed = chance * won + (1.0 - chance) * lost
         q_values = jnp.where(available, known + guessed, jnp.inf)
-        bounds = jnp.where(available, known + (1.0 - config.optimism) * guessed, jnp.inf)
+        bounds = jnp.where(available, known + (1.0 - context.optimism[:, None]) * guessed, jnp.inf)
     return Node(q_values=q_values, bounds=bounds, chances=chance, success_costs=terms.success_cost, lost=lost, won=won)
 
 

@@ -177,7 +177,7 @@ def _descend(context: Context, tree: Tree, config: SearchConfig) -> _Descent:
             step = _sampled_step(odds, success, q_values[rows, action], bounds[rows, action])
             step = dataclasses.replace(step, add=step.add + jnp.where(goes_inside, 0.0, descent.owed))
         else:
-            step = _expected_step(context, tree, odds, children, accepts, config)
+            step = _expected_step(context, tree, odds, children, accepts)
             step = dataclasses.replace(step, add=descent.owed)
         outcome = step.success.astype(jnp.int32)
         child = children[rows, outcome]
@@ -262,12 +262,11 @@ def _expected_step(
     odds: _Odds,
     children: Int32[Array, "B 2"],
     accepts: Bool[Array, "B"],
-    config: SearchConfig,
 ) -> _Step:
     """Follow the outcome to which the action owes more of the gap between its Q and its bound."""
     chance = odds.chance
-    won, won_bound = _outcome(context, tree, children[:, 1], odds.won, odds.success_cost, config)
-    lost, lost_bound = _outcome(context, tree, children[:, 0], odds.lost, odds.failure_cost, config)
+    won, won_bound = _outcome(context, tree, children[:, 1], odds.won, odds.success_cost)
+    lost, lost_bound = _outcome(context, tree, children[:, 0], odds.lost, odds.failure_cost)
     success = chance * (won - won_bound) >= (1.0 - chance) * (lost - lost_bound)
     # Nothing is to be learnt from satisfying the task, and a certain success cannot fail.
     success = (success & ~accepts) | (chance >= 1.0)
@@ -306,13 +305,12 @@ def _outcome(
     child: Int32[Array, "B"],
     guessed: Float32[Array, "B"],
     owed: Float32[Array, "B"],
-    config: SearchConfig,
 ) -> tuple[Float32[Array, "B"], Float32[Array, "B"]]:
     """Value and bound of an outcome: those of its node, or by the guess where there is none."""
     rows = jnp.arange(child.shape[0], dtype=jnp.int32)
     value, bound = arrival(tree.values[rows, jnp.maximum(child, 0)], owed, context.dead_end_cost)
     new = child == Tree.UNVISITED
-    return jnp.where(new, guessed, value), jnp.where(new, (1.0 - config.optimism) * guessed, bound)
+    return jnp.where(new, guessed, value), jnp.where(new, (1.0 - context.optimism) * guessed, bound)
 
 
 def _expand(
