@@ -104,7 +104,7 @@ def test_regret_is_small_at_the_default_budget(plans, solutions):
 
 
 def test_a_wrong_guess_is_found_out_where_there_is_one_subgoal():
-    """In the third of these problems the best action's guess is 44 % too high, and an optimism of .3 ends without it."""
+    """In the third of these the best action's guess is 44 % too high, and an optimism of .3 ends without it."""
     problems = [family_problem("three-single", 1, "test", index) for index in range(4)]
     plans = plan_many(problems, keys(len(problems)), SearchConfig())
     np.testing.assert_allclose(plans.value, [solve_exact(problem).value for problem in problems], rtol=1e-5)
@@ -159,15 +159,12 @@ def test_authors_mode_equals_a_literal_version(formula, seed):
     problem = shared_shape(formula, seed, unreachable=0.1)
     key = jax.random.key(seed)
     plan, tree = tree_jit(problem, key, config=AUTHORS)
-    seeds = jax.random.bits(key, (1, 2), jnp.uint32)
-    numbers = np.asarray(
-        [
-            [float(uniform(seeds, jnp.full((1,), k, jnp.int32), jnp.int32(level))[0]) for level in range(12)]
-            for k in range(AUTHORS.simulations)
-        ]
-    )
+    count = AUTHORS.simulations
+    seeds = jnp.broadcast_to(jax.random.bits(key, (1, 2), jnp.uint32), (count, 2))
+    draw = jax.vmap(uniform, in_axes=(None, None, 0), out_axes=1)
+    numbers = np.asarray(draw(seeds, jnp.arange(count, dtype=jnp.int32), jnp.arange(12, dtype=jnp.int32)), np.float64)
     reference = ReferenceProblem(problem)
-    visits, means = authors_pouct(reference, AUTHORS.simulations, 50.0, lambda k, level: numbers[k, level])
+    visits, means = authors_pouct(reference, count, 50.0, lambda k, level: numbers[k, level])
     for action, count in visits.items():
         assert int(plan.visits[reference.index(action)]) == count
         np.testing.assert_allclose(plan.q_values[reference.index(action)], means[action], rtol=1e-4)

@@ -6,7 +6,7 @@ a heap and with buckets (``eval/bench/opponents/dijkstra_numba.py``; they need `
 distances are compared with the library's. Times are medians over repeats, in
 milliseconds of processor time per source, so that other work on the machine counts little; pin the process to a core.
 
-    taskset -c 0 python -m eval.bench.distances --out distances.json
+    taskset -c 0 python -m eval.bench.distances --out distances.json --plot distances.png
     taskset -c 0 python -m eval.bench.distances --quick
 """
 
@@ -23,6 +23,7 @@ from typing import cast
 
 import jax
 import jax.numpy as jnp
+import matplotlib as mpl
 import numpy as np
 import scipy.sparse
 from jaxtyping import Bool, Int32
@@ -33,6 +34,9 @@ from potlp_jax.environments.rooms import Rooms, RoomsConfig
 from potlp_jax.planning.product import distance_table, product_distances, product_transitions
 from potlp_jax.planning.sweeps import NEIGHBOURS
 from potlp_jax.task.task import Task
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
 
 TASKS = {1: "1", 4: "F a & F b", 8: "F a & F b & F c"}
 """Tasks by their number of states."""
@@ -275,12 +279,51 @@ def table_of(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
+def growth(rows: list[dict]) -> dict[str, float]:
+    """Exponent with which our time a source grows with the side of the office maps, by labels and Z: 2 is per cell."""
+    return {
+        f"{labels} Z {states}": float(np.polyfit(*np.log([(row["size"], row["table_ms"]) for row in group]).T, 1)[0])
+        for (labels, states), group in _by_size(rows).items()
+    }
+
+
+def _by_size(rows: list[dict]) -> dict[tuple[str, int], list[dict]]:
+    """Rows of office maps by labels and Z, where there are several sizes."""
+    kinds = sorted({(row["labels"], row["states"]) for row in rows})
+    groups = {
+        kind: [row for row in rows if row["map"] == "office" and (row["labels"], row["states"]) == kind]
+        for kind in kinds
+    }
+    return {kind: group for kind, group in groups.items() if len(group) > 1}
+
+
+def plot(rows: list[dict], path: str) -> None:
+    """Time a source over the side of the office maps, ours and the opponents'."""
+    groups, slopes = _by_size(rows), growth(rows)
+    figure, axes = plt.subplots(1, len(groups), figsize=(3.2 * len(groups), 3.2), sharey=True, squeeze=False)
+    for axis, ((labels, states), group) in zip(axes[0], groups.items(), strict=True):
+        sizes = [row["size"] for row in group]
+        for column, name in (("table_ms", "ours"), *((f"{name}_ms", name) for name in _opponents())):
+            axis.plot(sizes, [row[column] for row in group], "o-", label=name)
+        axis.set(xscale="log", yscale="log", xlabel="side of the map")
+        axis.set_title(f"{labels}, Z {states}: ours ~ side^{slopes[f'{labels} Z {states}']:.2f}", fontsize=9)
+        axis.set_xticks(sizes, [str(size) for size in sizes])
+        axis.minorticks_off()
+        axis.grid(alpha=0.25)
+    axes[0, 0].set_ylabel("CPU ms a source")
+    axes[0, 0].legend(fontsize=8)
+    figure.tight_layout()
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="maps of 64² only")
     parser.add_argument("--only", default="", help="cases whose description contains this, e.g. 'office 256 8 points'")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", help="JSON file for the rows")
+    parser.add_argument("--plot", help="picture of how the time grows with the map")
     arguments = parser.parse_args()
     rows = []
     for case in QUICK if arguments.quick else CASES:
@@ -288,11 +331,18 @@ def main() -> None:
             rows.append(measure(case, arguments.repeats, SOURCES if case.size < 512 else 4))
             print(json.dumps(rows[-1]), flush=True)
     print(table_of(rows))
+    print("Our time a source grows with the side to the power:", growth(rows))
+    if arguments.plot:
+        plot(rows, arguments.plot)
     if arguments.out:
         versions = {"jax": jax.__version__, "numpy": np.__version__, "scipy": scipy.__version__}
         versions |= {"python": platform.python_version(), "device": str(jax.devices()[0])}
         with open(arguments.out, "w", encoding="utf-8") as file:
-            json.dump({"versions": versions, "repeats": arguments.repeats, "rows": rows}, file, indent=1)
+            json.dump(
+                {"versions": versions, "repeats": arguments.repeats, "growth": growth(rows), "rows": rows},
+                file,
+                indent=1,
+            )
 
 
 if __name__ == "__main__":
