@@ -219,6 +219,10 @@ def _decision_from_dict(data: Mapping[str, Any]) -> Decision:
     values["path"] = _cells(data["path"])
     values["looks"] = tuple(data.get("looks", ()))
     values["actions"] = tuple(_action_from_dict(action) for action in data["actions"])
+    listed = {action.index for action in values["actions"]}
+    for name in ("choice", "preferred"):
+        if values.get(name) is not None and values[name] not in listed:
+            raise ValueError(f"decision {values['index']}: {name} {values[name]} is none of its actions")
     return Decision(**values)
 
 

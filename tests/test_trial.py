@@ -170,6 +170,12 @@ def test_damaged_records_are_refused(tmp_path):
     path.write_text(json.dumps({"format": "potlp-trial-1"}))
     with pytest.raises(RecordError, match="damaged"):
         load_trial(path)
+    world = ROOMS.generate(world_key(Split.VALIDATION, 0, "rooms"))
+    data = _run(world, TASKS[0], Policy.ORACLE, 0).to_dict()
+    data["decisions"][0]["preferred"] = 999
+    path.write_text(json.dumps(data))
+    with pytest.raises(RecordError, match="preferred 999 is none of its actions"):
+        load_trial(path)
 
 
 def test_a_start_that_violates_is_infeasible_without_a_move():
