@@ -193,15 +193,11 @@ class Links:
 
     def arrival_at(self, layer: Float32[Array, "H W Q"], cells: Int32[Array, "N 2"]) -> Float32[Array, "N Q"]:
         """As ``cheapest_arrival`` for some cells."""
-        height, width, lanes = layer.shape
-        best = jnp.full((cells.shape[0], lanes), jnp.inf, jnp.float32)
-        for step, offset in zip(self.steps, NEIGHBOURS, strict=True):
-            beside = cells + jnp.asarray(offset, jnp.int32)[None, :]
-            # Off the grid there is nothing; a negative index would wrap round.
-            beside = jnp.where(beside < 0, max(height, width), beside)
-            from_there = layer.at[beside[:, 0], beside[:, 1]].get(mode="fill", fill_value=jnp.inf)
-            best = _smaller(from_there + step[cells[:, 0], cells[:, 1]][:, None], best)
-        return best
+        beside = cells[None] + jnp.asarray(NEIGHBOURS, jnp.int32)[:, None]
+        # Off the grid there is nothing; a negative index would wrap round.
+        beside = jnp.where(beside < 0, max(layer.shape[:2]), beside)
+        from_there = layer.at[beside[:, :, 0], beside[:, :, 1]].get(mode="fill", fill_value=jnp.inf)
+        return jnp.min(from_there + self.steps[:, cells[:, 0], cells[:, 1], None], axis=0)
 
     def _step(self, rows: int, columns: int) -> Float32[Array, "H W"]:
         """Length of the move into each cell from its neighbour at the offset (rows, columns)."""
