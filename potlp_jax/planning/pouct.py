@@ -48,7 +48,8 @@ class Plan:
       q_values: expected cost of each action, inf where it is not available.
       visits: simulations that began with each action.
       gap: convergence: the part of ``value`` by which it might still fall if all that was guessed on the way to it were
-        too high by the search's optimism (``SearchConfig``). 0: nothing is left to look at. inf in the mode ``AUTHORS_CODE``.
+        too high by the search's optimism (``SearchConfig``). 0: nothing is left to look at. inf in the mode
+        ``AUTHORS_CODE``.
       status: bits of ``types.Status``.
     """
 
