@@ -23,7 +23,7 @@ from potlp_jax.bench.timing import environment as describe_environment
 from potlp_jax.cli.inputs import read_environment_task, trial_config
 from potlp_jax.cli.output import console, fail, package_version, print_json, progress_bar
 from potlp_jax.environments import make
-from potlp_jax.learning.estimator import estimator_for
+from potlp_jax.learning.estimator import TrainedEstimator, estimator_for
 from potlp_jax.planning.families import FAMILIES
 from potlp_jax.planning.policies import DecisionConfig
 
@@ -61,9 +61,11 @@ def run_bench(
             progress.update(bar, description="looking around in a world")
             generator = make(environment)
             task = read_environment_task(generator, task_name)
+            # First of all, so that a missing one is told before anything long.
+            trained = estimator_for(task.propositions) if "looking" in chosen else None
             scene = make_scene(make_world(environment, size, world), task)
             progress.update(bar, description="compiling and measuring")
-            rows |= _measure_scene(scene, task.propositions, chosen, decision, sources, repeats)
+            rows |= _measure_scene(scene, trained, chosen, decision, sources, repeats)
     where = describe_environment()
     if json:
         print_json({"potlp_jax": package_version(), "environment": where, "rows": _plain(rows)})
@@ -73,15 +75,13 @@ def run_bench(
 
 def _measure_scene(
     scene: Scene,
-    propositions: tuple[str, ...],
+    trained: TrainedEstimator | None,
     chosen: list[str],
     decision: DecisionConfig,
     sources: int,
     repeats: int,
 ) -> dict[str, list[Any]]:
     rows: dict[str, list[Any]] = {}
-    # First of all, so that a missing one is told before the long measurements.
-    trained = estimator_for(propositions) if "looking" in chosen else None
     if "distances" in chosen:
         rows["distances"] = [measure_distances(scene, sources, repeats)]
     if "decision" in chosen:
