@@ -281,10 +281,11 @@ def table_of(rows: list[dict]) -> str:
 
 def growth(rows: list[dict]) -> dict[str, float]:
     """Exponent with which our time a source grows with the side of the office maps, by labels and Z: 2 is per cell."""
-    return {
-        f"{labels} Z {states}": float(np.polyfit(*np.log([(row["size"], row["table_ms"]) for row in group]).T, 1)[0])
-        for (labels, states), group in _by_size(rows).items()
-    }
+    slopes = {}
+    for (labels, states), group in _by_size(rows).items():
+        sizes, times = np.log([row["size"] for row in group]), np.log([row["table_ms"] for row in group])
+        slopes[f"{labels} Z {states}"] = float(np.polyfit(sizes, times, 1)[0])
+    return slopes
 
 
 def _by_size(rows: list[dict]) -> dict[tuple[str, int], list[dict]]:
