@@ -3,6 +3,7 @@
     python -m eval.table1 --out out/table1                       # 4 tasks × 750 test worlds × 5 policies
     python -m eval.table1 --out out/rehearsal --split validation --first-world 1000 --worlds 60
     python -m eval.table1 --out out/table1 --report docs/results/table1
+    python -m eval.table1 --out out/table1 --as-it-is            # what is finished so far; nothing is run
 
 The sweep is killed once with SIGKILL, workers and all, and started again; the same command goes on where it stopped.
 Then every word is judged by an evaluator that shares no code with the library, and every path's moves and cost are
@@ -191,8 +192,10 @@ def main() -> None:
     parser.add_argument("--first-world", type=int, default=0)
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--report", type=Path, help="without suffix: where results and picture go")
+    parser.add_argument("--as-it-is", action="store_true", help="report what is finished in the folder, run nothing")
     arguments = parser.parse_args()
-    run(arguments.out, arguments.split, arguments.worlds, arguments.first_world, arguments.processes)
+    if not arguments.as_it_is:
+        run(arguments.out, arguments.split, arguments.worlds, arguments.first_world, arguments.processes)
     found = results(arguments.out)
     print(markdown(found))
     for problem in found["problems"]:

@@ -271,10 +271,20 @@ def benchmark(arguments: argparse.Namespace) -> Iterator[Row]:
                 f"{family} S={subgoals}: {len(chosen)} of {arguments.instances} instances have a choice to make",
                 flush=True,
             )
-            for name in arguments.planners if chosen else ():
+            for name, planner in (_planners(arguments) if chosen else {}).items():
                 few = chosen[: FEW.get(name, len(chosen))]
-                budgets = [budget for budget in arguments.budgets if budget <= LARGEST.get(name, budget)]
-                yield from _rows(arguments.split, (family, subgoals), few, PLANNERS[name], budgets)
+                largest = LARGEST.get(name.partition(",")[0], max(arguments.budgets))
+                budgets = [budget for budget in arguments.budgets if budget <= largest]
+                yield from _rows(arguments.split, (family, subgoals), few, planner, budgets)
+
+
+def _planners(arguments: argparse.Namespace) -> dict[str, Callable[..., Iterator[Answer]]]:
+    """Those that were asked for, and our own with each optimism."""
+    chosen = {name: PLANNERS[name] for name in arguments.planners}
+    for optimism in arguments.optimism:
+        name = f"ours, optimism {optimism:g}"
+        chosen[name] = ours(name, optimism=optimism)
+    return chosen
 
 
 Instance = tuple[int, PlanningProblem, Truth]
@@ -394,6 +404,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--split", choices=splits, default="test", help="tune on 'tuning' only")
     parser.add_argument("--budgets", nargs="+", type=int, default=[10, 30, 100, 300, 1000, 10_000, 100_000])
     parser.add_argument("--planners", nargs="+", choices=list(PLANNERS), default=list(PLANNERS), metavar="NAME")
+    parser.add_argument("--optimism", nargs="+", type=float, default=[], metavar="W", help="our search with each, too")
     parser.add_argument("--seconds", type=float, default=60.0, help="for the truth of one instance")
     parser.add_argument("--quick", action="store_true", help="one family, S = 4, 6 tuning instances, two budgets")
     parser.add_argument("--out", default="out/bench/regret")
