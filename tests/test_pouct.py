@@ -174,13 +174,15 @@ def test_authors_mode_equals_a_literal_version(formula, seed):
 
 
 def test_a_search_goes_on_where_it_stopped():
-    """Twice 40 simulations are 80, in the mode whose random numbers count simulations."""
+    """Twice 40 simulations are 80, also in a batch; the rows keep their own pace."""
     problem = shared_shape("F a & F b", 3, unreachable=0.1)
-    half = SearchConfig(simulations=40, tree_capacity=90, mode=SearchMode.AUTHORS_CODE)
-    one = tree_jit(problem, jax.random.key(0), config=dataclasses.replace(half, simulations=80))
-    _, tree = tree_jit(problem, jax.random.key(0), config=half)
-    assert_same_plans(one, tree_jit(problem, jax.random.key(0), config=half, tree=tree))
-    assert not np.array_equal(one[1].simulations, tree.simulations)
+    for mode in SearchMode:
+        half = SearchConfig(simulations=40, tree_capacity=90, optimism=1.0, mode=mode)
+        whole = dataclasses.replace(half, simulations=80)
+        one = tree_jit(problem, jax.random.key(0), config=whole)
+        _, tree = tree_jit(problem, jax.random.key(0), config=half)
+        assert_same_plans(one, tree_jit(problem, jax.random.key(0), config=half, tree=tree))
+        assert not np.array_equal(one[1].simulations, tree.simulations)
 
 
 def test_seconds_as_the_budget():
