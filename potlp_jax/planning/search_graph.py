@@ -32,9 +32,10 @@ WINDOW: int = 8
 not shared between orders, which costs simulations but no correctness."""
 
 OPTIMISM: float = 0.3
-FEW_SUBGOALS: int = 3
+FEW_ACTIONS: int = 41
 OPTIMISM_OF_FEW: float = 0.7
-"""Optimism of a search that is not told (``SearchConfig.optimism``): of few subgoals, and of more."""
+"""Optimism of a search that is not told (``SearchConfig.optimism``): of few actions, and of more. 41 are 8 subgoals
+with 5 attempts each, and finish."""
 
 NOWHERE: int = -1
 """Spot of actions that are not attempted beyond a subgoal: finish, and padding."""
@@ -66,7 +67,7 @@ class SearchConfig:
         look at.
       optimism: fraction by which guesses may be too high: the descent takes the action that would be best if they all
         were. 1 looks at everything that the guesses cannot rule out, so that a search that ends by itself is exact.
-        None: .7 in problems of up to 3 subgoals, where one wrong guess weighs more and there is less to look at, else
+        None: .7 in problems of up to 41 actions, where one wrong guess weighs more and there is less to look at, else
         .3 (docs/results/planner.md).
       max_depth: actions per descent; one that gets there is cut, valued by what is known of its last node, and
         flagged.
@@ -262,7 +263,8 @@ def _optimism(problems: PlanningProblem, config: SearchConfig) -> Float32[Array,
     subgoals = jnp.sum(problems.subgoal_mask, axis=1, dtype=jnp.int32)
     if config.optimism is not None:
         return jnp.full(subgoals.shape, config.optimism, jnp.float32)
-    return jnp.where(subgoals <= FEW_SUBGOALS, OPTIMISM_OF_FEW, OPTIMISM).astype(jnp.float32)
+    actions = subgoals * jnp.sum(problems.task.edge_mask, axis=1, dtype=jnp.int32) + 1
+    return jnp.where(actions <= FEW_ACTIONS, OPTIMISM_OF_FEW, OPTIMISM).astype(jnp.float32)
 
 
 def _reachable(tables: ActionTables) -> Bool[Array, "Z Z"]:
