@@ -7,6 +7,7 @@ two processes on one store do not run the same trial. Should they all the same, 
 
 import contextlib
 import dataclasses
+import itertools
 import json
 import os
 import socket
@@ -85,6 +86,10 @@ CREATE TABLE claims (
     PRIMARY KEY (environment, task, policy, world)
 ) WITHOUT ROWID;
 """
+
+
+_THE_ITEM = "environment = ? AND task = ? AND policy = ? AND world = ?"
+"""Condition on the primary key of a trial or a claim."""
 
 
 class Store:
@@ -173,8 +178,7 @@ class Store:
     def claim(self, items: Sequence[Item], count: int) -> list[Item]:
         """Up to ``count`` of the items, in their order, that have no row and that no living process has claimed."""
         with self._transaction():
-            taken = self.done() | self._claimed()
-            free = [item for item in items if item not in taken][:count]
+            free = list(itertools.islice(filter(self._is_free, items), count))
             now = time.time()
             self._connection.executemany(
                 "INSERT OR REPLACE INTO claims VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
@@ -207,24 +211,25 @@ class Store:
         return [_row(entry) for entry in found]
 
     def _give_up(self, item: Item) -> None:
-        self._connection.execute(
-            "DELETE FROM claims WHERE environment = ? AND task = ? AND policy = ? AND world = ?", _key(item)
-        )
+        self._connection.execute(f"DELETE FROM claims WHERE {_THE_ITEM}", _key(item))
 
     def count(self) -> int:
         """Finished trials."""
         return self._connection.execute("SELECT count(*) FROM trials").fetchone()[0]
 
-    def done(self) -> set[Item]:
-        """What is finished: trials, and worlds of which it is known whether the task is possible there."""
-        trials = self._connection.execute("SELECT environment, task, policy, world FROM trials").fetchall()
-        worlds = self._connection.execute("SELECT environment, task, world FROM worlds").fetchall()
-        found = {Item(*row) for row in trials}
-        return found | {Item(environment, task, POSSIBLE, world) for environment, task, world in worlds}
-
-    def _claimed(self) -> set[Item]:
-        claims = self._connection.execute("SELECT * FROM claims").fetchall()
-        return {Item(*claim[:4]) for claim in claims if _alive(*claim[4:])}
+    def _is_free(self, item: Item) -> bool:
+        """Whether the item is neither finished nor claimed: looked up by itself, however large the store has grown."""
+        if item.policy == POSSIBLE:
+            finished = "SELECT 1 FROM worlds WHERE environment = ? AND task = ? AND world = ?"
+            values = (item.environment, item.task, item.world)
+        else:
+            finished = f"SELECT 1 FROM trials WHERE {_THE_ITEM}"
+            values = _key(item)
+        if self._connection.execute(finished, values).fetchone():
+            return False
+        claim = f"SELECT host, process, started, claimed FROM claims WHERE {_THE_ITEM}"
+        owner = self._connection.execute(claim, _key(item)).fetchone()
+        return owner is None or not _alive(*owner)
 
 
 def _key(item: Item) -> tuple[str, str, str, int]:
