@@ -1,7 +1,7 @@
 """Parcels delivered by a simulated robot on real maps, after the real-world experiment (Bradley et al. 2021, V-C).
 
     python -m eval.real_maps --out out/real-maps --maps MAPS
-    python -m eval.real_maps --out out/real-maps --maps MAPS --worlds 5
+    python -m eval.real_maps --out out/real-maps --maps MAPS --only uma_rooms gdc_3ne --worlds 5
 
 ``MAPS`` is a folder with the maps ``uma_rooms``, ``gdc_3ne``, ``gdc_floor2`` and ``intel_lab``; the rooms of the first
 and last are drawn by hand (the YAML files beside this one), those of the others come from the labels in MAPS/labels.
@@ -156,13 +156,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of the sweeps")
     parser.add_argument("--maps", type=Path, required=True, help="folder of the maps")
+    parser.add_argument("--only", nargs="+", choices=MAPS, default=list(MAPS), metavar="MAP")
     parser.add_argument("--worlds", type=int, default=50, help="per map and task")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--report", type=Path, help="without suffix: where results and picture go")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     found, example = {}, None
-    for name in MAPS:
+    for name in options.only:
         environment = environment_of(options.maps, name, options.out)
         sweep(options.out / name, specification(environment, options.worlds), options.processes)
         generator = MappedRooms.from_spec(environment)

@@ -37,7 +37,8 @@ class Sweeper:
     """Solves distances on one map. Costs are [Z, H, W, Q]: sources lie in the minor axis, in lanes.
 
     ``transitions`` may be shared by all lanes (last axis 1) or differ between them. Within a solution, grids have a
-    margin of unreachable cells, which stands in for what lies outside.
+    margin of unreachable cells, which stands in for what lies outside. Lines beyond the first and the last one that can
+    be entered are not swept: maps are padded, and little is known of most.
     """
 
     def __init__(
@@ -50,6 +51,7 @@ class Sweeper:
         self.transitions = transitions
         self.wildcard = wildcard
         self.enter = jnp.where(keeps, 0.0, jnp.inf).astype(jnp.float32)
+        self.rows, self.columns = (_extent(jnp.any(keeps, axis=axes)) for axes in ((2, 3), (1, 3)))
         # States from which no move exists (accepting and trap states, where the caller cut them) need no sweep.
         self.leads_on = jnp.any((transitions != NO_STATE) | keeps, axis=(1, 2, 3))
         self.links = Links(free)
@@ -75,7 +77,7 @@ class Sweeper:
         def settle(carry):
             cost, dirty = carry
             state = jnp.argmax(dirty).astype(jnp.int32)
-            layer = self._sweep_to_fixed_point(cost[state], self.enter[state])
+            layer = self._sweep_to_fixed_point(cost[state], state)
             cost, improved = self._leave(cost.at[state].set(layer), layer, state)
             return cost, dirty.at[state].set(False) | (improved & self.leads_on)
 
@@ -83,7 +85,7 @@ class Sweeper:
 
     def _solve_one_state(self, cells, states):
         """As ``_solve_padded`` where the automaton has one state, which no move leaves."""
-        return self._sweep_to_fixed_point(self._start(cells, states)[0], self.enter[0])[None]
+        return self._sweep_to_fixed_point(self._start(cells, states)[0], jnp.int32(0))[None]
 
     def _start(self, cells, states):
         """Costs before the first sweep: 0 at each source."""
@@ -94,11 +96,12 @@ class Sweeper:
         return start.at[states, cells[:, 0] + 1, cells[:, 1] + 1, lane].set(at_source)
 
     def _sweep_to_fixed_point(
-        self, cost: Float32[Array, "H2 W2 Q"], enter: Float32[Array, "H W lanes"]
+        self, cost: Float32[Array, "H2 W2 Q"], state: Int32[Array, ""]
     ) -> Float32[Array, "H2 W2 Q"]:
         """Apply the moves that keep one state of the automaton until they improve nothing."""
-        rows = _Lines(enter, self.links.falling, self.links.rising)
-        columns = _Lines(jnp.swapaxes(enter, 0, 1), self.links.falling.T, self.links.rising.T)
+        enter, falling, rising = self.enter[state], self.links.falling, self.links.rising
+        rows = _Lines(enter, falling, rising, self.rows[state])
+        columns = _Lines(jnp.swapaxes(enter, 0, 1), falling.T, rising.T, self.columns[state])
 
         def sweep_round(carry):
             before, _ = carry
@@ -207,6 +210,13 @@ class Links:
         return _shift(link, -max(rows, 0), -max(columns, 0), jnp.inf)
 
 
+def _extent(entered: Bool[Array, "Z lines"]) -> Int32[Array, "Z 2"]:
+    """Per state the first line that can be entered and the one after the last; 0 and 0 where there is none."""
+    count = entered.shape[1]
+    first, end = jnp.argmax(entered, axis=1), count - jnp.argmax(entered[:, ::-1], axis=1)
+    return jnp.where(jnp.any(entered, axis=1)[:, None], jnp.stack([first, end], axis=1), 0).astype(jnp.int32)
+
+
 def _link(blocked: Bool[Array, "H W"]) -> Float32[Array, "H W"]:
     return jnp.where(blocked, jnp.inf, DIAGONAL).astype(jnp.float32)
 
@@ -222,13 +232,19 @@ def _shift(array: Array, rows: int, columns: int, fill: float | bool) -> Array:
 class _Lines:
     """The lines of one grid, to be swept in both directions: each line is updated from the one before it.
 
-    ``enter`` is the extra cost of entering a cell, ``falling`` and ``rising`` are the diagonals of its squares.
+    ``enter`` is the extra cost of entering a cell, ``falling`` and ``rising`` are the diagonals of its squares,
+    ``extent`` the first line that can be entered and the one after the last.
     """
 
     def __init__(
-        self, enter: Float32[Array, "H W lanes"], falling: Float32[Array, "H W"], rising: Float32[Array, "H W"]
+        self,
+        enter: Float32[Array, "H W lanes"],
+        falling: Float32[Array, "H W"],
+        rising: Float32[Array, "H W"],
+        extent: Int32[Array, "2"],
     ) -> None:
         self.enter = enter
+        self.extent = extent
         # Diagonals into a line from the line above it, seen from the left and from the right; and from the line below,
         # where the same links belong to the squares of that line.
         self.above = (falling[:, :, None], _shift(rising, 0, -1, jnp.inf)[:, :, None])
@@ -236,10 +252,11 @@ class _Lines:
 
     def sweep(self, cost: Float32[Array, "H2 W2 Q"]) -> Float32[Array, "H2 W2 Q"]:
         """Once downwards, once upwards, in place; ``cost`` has a margin of one cell."""
-        count = cost.shape[0] - 2
-        cost = jax.lax.fori_loop(0, count, lambda i, cost: self._update(cost, i, i, self.above), cost)
+        first, end = self.extent
+        cost = jax.lax.fori_loop(first, end, lambda i, cost: self._update(cost, i, i, self.above), cost)
+        last = first + end - 1
         return jax.lax.fori_loop(
-            0, count, lambda i, cost: self._update(cost, count - 1 - i, count + 1 - i, self.below), cost
+            first, end, lambda i, cost: self._update(cost, last - i, last - i + 2, self.below), cost
         )
 
     def _update(self, cost, line, previous, links):
