@@ -51,7 +51,8 @@ class Sweeper:
         self.transitions = transitions
         self.wildcard = wildcard
         self.enter = jnp.where(keeps, 0.0, jnp.inf).astype(jnp.float32)
-        self.rows, self.columns = (_extent(jnp.any(keeps, axis=axes)) for axes in ((2, 3), (1, 3)))
+        entered = jnp.any(keeps, axis=3)
+        self.rows, self.columns = (_extent(jnp.any(entered, axis=across)) for across in (2, 1))
         # States from which no move exists (accepting and trap states, where the caller cut them) need no sweep.
         self.leads_on = jnp.any((transitions != NO_STATE) | keeps, axis=(1, 2, 3))
         self.links = Links(free)
