@@ -21,7 +21,7 @@ from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
 from potlp_jax.learning.views import Views, remember
 from potlp_jax.planning.commitment import Intention
-from potlp_jax.planning.estimates import Estimates, Estimator
+from potlp_jax.planning.estimates import Estimates, Estimator, ask
 from potlp_jax.planning.policies import (
     Move,
     MoveKind,
@@ -244,10 +244,12 @@ def _consider(
     views = None if rules.network is None else _look(rules, rules.network, params, progress, scene)
     situation = _assess(rules, progress, scene)
 
-    def ask(views: Views | None, belief: BeliefMap, subgoals: Subgoals, scene: Scene) -> Estimates:
-        return _estimator(rules, params, views, scene)(belief, subgoals, scene.task)
+    def estimate(progress: Progress, subgoals: Subgoals, scene: Scene) -> Estimates:
+        estimator = _estimator(rules, params, progress.views, scene)
+        return ask(estimator, progress.belief, subgoals, scene.task, progress.state)
 
-    estimates = _phase(progress.running, ask, views, progress.belief, situation.subgoals, scene)
+    seeing = dataclasses.replace(progress, views=views)
+    estimates = _phase(progress.running, estimate, seeing, situation.subgoals, scene)
     problem = _phase(progress.running, partial(planning_problem, config=rules.config.decision), situation, estimates)
     return views, situation, problem, jax.random.fold_in(scene.planning, progress.decisions)
 

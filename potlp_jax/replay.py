@@ -9,7 +9,7 @@ from jaxtyping import Array, Int32, UInt8
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, look
 from potlp_jax.learning.estimator_files import CheckpointError
 from potlp_jax.learning.labels import TrueMapEstimator
-from potlp_jax.planning.estimates import Estimator
+from potlp_jax.planning.estimates import Estimator, ask
 from potlp_jax.planning.policies import DecisionConfig, Policy, assess, planning_problem
 from potlp_jax.planning.pouct import Plan, search_tree
 from potlp_jax.planning.problem import PlanningProblem
@@ -96,4 +96,5 @@ def _replayed_problem(
     config: DecisionConfig,
 ) -> PlanningProblem:
     situation = assess(belief, cell, state, task, config.frontiers)
-    return planning_problem(situation, estimator(belief, situation.subgoals, task), config)
+    estimates = ask(estimator, belief, situation.subgoals, task, state)
+    return planning_problem(situation, estimates, config)

@@ -16,7 +16,7 @@ from potlp_jax.environments import make
 from potlp_jax.environments.rooms import Rooms, RoomsConfig
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.learning.labels import TrueMapEstimator
-from potlp_jax.planning.estimates import Estimator
+from potlp_jax.planning.estimates import Estimator, ask
 from potlp_jax.planning.families import family_problem
 from potlp_jax.planning.paths import shortest_path
 from potlp_jax.planning.policies import DecisionConfig, Move, Policy, Situation, assess, decide, planning_problem
@@ -240,11 +240,12 @@ def measure_decision(
     )
     estimates = phases.measure(
         "estimates",
-        lambda estimator, belief, subgoals, task: estimator(belief, subgoals, task),
+        ask,
         scene.estimator,
         scene.belief,
         situation.subgoals,
         scene.task,
+        scene.state,
     )
     problem = phases.measure(
         "travel", lambda situation, estimates: planning_problem(situation, estimates, config), situation, estimates

@@ -32,6 +32,9 @@ from potlp_jax.world.panorama import bearing
 MEMORY: int = 32
 """Panoramas that are remembered. A trial takes 14 to 100, of which seldom more than a dozen still show a frontier."""
 
+QUESTIONS: int = 3
+"""Classes that are asked of a subgoal at a time."""
+
 SURE: float = 0.97
 """The most that the chances of subgoals side by side come to together."""
 
@@ -48,7 +51,7 @@ class NetworkEstimator:
         """Estimates of every real (subgoal, class); padded pairs have P_S = 0. At least one look must be remembered.
 
         The network counts in the unit of the worlds that it learned from, which is the belief's: cells or metres.
-        Subgoals are asked one after the other, so that padded ones cost nothing.
+        Subgoals are asked one after the other, of each so many classes at a time, so that padding costs little.
         """
         network = EstimatorNetwork(self.config)
         places = places_of_looks(self.views, look_of_subgoals(self.views, subgoals))
@@ -56,19 +59,28 @@ class NetworkEstimator:
         distance = self.distances(belief, subgoals)
         angle = jax.vmap(bearing)(poses, subgoals.cells)
         classes = task.class_mask.shape[0]
+        # Real classes first; those that fill up the last portion are dropped where they are written.
+        order = jnp.argsort(~task.class_mask, stable=True).astype(jnp.int32)
+        order = jnp.pad(order, (0, -classes % QUESTIONS), constant_values=classes)
+        portions = -(-jnp.sum(task.class_mask, dtype=jnp.int32) // QUESTIONS)
 
         def ask(subgoal: Int32[Array, ""], answers: Float32[Array, "3 S C"]) -> Float32[Array, "3 S C"]:
             features, residual = network.centre(self.views.features[places[subgoal]], angle[subgoal])
-            answer = network.answer(
-                self.params,
-                jnp.broadcast_to(features[None], (classes, *features.shape)),
-                jnp.broadcast_to(residual, (classes,)),
-                jnp.broadcast_to(distance[subgoal], (classes,)),
-                task.class_phi[:, 0],
-                task.class_phi[:, 1],
-            )
-            row = jnp.stack([answer.success_probability, answer.success_cost, answer.failure_cost])
-            return answers.at[:, subgoal].set(row)
+
+            def ask_of_classes(portion: Int32[Array, ""], row: Float32[Array, "3 C"]) -> Float32[Array, "3 C"]:
+                chosen = jax.lax.dynamic_slice_in_dim(order, portion * QUESTIONS, QUESTIONS)
+                answer = network.answer(
+                    self.params,
+                    jnp.broadcast_to(features[None], (QUESTIONS, *features.shape)),
+                    jnp.broadcast_to(residual, (QUESTIONS,)),
+                    jnp.broadcast_to(distance[subgoal], (QUESTIONS,)),
+                    task.class_phi[chosen, 0],
+                    task.class_phi[chosen, 1],
+                )
+                found = jnp.stack([answer.success_probability, answer.success_cost, answer.failure_cost])
+                return row.at[:, chosen].set(found, mode="drop")
+
+            return answers.at[:, subgoal].set(jax.lax.fori_loop(0, portions, ask_of_classes, answers[:, subgoal]))
 
         # Real subgoals come first.
         real = jnp.sum(subgoals.mask, dtype=jnp.int32)

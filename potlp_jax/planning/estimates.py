@@ -1,10 +1,13 @@
 """What an estimator answers: how each outcome class fares beyond each subgoal."""
 
+import dataclasses
 from typing import Protocol, runtime_checkable
 
+import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float32
+from jaxtyping import Array, Bool, Float32, Int32
 
+from potlp_jax.planning.product import reachable_states
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.world.frontiers import Subgoals
 from potlp_jax.world.grid import BeliefMap
@@ -28,3 +31,23 @@ class Estimator(Protocol):
     """A pytree that can be called inside jit: the true map, or a network with its parameters."""
 
     def __call__(self, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays) -> Estimates: ...
+
+
+def ask(
+    estimator: Estimator, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays, state: Int32[Array, ""]
+) -> Estimates:
+    """The estimates of all that can still be attempted once the automaton is in ``state``; of the rest P_S is 0.
+
+    Once the professor is found nobody asks where the professor is: those questions would be most of the work.
+    """
+    ahead = dataclasses.replace(task, class_mask=classes_ahead(task, state))
+    return estimator(belief, subgoals, ahead)
+
+
+def classes_ahead(task: TaskArrays, state: Int32[Array, ""]) -> Bool[Array, " C"]:
+    """The outcome classes of the edges that begin in a state that ``state`` can lead to."""
+    edges = task.edge_mask & reachable_states(task, state)[task.edges[:, 0]]
+    conditions = jnp.zeros(task.condition_mask.shape, bool).at[task.edge_condition].max(edges)
+    own = jnp.arange(task.class_mask.shape[0], dtype=jnp.int32)
+    members = task.condition_classes[:, :, None] == own[None, None, :]
+    return task.class_mask & jnp.any(members & conditions[:, None, None], axis=(0, 1))

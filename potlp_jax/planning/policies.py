@@ -20,7 +20,7 @@ from flax import struct
 from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
 from potlp_jax.planning.commitment import Intention, intention_of, keep_on
-from potlp_jax.planning.estimates import Estimates, Estimator
+from potlp_jax.planning.estimates import Estimates, Estimator, ask
 from potlp_jax.planning.history import ActionTerms, action_terms, initial_history
 from potlp_jax.planning.paths import KnownPath, shortest_path
 from potlp_jax.planning.pouct import Plan, plan_actions
@@ -31,6 +31,7 @@ from potlp_jax.planning.product import (
     product_distances,
     product_transitions,
     reachable_cells,
+    reachable_states,
 )
 from potlp_jax.planning.search_graph import SearchConfig
 from potlp_jax.planning.sweeps import Wildcard
@@ -189,7 +190,8 @@ def decide(
         return direct_move(situation, policy, config)
     if estimator is None:
         raise ValueError(f"policy {policy.value!r} needs an estimator")
-    return search_move(situation, estimator(belief, situation.subgoals, task), key, config, intention)
+    estimates = ask(estimator, belief, situation.subgoals, task, state)
+    return search_move(situation, estimates, key, config, intention)
 
 
 def direct_move(situation: Situation, policy: Policy, config: DecisionConfig) -> Move:
@@ -228,10 +230,11 @@ def _subgoal_travel(
     count, states = subgoals.mask.shape[0], task.transitions.shape[0]
     reentered = situation.transitions[subgoals.cells[:, 0], subgoals.cells[:, 1]]
     # Rollouts leave a subgoal only after an action there, so one where nothing can succeed needs no table; nor does
-    # a state that no re-entry leads to, or an accepting one.
+    # a state that no re-entry leads to from where the automaton can still get, or an accepting one.
     promising = subgoals.mask & jnp.any(estimates.success_probability > 0.0, axis=1)
     own = jnp.arange(states, dtype=jnp.int32)
-    needed = jnp.any(reentered[:, :, None] == own[None, None, :], axis=1) & promising[:, None] & ~task.accepting[None]
+    ahead = jnp.where(reachable_states(task, situation.state)[None], reentered, NO_STATE)
+    needed = jnp.any(ahead[:, :, None] == own[None, None, :], axis=1) & promising[:, None] & ~task.accepting[None]
     sources = jnp.where(needed, own[None, :], NO_STATE)
     travel, finish = distance_table(
         situation.transitions,

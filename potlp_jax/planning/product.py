@@ -44,6 +44,14 @@ def one_letter_successors(task: TaskArrays) -> Bool[Array, "Z Z"]:
     return (reached | jnp.eye(states, dtype=bool)) & live[None, :] & live[:, None]
 
 
+def reachable_states(task: TaskArrays, state: Int32[Array, ""]) -> Bool[Array, " Z"]:
+    """The states that some word leads to from ``state``, itself among them; traps excluded."""
+    reach = one_letter_successors(task)
+    for _ in range(max(reach.shape[0] - 1, 1).bit_length()):
+        reach = jnp.any(reach[:, :, None] & reach[None, :, :], axis=1)
+    return reach[state]
+
+
 def product_distances(
     transitions: Int32[Array, "H W Z"],
     free: Bool[Array, "H W"],
