@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from potlp_jax.environments.academic import MANY_DOORS, NO_ROOM, PARCELS, Floor, FurnishConfig, Kind, Placement, furnish
+from potlp_jax.environments.academic import NO_ROOM, PARCELS, Floor, FurnishConfig, Kind, Placement, furnish
 from potlp_jax.environments.delivery import DeliveryConfig
 from potlp_jax.environments.map_server import MapError, MapWarning, load_map
 from potlp_jax.environments.options import parse_options
@@ -44,6 +44,10 @@ LEARNED_RESOLUTION = DeliveryConfig().resolution
 
 REPLAN_DISTANCE = 2.0
 """Metres between decisions, as there."""
+
+MANY_SLIVERS = 64
+"""Subgoals that there is room for: where doors may be as narrow as a cell, slivers between clutter are frontiers too,
+and 32 nearest ones left out the only way on in a building of 27 rooms."""
 
 _HALLWAY = 0
 
@@ -125,12 +129,12 @@ class MappedRooms:
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """Camera and replanning as in ``parcels``, in metres, room for as many doors, and none too narrow."""
+        """Camera and replanning as in ``parcels``, in metres, room for all frontiers, and none too narrow."""
         scale, camera = LEARNED_RESOLUTION / self.config.resolution, CameraConfig()
         lengths = {
             name: getattr(camera, name) * scale for name in ("far", "eye_height", "wall_height", "texture_reach")
         }
-        frontiers = {**MANY_DOORS["decision"]["frontiers"], **NARROW_DOORS["decision"]["frontiers"]}
+        frontiers = {"max_subgoals": MANY_SLIVERS, **NARROW_DOORS["decision"]["frontiers"]}
         replan_distance = REPLAN_DISTANCE / self.config.resolution
         return {"decision": {"frontiers": frontiers}, "camera": lengths, "replan_distance": replan_distance}
 
