@@ -10,7 +10,12 @@ from potlp_jax.environments import make
 from potlp_jax.environments.academic import PARCELS, Floor, FurnishConfig, Kind, furnish
 from potlp_jax.environments.delivery import Delivery
 from potlp_jax.environments.map_server import MapError, MapWarning
-from potlp_jax.environments.mapped_rooms import LEARNED_RESOLUTION, MappedRooms, MappedRoomsConfig
+from potlp_jax.environments.mapped_rooms import (
+    LEARNED_RESOLUTION,
+    MANY_SLIVERS,
+    MappedRooms,
+    MappedRoomsConfig,
+)
 from potlp_jax.environments.ros_map import NARROW_DOORS
 from potlp_jax.environments.splits import world_key
 from potlp_jax.sweep.specification import SpecificationError, specification_from_dict
@@ -112,7 +117,9 @@ def test_parcels_of_a_map_take_every_pair_of_rooms_and_are_lit(building):
 def test_trials_on_a_map_see_as_in_the_worlds_that_were_learned_from(building):
     same = MappedRooms(MappedRoomsConfig(building, resolution=LEARNED_RESOLUTION, radius=0.0))
     learned_from = with_settings(TrialConfig(), make("parcels").settings)
-    assert with_settings(TrialConfig(), same.settings) == with_settings(learned_from, NARROW_DOORS)
+    room = {"decision": {"frontiers": {"max_subgoals": MANY_SLIVERS}}}
+    expected = with_settings(with_settings(learned_from, NARROW_DOORS), room)
+    assert with_settings(TrialConfig(), same.settings) == expected
     fine = MappedRooms(MappedRoomsConfig(building, resolution=LEARNED_RESOLUTION / 2, radius=0.0))
     config = with_settings(TrialConfig(), fine.settings)
     assert config.camera.wall_height == TrialConfig().camera.wall_height * 2
