@@ -46,7 +46,7 @@ def test_once_something_is_found_it_is_not_asked_for():
     letter = 1 << task.propositions.index("a")
     after = int(task.dfa.transitions[task.dfa.initial, letter])
     asked = np.flatnonzero(classes_ahead(task.arrays, jnp.int32(after)))
-    # Of b, of c, and of both: each alone, one with the other or without; all of them without a word about a.
+    # What is left is b, c, or both at one cell; no cube says that a must hold or must not.
     literals = np.asarray(task.arrays.class_phi)[asked][:, 1, task.propositions.index("a")]
     assert 0 < len(asked) < task.sizes.classes
     assert not literals.any()

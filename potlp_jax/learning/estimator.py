@@ -53,34 +53,15 @@ class NetworkEstimator:
         The network counts in the unit of the worlds that it learned from, which is the belief's: cells or metres.
         Subgoals are asked one after the other, of each so many classes at a time, so that padding costs little.
         """
-        network = EstimatorNetwork(self.config)
         places = places_of_looks(self.views, look_of_subgoals(self.views, subgoals))
-        poses = self.views.cells[places]
         distance = self.distances(belief, subgoals)
-        angle = jax.vmap(bearing)(poses, subgoals.cells)
+        angle = jax.vmap(bearing)(self.views.cells[places], subgoals.cells)
         classes = task.class_mask.shape[0]
-        # Real classes first; those that fill up the last portion are dropped where they are written.
-        order = jnp.argsort(~task.class_mask, stable=True).astype(jnp.int32)
-        order = jnp.pad(order, (0, -classes % QUESTIONS), constant_values=classes)
-        portions = -(-jnp.sum(task.class_mask, dtype=jnp.int32) // QUESTIONS)
 
         def ask(subgoal: Int32[Array, ""], answers: Float32[Array, "3 S C"]) -> Float32[Array, "3 S C"]:
-            features, residual = network.centre(self.views.features[places[subgoal]], angle[subgoal])
-
-            def ask_of_classes(portion: Int32[Array, ""], row: Float32[Array, "3 C"]) -> Float32[Array, "3 C"]:
-                chosen = jax.lax.dynamic_slice_in_dim(order, portion * QUESTIONS, QUESTIONS)
-                answer = network.answer(
-                    self.params,
-                    jnp.broadcast_to(features[None], (QUESTIONS, *features.shape)),
-                    jnp.broadcast_to(residual, (QUESTIONS,)),
-                    jnp.broadcast_to(distance[subgoal], (QUESTIONS,)),
-                    task.class_phi[chosen, 0],
-                    task.class_phi[chosen, 1],
-                )
-                found = jnp.stack([answer.success_probability, answer.success_cost, answer.failure_cost])
-                return row.at[:, chosen].set(found, mode="drop")
-
-            return answers.at[:, subgoal].set(jax.lax.fori_loop(0, portions, ask_of_classes, answers[:, subgoal]))
+            features = self.views.features[places[subgoal]]
+            found = self._ask_of_subgoal(features, angle[subgoal], distance[subgoal], task, answers[:, subgoal])
+            return answers.at[:, subgoal].set(found)
 
         # Real subgoals come first.
         real = jnp.sum(subgoals.mask, dtype=jnp.int32)
@@ -94,6 +75,37 @@ class NetworkEstimator:
             success_cost=success_cost,
             failure_cost=failure_cost,
         )
+
+    def _ask_of_subgoal(
+        self,
+        features: Float32[Array, "rows columns F"],
+        angle: Float32[Array, ""],
+        distance: Float32[Array, ""],
+        task: TaskArrays,
+        answers: Float32[Array, "3 C"],
+    ) -> Float32[Array, "3 C"]:
+        """P_S, R_S and R_F of the real classes beyond one subgoal; ``answers`` keeps what it has of the others."""
+        network, classes = EstimatorNetwork(self.config), task.class_mask.shape[0]
+        centred, residual = network.centre(features, angle)
+        # Real classes first; those that fill up the last portion are dropped where they are written.
+        order = jnp.argsort(~task.class_mask, stable=True).astype(jnp.int32)
+        order = jnp.pad(order, (0, -classes % QUESTIONS), constant_values=classes)
+        portions = -(-jnp.sum(task.class_mask, dtype=jnp.int32) // QUESTIONS)
+
+        def ask(portion: Int32[Array, ""], answers: Float32[Array, "3 C"]) -> Float32[Array, "3 C"]:
+            chosen = jax.lax.dynamic_slice_in_dim(order, portion * QUESTIONS, QUESTIONS)
+            answer = network.answer(
+                self.params,
+                jnp.broadcast_to(centred[None], (QUESTIONS, *centred.shape)),
+                jnp.broadcast_to(residual, (QUESTIONS,)),
+                jnp.broadcast_to(distance, (QUESTIONS,)),
+                task.class_phi[chosen, 0],
+                task.class_phi[chosen, 1],
+            )
+            found = jnp.stack([answer.success_probability, answer.success_cost, answer.failure_cost])
+            return answers.at[:, chosen].set(found, mode="drop")
+
+        return jax.lax.fori_loop(0, portions, ask, answers)
 
     def distances(self, belief: BeliefMap, subgoals: Subgoals) -> Float32[Array, " S"]:
         """From where each subgoal was seen to the subgoal through known space, letters ignored, in the belief's unit.

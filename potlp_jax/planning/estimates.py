@@ -28,7 +28,11 @@ class Estimates:
 
 @runtime_checkable
 class Estimator(Protocol):
-    """A pytree that can be called inside jit: the true map, or a network with its parameters."""
+    """A pytree that can be called inside jit: the true map, or a network with its parameters.
+
+    ``task.class_mask`` is True for the classes that are asked; a decision asks for what can still be attempted alone
+    (``ask``), and reads nothing of the others.
+    """
 
     def __call__(self, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays) -> Estimates: ...
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 
+from potlp_jax.planning.state_relations import transitive_closure
 from potlp_jax.types import NO_STATE
 
 CAPACITY: int = 64
@@ -57,9 +58,7 @@ def portals_pay(
     states = transitions.shape[2]
     own = jnp.arange(states, dtype=jnp.int32)
     follows = jax.lax.map(lambda state: jnp.any(transitions == state, axis=(0, 1)), own).T
-    reached = follows | jnp.eye(states, dtype=bool)
-    for _ in range(max(states - 1, 1).bit_length()):
-        reached = jnp.any(reached[:, :, None] & reached[None, :, :], axis=1)
+    reached = transitive_closure(follows | jnp.eye(states, dtype=bool))
     moving = jnp.any(follows, axis=1)
     grids_of_state = jnp.sum(reached & moving[None, :], axis=1)
     real = source_states != NO_STATE

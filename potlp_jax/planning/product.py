@@ -15,6 +15,7 @@ from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Bool, Float32, Int32
 
 from potlp_jax.planning.portals import find_active_cells, portals_pay, table_by_portals
+from potlp_jax.planning.state_relations import transitive_closure
 from potlp_jax.planning.sweeps import Links, Sweeper, Wildcard
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_STATE
@@ -46,10 +47,7 @@ def one_letter_successors(task: TaskArrays) -> Bool[Array, "Z Z"]:
 
 def reachable_states(task: TaskArrays, state: Int32[Array, ""]) -> Bool[Array, " Z"]:
     """The states that some word leads to from ``state``, itself among them; traps excluded."""
-    reach = one_letter_successors(task)
-    for _ in range(max(reach.shape[0] - 1, 1).bit_length()):
-        reach = jnp.any(reach[:, :, None] & reach[None, :, :], axis=1)
-    return reach[state]
+    return transitive_closure(one_letter_successors(task))[state]
 
 
 def product_distances(

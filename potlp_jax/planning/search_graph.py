@@ -25,6 +25,7 @@ from potlp_jax.planning.history import (
 )
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search_arrays import least_of_each, mix, pack_rows
+from potlp_jax.planning.state_relations import transitive_closure
 from potlp_jax.types import NO_STATE
 
 WINDOW: int = 8
@@ -274,10 +275,7 @@ def _reachable(tables: ActionTables) -> Bool[Array, "Z Z"]:
     attempts = rows.from_state[:, None] == own[None, :]
     travels = jnp.any(jnp.any(jnp.isfinite(tables.distance), axis=0)[:, :, None] & attempts[None, :, :], axis=1)
     succeeds = jnp.any(attempts[:, :, None] & (rows.to_state[:, None] == own[None, :])[:, None, :], axis=0)
-    reach = travels | succeeds | (own[:, None] == own[None, :])
-    for _ in range(max(states - 1, 1).bit_length()):
-        reach = jnp.any(reach[:, :, None] & reach[None, :, :], axis=1)
-    return reach
+    return transitive_closure(travels | succeeds | (own[:, None] == own[None, :]))
 
 
 def _relevant_conditions(tables: ActionTables, reach: Bool[Array, "Z Z"]) -> UInt32[Array, "Z W"]:
