@@ -4,15 +4,17 @@
     python -m eval.delivery --out out/delivery --plans PLANS --worlds 80 --formula-worlds 0
 
 ``PLANS`` is a folder with folders of plans (docs/delivery.md), each a group of its own beside the generated floors.
-The paper's 80 simulations are the first 80 of each group. The same network, unchanged, then runs formulas that no
-training task equals. Intervals and errors are clustered by building. The same command goes on where it was stopped.
+The paper's 80 simulations are the first 80 of each group; the oracle runs on the generated ones among them. The same
+network, unchanged, then runs formulas that no training task equals. Intervals and errors are clustered by building. The
+same command goes on where it was stopped, also with more worlds: each block of them is a sweep of its own.
 ``--report`` writes NAME.json beside what is printed.
 """
 
 import argparse
+import itertools
 import json
 import os
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,15 +29,19 @@ from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.learning.formulas import HELD_OUT
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.rows import source_commit
+from potlp_jax.sweep.store import Row
 from potlp_jax.trial import versions
 
 POLICIES = [Policy.KNOWN_MAP.value, Policy.BASELINE.value, Policy.ORACLE.value, Policy.POTLP.value]
 WITHOUT_ORACLE = [policy for policy in POLICIES if policy != Policy.ORACLE.value]
-"""Of all groups but the generated floors: on the large grids of plans true labels take seconds a decision."""
+"""Of all but the first generated floors: true labels take as long as the network, on large grids seconds a decision."""
 
 GENERATED = "generated"
 FIRST = 80
 """Simulations of the paper: 13.5 % per trial (6.1 % standard error), 7.8 % net."""
+
+BLOCK = 230
+"""Worlds of each sweep after the first: four of them and the first make 1,000."""
 
 
 def groups(plans: Path | None) -> dict[str, str]:
@@ -46,15 +52,30 @@ def groups(plans: Path | None) -> dict[str, str]:
     return found
 
 
-def specification(environment: str, tasks: list[str], policies: list[str], worlds: int) -> dict[str, Any]:
-    """A sweep over test worlds."""
-    return {
-        "environments": [environment],
-        "tasks": tasks,
-        "policies": policies,
-        "worlds": worlds,
-        "split": Split.TEST.value,
-    }
+def blocks(worlds: int) -> list[range]:
+    """The numbers of the worlds of each sweep."""
+    starts = [0, *range(FIRST, worlds, BLOCK)]
+    return [range(start, end) for start, end in itertools.pairwise([*starts, worlds])]
+
+
+def run_blocks(
+    folder: Path, environment: str, tasks: list[str], worlds: int, processes: int, *, oracle: bool = False
+) -> list[Row]:
+    """The rows of all blocks of test worlds; what is missing is run, with the oracle on the first block alone."""
+    rows = []
+    for block in blocks(worlds):
+        chosen = {
+            "environments": [environment],
+            "tasks": tasks,
+            "policies": POLICIES if oracle and block.start == 0 else WITHOUT_ORACLE,
+            "worlds": len(block),
+            "first_world": block.start,
+            "split": Split.TEST.value,
+        }
+        own = folder / f"{block.start}-{block.stop}"
+        sweep(own, chosen, processes)
+        rows += read_rows(own)
+    return rows
 
 
 def building_of(generator: Generator, world: int) -> Hashable:
@@ -64,27 +85,35 @@ def building_of(generator: Generator, world: int) -> Hashable:
     return world
 
 
-def results_of(folder: Path, environment: str, policies: list[str], worlds: Mapping[str, int]) -> dict[str, Any]:
-    """Tables of a group: the first 80 worlds and all, by formula, and the audit."""
-    generator, rows = make(environment), read_rows(folder)
+def results_of(rows: Sequence[Row], environment: str, tasks: Sequence[str]) -> dict[str, Any]:
+    """Tables of a group: of every task the first 80 worlds and all, and the audit."""
+    generator = make(environment)
     problems = audit(rows, generator, Split.TEST)
-    counts = {formula: sorted({min(FIRST, count), count}) for formula, count in worlds.items()}
+    ran = [policy for policy in POLICIES if any(row.item.policy == policy for row in rows)]
     return {
         "environment": environment.partition(":")[0],
-        "policies": policies,
-        "tables": [
-            compare_first(rows, formula, policies, count, lambda world: building_of(generator, world))
-            for formula, found in counts.items()
-            for count in found
-        ],
+        "tables": [table for task in tasks for table in tables_of(rows, generator, task, ran)],
         "audited": len(rows),
         "violations": sum(problem.startswith("violates") for problem in problems),
         "problems": problems,
         "commits": sorted({row.commit for row in rows}),
         "seconds_per_trial": {
-            policy: float(np.mean([row.seconds for row in rows if row.item.policy == policy])) for policy in policies
+            policy: float(np.mean([row.seconds for row in rows if row.item.policy == policy])) for policy in ran
         },
     }
+
+
+def tables_of(rows: Sequence[Row], generator: Generator, task: str, ran: list[str]) -> list[dict[str, Any]]:
+    """The comparison over the paper's number of worlds, and over all where there are more."""
+    worlds = len({row.item.world for row in rows if row.item.task == task})
+    chosen = {min(worlds, FIRST): ran} | ({worlds: WITHOUT_ORACLE} if worlds > FIRST else {})
+    return [
+        {
+            "policies": policies,
+            **compare_first(rows, task, policies, count, lambda world: building_of(generator, world)),
+        }
+        for count, policies in chosen.items()
+    ]
 
 
 def markdown(results: Mapping[str, Any]) -> str:
@@ -93,7 +122,7 @@ def markdown(results: Mapping[str, Any]) -> str:
     for name, group in results["groups"].items():
         lines += ["", f"### {name}", "", TABLE_HEAD]
         for table in group["tables"]:
-            lines += table_lines(table, group["policies"])
+            lines += table_lines(table, table["policies"])
         lines += ["", f"{group['audited']} trials audited: {len(group['problems'])} problems."]
     return "\n".join(lines)
 
@@ -109,18 +138,16 @@ def main() -> None:
     parser.add_argument("--report", type=Path, help="without suffix: where the results go")
     options = parser.parse_args()
     found: dict[str, Any] = {}
+    task = PEOPLE.tasks["1"]
     for name, environment in groups(options.plans).items():
         generated = name == GENERATED
-        count, policies = (options.worlds, POLICIES) if generated else (options.plan_worlds, WITHOUT_ORACLE)
-        worlds = {PEOPLE.tasks["1"]: count}
-        sweep(options.out / name, specification(environment, list(worlds), policies, count), options.processes)
-        found[name] = results_of(options.out / name, environment, policies, worlds)
+        worlds = options.worlds if generated else options.plan_worlds
+        rows = run_blocks(options.out / name, environment, [task], worlds, options.processes, oracle=generated)
+        found[name] = results_of(rows, environment, [task])
     if options.formula_worlds:
-        worlds = {formula: int(options.formula_worlds) for formula in HELD_OUT["delivery"]}
-        folder = options.out / "formulas"
-        chosen = specification("delivery", list(worlds), WITHOUT_ORACLE, options.formula_worlds)
-        sweep(folder, chosen, options.processes)
-        found["other formulas"] = results_of(folder, "delivery", WITHOUT_ORACLE, worlds)
+        tasks = list(HELD_OUT["delivery"])
+        rows = run_blocks(options.out / "formulas", "delivery", tasks, options.formula_worlds, options.processes)
+        found["other formulas"] = results_of(rows, "delivery", tasks)
     results = {"groups": found, "versions": versions(), "reported_at": source_commit()}
     print(markdown(results))
     for group in found.values():

@@ -118,16 +118,10 @@ def test_answers_equal_the_network_asked_pair_by_pair(world, task, trained, reso
     for s in range(count):
         row, column = subgoals.cells[s].tolist()
         angle = jnp.float32(math.atan2(row - start[0], column - start[1]))
-        centred, residual = network.centre(features, angle)
+        distance = jnp.float32(resolution * distances[((row, column), 0)])
+        gaze = network.centre(features, angle[None], distance[None])
         for c, (stay, go) in enumerate(task.classes):
-            answer = network.answer(
-                trained.params,
-                centred[None],
-                residual[None],
-                jnp.float32(resolution * distances[((row, column), 0)])[None],
-                jnp.asarray([stay], jnp.int8),
-                jnp.asarray([go], jnp.int8),
-            )
+            answer = network.answer(trained.params, gaze, jnp.asarray([stay], jnp.int8), jnp.asarray([go], jnp.int8))
             chances[s, c] = answer.success_probability[0]
             pair = (estimates.success_cost, estimates.failure_cost)
             expected = (answer.success_cost, answer.failure_cost)

@@ -12,7 +12,6 @@ from potlp_jax.learning.network import (
     EstimatorNetwork,
     NetworkConfig,
     NetworkError,
-    foveal_window,
     operation_counts,
     parameter_count,
 )
@@ -46,9 +45,14 @@ def _questions(shape, seed=1):
     return bearing, jnp.asarray(random.uniform(0, 60, shape), jnp.float32), *phi
 
 
+def _gaze(network, params, image, bearing, distance):
+    """Of one image toward subgoals, or of several, each toward its own."""
+    centre = network.centre if image.ndim == 3 else jax.vmap(network.centre)
+    return centre(network.encode(params, image), bearing, distance)
+
+
 def _answers(params, image, bearing, distance, phi_stay, phi_go):
-    features, residual = NETWORK.centre(NETWORK.encode(params, image), bearing)
-    return NETWORK.answer(params, features, residual, distance, phi_stay, phi_go)
+    return NETWORK.answer(params, _gaze(NETWORK, params, image, bearing, distance), phi_stay, phi_go)
 
 
 @pytest.mark.parametrize("columns", [1, 3, -2])
@@ -83,46 +87,44 @@ def test_centring_brings_the_bearing_into_the_centre():
     # Features that hold the bearing of their own column's centre.
     step = 2 * np.pi / COLUMNS
     own = (np.arange(COLUMNS) + 0.5) * step - np.pi
-    features = jnp.broadcast_to(jnp.asarray(own, jnp.float32)[None, None, :, None], (41, 4, COLUMNS, 1))
+    features = jnp.broadcast_to(jnp.asarray(own, jnp.float32)[None, :, None], (4, COLUMNS, 1))
     bearings = np.linspace(-2 * np.pi, 2 * np.pi, 41).astype(np.float32)
-    rolled, residual = NETWORK.centre(features, jnp.asarray(bearings))
-    assert float(jnp.max(jnp.abs(residual))) <= step / 2 + 1e-5
+    gaze = NETWORK.centre(features, jnp.asarray(bearings), jnp.zeros(41))
+    assert gaze.features.shape == (41, 4, COLUMNS, 1)
+    assert float(jnp.max(jnp.abs(gaze.residual))) <= step / 2 + 1e-5
     # The centre of the picture is the line between the two middle columns.
-    left, right = np.asarray(rolled[:, 0, COLUMNS // 2 - 1, 0]), np.asarray(rolled[:, 0, COLUMNS // 2, 0])
+    left, right = (np.asarray(gaze.features[:, 0, COLUMNS // 2 - side, 0]) for side in (1, 0))
     centre = np.angle(np.exp(1j * left) + np.exp(1j * right))
-    error = np.angle(np.exp(1j * (centre + np.asarray(residual) - bearings)))
+    error = np.angle(np.exp(1j * (centre + np.asarray(gaze.residual) - bearings)))
     np.testing.assert_allclose(error, 0, atol=1e-5)
-
-
-def test_the_fovea_is_what_the_image_shows_at_the_exact_bearing():
-    """Against interpolation in the image itself, without features or rolling."""
-    network = EstimatorNetwork(dataclasses.replace(CONFIG, fovea=5))
-    image = _images(1)[0]
-    bearings = np.append(np.linspace(-np.pi, np.pi, 23), [0.0, np.pi / COLUMNS]).astype(np.float32)
-    features = network.encode(network.init(jax.random.key(0)), image)
-    rolled, residual = network.centre(jnp.broadcast_to(features, (25, *features.shape)), jnp.asarray(bearings))
-    window = np.asarray(foveal_window(rolled[..., -STRIDE * 3 :], residual, 5))
-    rows, width = CONFIG.image_shape
-    normalised = (np.asarray(image) / 255 - CONFIG.pixel_mean) / CONFIG.pixel_scale
-    bands = normalised.reshape(rows // STRIDE, STRIDE, width, 3).mean(axis=1)
-    for bearing, found in zip(bearings, window, strict=True):
-        columns = (bearing + np.pi) * width / (2 * np.pi) - 0.5 + np.arange(-5, 6)
-        for channel in range(3):
-            for band, seen in zip(bands[..., channel], found[..., channel], strict=True):
-                np.testing.assert_allclose(seen, np.interp(columns, np.arange(width), band, period=width), atol=2e-3)
 
 
 def test_the_fovea_changes_answers_and_nothing_of_a_network_without_it(params):
     network = EstimatorNetwork(dataclasses.replace(CONFIG, fovea=5))
-    wide = network.init(jax.random.key(3))
-    image, (bearing, *rest) = _images(1), _questions((1,))
-    features, residual = network.centre(network.encode(wide, image), bearing)
-    answer = network.answer(wide, features, residual, *rest)
-    blind = network.answer(wide, features.at[..., -STRIDE * 3 :].set(0.0), residual, *rest)
+    keen = network.init(jax.random.key(3))
+    image, (bearing, distance, *phi) = _images(1), _questions((1,))
+    gaze = _gaze(network, keen, image, bearing, distance)
+    without = _gaze(NETWORK, params | {"first": keen["first"]}, image, bearing, distance)
+    np.testing.assert_array_equal(gaze.features, without.features)
+    assert without.fovea is None
+    answer = network.answer(keen, gaze, *phi)
+    blind = network.answer(keen, dataclasses.replace(gaze, fovea=jnp.zeros_like(gaze.fovea)), *phi)
     assert float(answer.success_logit[0]) != float(blind.success_logit[0])
-    np.testing.assert_array_equal(
-        network.encode(params | {"second": wide["second"]}, image)[..., : -STRIDE * 3], NETWORK.encode(params, image)
-    )
+
+
+def test_what_the_fovea_says_depends_on_who_is_looked_for(params):
+    """Two patches differ by one amount for one phi and by another for another: the condition does more than add."""
+    network = EstimatorNetwork(dataclasses.replace(CONFIG, fovea=5))
+    keen = network.init(jax.random.key(3))
+    bearing, distance, stay, go = _questions((1,))
+    gaze = _gaze(network, keen, _images(1), bearing, distance)
+    other = dataclasses.replace(gaze, fovea=-gaze.fovea)
+
+    def difference(go):
+        pair = [network.answer(keen, seen, stay, go).success_logit[0] for seen in (gaze, other)]
+        return float(pair[0] - pair[1])
+
+    assert difference(go) != pytest.approx(difference(-go), rel=1e-2)
 
 
 def test_one_call_over_subgoals_and_classes_equals_a_loop(params):
@@ -131,14 +133,10 @@ def test_one_call_over_subgoals_and_classes_equals_a_loop(params):
     bearing, distance, _, _ = _questions((subgoals,))
     _, _, stay, go = _questions((classes,), seed=7)
     pairs = (subgoals, classes)
-    features, residual = NETWORK.centre(
-        jnp.broadcast_to(NETWORK.encode(params, image)[None], (subgoals, *CONFIG.feature_shape)), bearing
-    )
+    gaze = _gaze(NETWORK, params, image, bearing, distance)
     answers = NETWORK.answer(
         params,
-        jnp.broadcast_to(features[:, None], (*pairs, *CONFIG.feature_shape)),
-        jnp.broadcast_to(residual[:, None], pairs),
-        jnp.broadcast_to(distance[:, None], pairs),
+        jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], (*pairs, *leaf.shape[1:])), gaze),
         jnp.broadcast_to(stay[None], (*pairs, 3)),
         jnp.broadcast_to(go[None], (*pairs, 3)),
     )
@@ -183,8 +181,7 @@ def test_costs_keep_their_bounds_whatever_the_parameters(params, factor):
     wild = jax.tree.map(lambda leaf: leaf * factor, params)
     network = EstimatorNetwork(dataclasses.replace(CONFIG, step=0.5))
     bearing, distance, stay, go = _questions((8,))
-    features, residual = network.centre(network.encode(wild, _images(8)), bearing)
-    answers = network.answer(wild, features, residual, distance * 1e3, stay, go)
+    answers = network.answer(wild, _gaze(network, wild, _images(8), bearing, distance * 1e3), stay, go)
     assert np.all(np.asarray(answers.success_cost) >= 0.5)
     assert np.all(np.asarray(answers.failure_cost) >= 0)
     assert np.all((answers.success_probability >= 0) & (answers.success_probability <= 1))
@@ -209,7 +206,8 @@ def test_operations_and_parameters_counted_by_hand():
     biases = (1 + 2 + 3 + 4) + 8 + 4 * 2 + 3
     position = 4
     _, wide = operation_counts(dataclasses.replace(config, fovea=1))
-    assert wide - second == 2 * ((4 * 3 * 3 + 5) * 64 + 64 * 64 + 64 * 2)
+    # Twelve bands of three columns; scale and shift of both layers by the condition.
+    assert wide - second == 2 * ((12 * 3 * 3 + 2 * 5) * 256 + (256 + 2 * 5) * 128 + 128 * 2)
     shapes = jax.eval_shape(EstimatorNetwork(config).init, jax.random.key(0))
     assert parameter_count(shapes) == kernels + biases + position
 
@@ -228,7 +226,9 @@ def test_configuration_survives_json():
         ({"dense_widths": (8,)}, "dense_widths"),
         ({"image_shape": (128, 500)}, "multiples of 64"),
         ({"propositions": ()}, "propositions"),
-        ({"fovea": 60}, "fovea"),
+        ({"fovea": 64}, "fovea"),
+        ({"horizon": float("inf")}, "horizon"),
+        ({"fold": 0.0}, "fold"),
         ({"exclusive_within": -1.0}, "exclusive_within"),
         ({"success_cost_scale": float("nan")}, "success_cost_scale"),
     ],
@@ -241,7 +241,7 @@ def test_configurations_that_do_not_fit_are_refused(change, message):
 def test_other_shapes_of_input_are_refused_by_name(params):
     with pytest.raises(NetworkError, match=r"\(64, 64\).*\(64, 128\)"):
         NETWORK.encode(params, jnp.zeros((1, 64, 64, 3), jnp.uint8))
-    features = jnp.zeros((1, *CONFIG.feature_shape))
-    scalar, phi = jnp.zeros(1), jnp.zeros((1, 2), jnp.int8)
+    gaze = NETWORK.centre(jnp.zeros(CONFIG.feature_shape), jnp.zeros(1), jnp.zeros(1))
+    phi = jnp.zeros((1, 2), jnp.int8)
     with pytest.raises(NetworkError, match="fire, alarm, exit"):
-        NETWORK.answer(params, features, scalar, scalar, phi, phi)
+        NETWORK.answer(params, gaze, phi, phi)

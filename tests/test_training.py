@@ -149,6 +149,16 @@ def test_scales_are_those_of_the_labels_that_count():
     assert network_config(nothing, SHAPE).success_cost_scale == 1.0
 
 
+def test_a_fovea_looks_through_the_data_sets_camera():
+    samples = synthetic(6, 8, 2)
+    with pytest.raises(TrainingError, match="horizon, far, fold"):
+        network_config(samples, SHAPE, fovea=3)
+    camera = {"horizon": 20.0, "far": 40.0, "fold": 8.0}
+    seen = dataclasses.replace(samples, metadata=dataclasses.replace(samples.metadata, camera=camera))
+    config = network_config(seen, SHAPE, fovea=3)
+    assert (config.fovea, config.horizon, config.far, config.fold) == (3, 20.0, 40.0, 8.0)
+
+
 def test_costs_that_are_not_known_give_no_nan_gradient_and_padding_gives_none():
     samples = synthetic(4, 3, 3)
     samples = dataclasses.replace(samples, failure_cost=np.full_like(samples.failure_cost, np.nan))

@@ -33,7 +33,7 @@ from potlp_jax.learning.batches import TrainingError
 from potlp_jax.learning.dataset import DatasetError, Samples, decode, read_dataset
 from potlp_jax.learning.estimator_files import CheckpointError, save_estimator
 from potlp_jax.learning.loss import DataScale, network_config
-from potlp_jax.learning.network import EstimatorNetwork, NetworkError, operation_counts, parameter_count
+from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, NetworkError, operation_counts, parameter_count
 from potlp_jax.learning.training import Progress, Trained, TrainingConfig, seconds_per_step, steps_per_epoch, train
 
 # Of the time asked for: what validation, checkpoints and a busy machine may take.
@@ -186,7 +186,8 @@ def fit(training: Samples, validation: Samples, out: Path, arguments: argparse.N
     """Everything after reading the data."""
     config = TrainingConfig(steps=1, seed=arguments.seed, **{name: getattr(arguments, name) for name in _OPTIONS})
     rows, columns, _ = decode(training.images[0]).shape
-    network = EstimatorNetwork(network_config(training, (rows, columns), arguments.exclusive_within, arguments.fovea))
+    shape = (arguments.exclusive_within, arguments.fovea, tuple(arguments.second_widths))
+    network = EstimatorNetwork(network_config(training, (rows, columns), *shape))
     out.mkdir(parents=True, exist_ok=True)
     epoch = steps_per_epoch(training, config)
     began = time.perf_counter()
@@ -258,7 +259,15 @@ def parser() -> argparse.ArgumentParser:
         help="cells within which subgoals exclude each other, as eval.exclusion measures it (default 0: nowhere)",
     )
     found.add_argument(
-        "--fovea", type=int, default=0, help="columns of pixels beside the subgoal seen at full width (default 0: none)"
+        "--fovea", type=int, default=0, help="columns of pixels beside the subgoal to look at closely (default 0: none)"
+    )
+    found.add_argument(
+        "--second-widths",
+        type=int,
+        nargs=8,
+        default=NetworkConfig.second_widths,
+        metavar="N",
+        help=f"channels of the eight convolutions after phi is joined (default {NetworkConfig.second_widths})",
     )
     for name, field in _OPTIONS.items():
         found.add_argument(

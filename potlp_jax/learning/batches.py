@@ -8,6 +8,7 @@ import functools
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -131,6 +132,5 @@ def batch_answers(
 ) -> Answers:
     """The network's answers for a batch: the first stage once per panorama."""
     features = network.encode_pixels(params, pixels)
-    repeated = jnp.broadcast_to(features[:, None], (*bearing.shape, *features.shape[1:]))
-    centred, residual = network.centre(repeated, bearing)
-    return network.answer(params, centred, residual, batch.distance, batch.phi_stay, batch.phi_go)
+    gaze = jax.vmap(network.centre)(features, bearing, batch.distance)
+    return network.answer(params, gaze, batch.phi_stay, batch.phi_go)

@@ -86,7 +86,8 @@ class NetworkEstimator:
     ) -> Float32[Array, "3 C"]:
         """P_S, R_S and R_F of the real classes beyond one subgoal; ``answers`` keeps what it has of the others."""
         network, classes = EstimatorNetwork(self.config), task.class_mask.shape[0]
-        centred, residual = network.centre(features, angle)
+        gaze = network.centre(features, angle, distance)
+        repeated = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (QUESTIONS, *leaf.shape)), gaze)
         # Real classes first; those that fill up the last portion are dropped where they are written.
         order = jnp.argsort(~task.class_mask, stable=True).astype(jnp.int32)
         order = jnp.pad(order, (0, -classes % QUESTIONS), constant_values=classes)
@@ -94,14 +95,7 @@ class NetworkEstimator:
 
         def ask(portion: Int32[Array, ""], answers: Float32[Array, "3 C"]) -> Float32[Array, "3 C"]:
             chosen = jax.lax.dynamic_slice_in_dim(order, portion * QUESTIONS, QUESTIONS)
-            answer = network.answer(
-                self.params,
-                jnp.broadcast_to(centred[None], (QUESTIONS, *centred.shape)),
-                jnp.broadcast_to(residual, (QUESTIONS,)),
-                jnp.broadcast_to(distance, (QUESTIONS,)),
-                task.class_phi[chosen, 0],
-                task.class_phi[chosen, 1],
-            )
+            answer = network.answer(self.params, repeated, task.class_phi[chosen, 0], task.class_phi[chosen, 1])
             found = jnp.stack([answer.success_probability, answer.success_cost, answer.failure_cost])
             return answers.at[:, chosen].set(found, mode="drop")
 

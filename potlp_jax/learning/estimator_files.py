@@ -19,7 +19,7 @@ import numpy as np
 
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, NetworkError, Params
 
-ESTIMATOR_FORMAT: str = "potlp-estimator-2"
+ESTIMATOR_FORMAT: str = "potlp-estimator-3"
 """Changed when older files can no longer be read."""
 
 

@@ -14,6 +14,7 @@ differ between successes and failures move p away from the frequency of success:
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -83,11 +84,16 @@ class Evaluation:
 
 
 def network_config(
-    samples: Samples, image_shape: tuple[int, int], exclusive_within: float = 0.0, fovea: int = 0
+    samples: Samples,
+    image_shape: tuple[int, int],
+    exclusive_within: float = NetworkConfig.exclusive_within,
+    fovea: int = NetworkConfig.fovea,
+    second_widths: tuple[int, ...] = NetworkConfig.second_widths,
 ) -> NetworkConfig:
-    """A network for these samples: their propositions, and normalisers from their distances and costs.
+    """A network for these samples: their propositions and camera, and normalisers from their distances and costs.
 
-    ``exclusive_within`` and ``fovea`` as in ``NetworkConfig``; training does not depend on the first.
+    The other arguments as in ``NetworkConfig``; training does not depend on ``exclusive_within``. Raises TrainingError
+    where a fovea is asked for and the data do not say how their camera sees the floor.
     """
     step = float(samples.metadata.resolution)
     succeeded, failed = samples.success > 0, (samples.success < 1) & np.isfinite(samples.failure_cost)
@@ -100,7 +106,20 @@ def network_config(
         step=step,
         exclusive_within=exclusive_within,
         fovea=fovea,
+        second_widths=second_widths,
+        **(_geometry(samples) if fovea else {}),
     )
+
+
+def _geometry(samples: Samples) -> dict[str, Any]:
+    names, camera = ("horizon", "far", "fold"), samples.metadata.camera
+    missing = [name for name in names if name not in camera]
+    if missing:
+        raise TrainingError(
+            f"a fovea needs {', '.join(missing)} of the data set's camera (docs/camera.md): collect it again, or train "
+            "without a fovea"
+        )
+    return {name: float(camera[name]) for name in names}
 
 
 def _spread(values: np.ndarray, least: float) -> float:

@@ -13,10 +13,12 @@ subgoal's bearing. What is left of the bearing, at most half a column, enters th
 such a convolution is a matrix product of patches, whose gradient costs a CPU several times less than that of
 overlapping strided kernels. A condition that is constant over the image passes a convolution as one vector per sample,
 so the second stage's first layer adds ``W @ condition`` to every element instead of convolving copies of it. Circular
-padding hides from a convolution where the centre is: a learned bias per spatial element says it. With ``fovea``, the
-pixels around the subgoal's exact bearing are an input of their own: a door far down a hallway is narrower than a column
-of the features. They travel as further channels of the features, 16 columns of pixels in each. Layers that keep the
+padding hides from a convolution where the centre is: a learned bias per spatial element says it. Layers that keep the
 shape have a residual connection. There is no normalisation layer: one panorama's answer never depends on the batch.
+
+With ``fovea``, a patch of pixels around the subgoal is an input of its own (``learning.fovea``), and the condition
+scales what is made of it: which colours matter depends on who is looked for. The pixels travel as further channels of
+the features.
 """
 
 import dataclasses
@@ -32,6 +34,9 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float32, Int8, PRNGKeyArray, UInt8
 
+from potlp_jax.learning.fovea import ABOVE, BAND, BELOW, bands_of, packed, patch, unpacked
+from potlp_jax.world.panorama import CameraConfig, floor_rows
+
 Params = Any
 """Parameters of the network: nested dictionaries of float32 arrays, ``{"first": ..., "second": ...}``."""
 
@@ -42,8 +47,8 @@ _FIRST_KERNELS = (4, 2, 3, 3)
 _FIRST_STRIDES = (4, 2, 2, 1)
 _SECOND_STRIDES = (2, 1, 1, 1, 2, 1, 1, 1)
 _OUTPUTS = 3
-_FINE = STRIDE * 3
-_FOVEA_WIDTHS = (64, 64)
+_FINE = STRIDE // BAND * STRIDE * 3
+_FOVEA_WIDTHS = (256, 128)
 _SLOPE = 0.1
 
 
@@ -61,7 +66,8 @@ class NetworkConfig:
         first_widths: channels of the four convolutions before phi is joined.
         second_widths: channels of the eight after.
         dense_widths: units of the first four fully connected layers; the fifth has the three outputs.
-        fovea: columns of pixels on each side of the subgoal that are seen at full width; 0 for none.
+        fovea: columns of pixels on each side of the subgoal that are looked at closely; 0 for none.
+        horizon, far, fold: of the camera (``CameraConfig``), for the row in which a subgoal is looked for.
         distance_scale: the distance is divided by it.
         success_cost_scale, failure_cost_scale: unit of the outputs R_S and R_F, and of their errors in the loss
             (standard deviations over the training data).
@@ -77,6 +83,9 @@ class NetworkConfig:
     second_widths: tuple[int, ...] = (32, 32, 32, 32, 48, 48, 48, 48)
     dense_widths: tuple[int, ...] = (128, 64, 64, 32)
     fovea: int = 0
+    horizon: float = CameraConfig.horizon
+    far: float = CameraConfig.far
+    fold: float = CameraConfig.fold
     distance_scale: float = 30.0
     success_cost_scale: float = 30.0
     failure_cost_scale: float = 30.0
@@ -97,12 +106,22 @@ class NetworkConfig:
         side = STRIDE * math.prod(_SECOND_STRIDES)
         if any(size < side or size % side for size in self.image_shape):
             raise NetworkError(f"image_shape is {self.image_shape}; rows and columns must be multiples of {side}")
-        for name in ("distance_scale", "success_cost_scale", "failure_cost_scale", "step", "pixel_scale"):
+        for name in (
+            "distance_scale",
+            "success_cost_scale",
+            "failure_cost_scale",
+            "step",
+            "pixel_scale",
+            "far",
+            "fold",
+        ):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise NetworkError(f"{name} is {getattr(self, name)}; give a positive number")
         if not (math.isfinite(self.exclusive_within) and self.exclusive_within >= 0):
             raise NetworkError(f"exclusive_within is {self.exclusive_within}; give a number of cells, 0 for none")
-        if not 0 <= self.fovea <= self.image_shape[1] // 2 - STRIDE:
+        if not math.isfinite(self.horizon):
+            raise NetworkError(f"horizon is {self.horizon}; give a number of rows")
+        if not 0 <= 2 * self.fovea < self.image_shape[1]:
             raise NetworkError(f"fovea is {self.fovea}; give a number of columns, less than half the image's")
         if not self.propositions:
             raise NetworkError("propositions is empty; name at least one")
@@ -155,6 +174,20 @@ def _deviation(gain: float) -> Callable[..., Array]:
     return fill
 
 
+@struct.dataclass(kw_only=True)
+class Gaze:
+    """A panorama as it looks from the direction of a subgoal: what ``EstimatorNetwork.centre`` makes of it."""
+
+    features: Float32[Array, "*B feature_rows feature_columns F"]
+    """Rolled by whole columns so that the subgoal's bearing is in the centre."""
+    residual: Float32[Array, "*B"]
+    """The angle that is left, at most half a column; positive where the subgoal lies to the right of the centre."""
+    distance: Float32[Array, "*B"]
+    """From the panorama's pose to the subgoal."""
+    fovea: Float32[Array, "*B patch_rows patch_columns 3"] | None
+    """The pixels around the subgoal, where the network looks at them."""
+
+
 class _Convolution(nn.Module):
     """Convolution and leaky ReLU: circular across the width, zeros above and below; patches where kernel = stride."""
 
@@ -194,6 +227,17 @@ class _FirstStage(nn.Module):
         return x
 
 
+class _Modulated(nn.Module):
+    """A fully connected layer whose units the condition scales and shifts (FiLM, Perez et al. 2018), and leaky ReLU."""
+
+    width: int
+
+    @nn.compact
+    def __call__(self, x: Array, condition: Array) -> Array:
+        scale, shift = (nn.Dense(self.width, use_bias=False, kernel_init=_deviation(0.1))(condition) for _ in range(2))
+        return nn.leaky_relu(nn.Dense(self.width, kernel_init=_deviation(2.0))(x) * (1 + scale) + shift, _SLOPE)
+
+
 class _SecondStage(nn.Module):
     widths: tuple[int, ...]
     dense_widths: tuple[int, ...]
@@ -209,9 +253,9 @@ class _SecondStage(nn.Module):
             x = x + y if keeps else y
         x = x.reshape(x.shape[0], -1)
         if fovea is not None:
-            seen = jnp.concatenate([fovea, condition], axis=-1)
+            seen = fovea
             for width in _FOVEA_WIDTHS:
-                seen = nn.leaky_relu(nn.Dense(width, kernel_init=_deviation(2.0))(seen), _SLOPE)
+                seen = _Modulated(width)(seen, condition)
             x = jnp.concatenate([x, seen], axis=-1)
         for width in self.dense_widths:
             x = nn.leaky_relu(nn.Dense(width, kernel_init=_deviation(2.0))(x), _SLOPE)
@@ -251,10 +295,12 @@ class EstimatorNetwork:
         key = jax.random.key(0)
         pixels = jnp.zeros((1, *self.config.image_shape, 3))
         conditions = jnp.zeros((1, 2 * len(self.config.propositions) + 3))
-        features, fovea = self._parted(jnp.zeros((1, *self.config.feature_shape)), jnp.zeros(1))
+        gaze = jax.tree.map(
+            lambda leaf: leaf[None], self.centre(jnp.zeros(self.config.feature_shape), *[jnp.zeros(())] * 2)
+        )
         return {
             "first": self._first.init(key, pixels)["params"],
-            "second": self._second.init(key, features, conditions, fovea)["params"],
+            "second": self._second.init(key, gaze.features, conditions, _flat_fovea(gaze))["params"],
         }
 
     def encode(
@@ -274,40 +320,38 @@ class EstimatorNetwork:
         features = self._first.apply({"params": params["first"]}, flat)
         assert isinstance(features, jax.Array)
         if self.config.fovea:
-            rows, columns, _ = self.config.feature_shape
-            fine = jnp.mean(flat.reshape(-1, rows, STRIDE, columns * STRIDE, 3), axis=2)
-            features = jnp.concatenate([features, fine.reshape(-1, rows, columns, _FINE)], axis=-1)
+            features = jnp.concatenate([features, packed(bands_of(flat), STRIDE)], axis=-1)
         return features.reshape(*pixels.shape[:-3], *features.shape[1:])
 
     def centre(
-        self, features: Float32[Array, "*B feature_rows feature_columns F"], bearing: Float32[Array, "*B"]
-    ) -> tuple[Float32[Array, "*B feature_rows feature_columns F"], Float32[Array, "*B"]]:
-        """Features rolled by whole columns so that ``bearing`` is in the centre, and the angle that is left.
+        self,
+        features: Float32[Array, "feature_rows feature_columns F"],
+        bearing: Float32[Array, "*B"],
+        distance: Float32[Array, "*B"],
+    ) -> Gaze:
+        """One panorama, as ``encode`` gives it, seen toward subgoals.
 
-        The angle left is at most half a column, ``pi / feature_columns``, and positive where the subgoal lies to the
-        right of the centre.
+        ``distance`` is the known-space distance from the panorama's pose to the subgoal.
         """
-        columns = features.shape[-2]
+        fovea = None
+        if self.config.fovea:
+            row = floor_rows(self._camera, distance / jnp.float32(self.config.step))
+            # Pixels depend on no parameter; said here, no gradient is scattered back into the panorama.
+            bands = jax.lax.stop_gradient(unpacked(features[..., -_FINE:], STRIDE))
+            fovea = patch(bands, bearing, row, self.config.fovea)
+            features = features[..., :-_FINE]
+        columns = features.shape[1]
         column = jnp.float32(2 * math.pi / columns)
         shift = jnp.round(bearing / column)
-        own = jnp.broadcast_to(jnp.arange(columns), (*bearing.shape, columns))
+        own = jnp.broadcast_to(jnp.arange(columns, dtype=jnp.int32), (*shift.shape, columns))
         source = (own + shift[..., None].astype(jnp.int32)) % columns
-        rolled = jnp.take_along_axis(features, source[..., None, :, None], axis=-2)
-        return rolled, bearing - shift * column
+        rolled = jnp.moveaxis(features[:, source], 0, -3)
+        return Gaze(features=rolled, residual=bearing - shift * column, distance=distance, fovea=fovea)
 
-    def answer(
-        self,
-        params: Params,
-        features: Float32[Array, "*B feature_rows feature_columns F"],
-        residual: Float32[Array, "*B"],
-        distance: Float32[Array, "*B"],
-        phi_stay: Int8[Array, "*B P"],
-        phi_go: Int8[Array, "*B P"],
-    ) -> Answers:
-        """The second stage, for features and residual angles as ``centre`` gives them.
+    def answer(self, params: Params, gaze: Gaze, phi_stay: Int8[Array, "*B P"], phi_go: Int8[Array, "*B P"]) -> Answers:
+        """The second stage. ``*B`` are the leading dimensions of ``gaze``.
 
-        ``distance`` is the known-space distance from the panorama's pose to the subgoal. Raises NetworkError where the
-        vectors phi have another length than the network's propositions.
+        Raises NetworkError where the vectors phi have another length than the network's propositions.
         """
         expected = len(self.config.propositions)
         if phi_stay.shape[-1] != expected or phi_go.shape[-1] != expected:
@@ -316,16 +360,18 @@ class EstimatorNetwork:
                 f"propositions: {', '.join(self.config.propositions)}"
             )
         # Half a column is turned into a quarter of a circle: the sine then uses its whole range.
-        angle = residual * jnp.float32(self.config.feature_shape[1] / 2)
-        scaled = distance / jnp.float32(self.config.distance_scale)
+        angle = gaze.residual * jnp.float32(self.config.feature_shape[1] / 2)
+        scaled = gaze.distance / jnp.float32(self.config.distance_scale)
         scalars = jnp.stack([scaled, jnp.sin(angle), jnp.cos(angle)], axis=-1)
         condition = jnp.concatenate([phi_stay.astype(jnp.float32), phi_go.astype(jnp.float32), scalars], axis=-1)
-        coarse, fovea = self._parted(features.reshape(-1, *features.shape[-3:]), residual.reshape(-1))
         outputs = self._second.apply(
-            {"params": params["second"]}, coarse, condition.reshape(-1, condition.shape[-1]), fovea
+            {"params": params["second"]},
+            gaze.features.reshape(-1, *gaze.features.shape[-3:]),
+            condition.reshape(-1, condition.shape[-1]),
+            _flat_fovea(gaze),
         )
         assert isinstance(outputs, jax.Array)
-        logit, success, failure = jnp.moveaxis(outputs.reshape(*distance.shape, _OUTPUTS), -1, 0)
+        logit, success, failure = jnp.moveaxis(outputs.reshape(*gaze.distance.shape, _OUTPUTS), -1, 0)
         return Answers(
             success_logit=logit,
             success_cost=jnp.float32(self.config.step)
@@ -333,14 +379,11 @@ class EstimatorNetwork:
             failure_cost=jnp.float32(self.config.failure_cost_scale) * jax.nn.softplus(failure),
         )
 
-    def _parted(
-        self, features: Float32[Array, "B feature_rows feature_columns F"], residual: Float32[Array, " B"]
-    ) -> tuple[Array, Array | None]:
-        """The features proper, and the fovea where the network has one."""
-        if not self.config.fovea:
-            return features, None
-        window = foveal_window(features[..., -_FINE:], residual, self.config.fovea)
-        return features[..., :-_FINE], window.reshape(len(window), -1)
+    @property
+    def _camera(self) -> CameraConfig:
+        rows, columns = self.config.image_shape
+        config = self.config
+        return CameraConfig(height=rows, width=columns, horizon=config.horizon, far=config.far, fold=config.fold)
 
     @property
     def _first(self) -> _FirstStage:
@@ -351,25 +394,8 @@ class EstimatorNetwork:
         return _SecondStage(self.config.second_widths, self.config.dense_widths)
 
 
-def foveal_window(
-    fine: Float32[Array, "B feature_rows feature_columns F"], residual: Float32[Array, " B"], reach: int
-) -> Float32[Array, "B feature_rows W 3"]:
-    """The ``W = 2 * reach + 1`` columns of pixels around the subgoal's exact bearing, by linear interpolation.
-
-    ``fine`` has 16 columns of pixels in each column of the features, already rolled by whole columns (``centre``), and
-    ``residual`` is the angle that is left.
-    """
-    batch, rows, columns, _ = fine.shape
-    # The residual is at most half a column of features, and one pixel more is interpolated.
-    half = -(-(reach + 1 + STRIDE // 2) // STRIDE)
-    pixels = fine[:, :, columns // 2 - half : columns // 2 + half].reshape(batch, rows, 2 * half * STRIDE, 3)
-    place = half * STRIDE - 0.5 + residual * jnp.float32(columns * STRIDE / (2 * math.pi))
-    seen = place[:, None] + jnp.arange(-reach, reach + 1, dtype=jnp.float32)[None]
-    left = jnp.floor(seen)
-    part = (seen - left)[:, None, :, None]
-    index = left.astype(jnp.int32)[:, None, :, None]
-    at_left, at_right = (jnp.take_along_axis(pixels, index + step, axis=2) for step in (0, 1))
-    return (1 - part) * at_left + part * at_right
+def _flat_fovea(gaze: Gaze) -> Float32[Array, "B pixels"] | None:
+    return None if gaze.fovea is None else gaze.fovea.reshape(-1, math.prod(gaze.fovea.shape[-3:]))
 
 
 def parameter_count(params: Params) -> int:
@@ -394,8 +420,8 @@ def operation_counts(config: NetworkConfig) -> tuple[int, int]:
     shrink = math.prod(_SECOND_STRIDES)
     flat = (rows // shrink) * (columns // shrink) * config.second_widths[-1]
     if config.fovea:
-        seen = [rows * (2 * config.fovea + 1) * 3 + conditions, *_FOVEA_WIDTHS]
-        second += sum(2 * i * o for i, o in itertools.pairwise(seen))
+        seen = [(ABOVE + BELOW) * (2 * config.fovea + 1) * 3, *_FOVEA_WIDTHS]
+        second += sum(2 * (i + 2 * conditions) * o for i, o in itertools.pairwise(seen))
         flat += seen[-1]
     units = [flat, *config.dense_widths, _OUTPUTS]
     return first, second + sum(2 * i * o for i, o in itertools.pairwise(units))

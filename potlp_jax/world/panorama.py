@@ -233,6 +233,15 @@ def rows_at_slopes(config: CameraConfig, slopes: Float[np.ndarray, " n"]) -> Flo
     return config.horizon + config.fold * np.arcsinh(-slopes * config.far / config.eye_height) - 0.5
 
 
+def floor_rows(config: CameraConfig, distance: Float32[Array, "*B"]) -> Float32[Array, "*B"]:
+    """Row coordinate, 0 in the middle of the first row, in which the floor at a distance in cells is seen.
+
+    Nearer than one cell as at one cell: the robot does not see the floor under itself.
+    """
+    ratio = jnp.float32(config.far) / jnp.maximum(distance, jnp.float32(1))
+    return jnp.float32(config.horizon - 0.5) + jnp.float32(config.fold) * jnp.arcsinh(ratio)
+
+
 def finer(config: CameraConfig, factor: int) -> CameraConfig:
     """The same view in ``factor`` times as many rows and columns."""
     return dataclasses.replace(
