@@ -33,7 +33,7 @@ CONFIG = TrialConfig(
 
 def _untrained():
     config = NetworkConfig(
-        propositions=TOY.propositions, first_widths=(4,) * 4, second_widths=(4,) * 8, dense_widths=(8,) * 4
+        propositions=TOY.propositions, first_widths=(4,) * 4, second_widths=(4,) * 8, dense_widths=(8,) * 4, fovea=3
     )
     params = EstimatorNetwork(config).init(jax.random.key(0))
     return TrainedEstimator(params=params, config=config, metadata={}, name="untrained", digest="")

@@ -49,7 +49,7 @@ def generator():
 
 @pytest.fixture(scope="module")
 def trained_file(generator, tmp_path_factory):
-    config = NetworkConfig(propositions=generator.propositions, exclusive_within=WITHIN, **TINY)
+    config = NetworkConfig(propositions=generator.propositions, exclusive_within=WITHIN, fovea=4, **TINY)
     path = tmp_path_factory.mktemp("estimator") / "tiny.npz"
     save_estimator(path, EstimatorNetwork(config).init(jax.random.key(3)), config, {})
     return path
