@@ -105,13 +105,15 @@ def contrast(generator: MappedRooms, pairs: list[Pair]) -> dict[str, Any]:
 
 
 def draw_contrast(generator: MappedRooms, pair: Pair, file: Path) -> None:
-    """The paths of the baseline and of PO-TLP in one world, one above the other; lit rooms are bright."""
+    """The paths of the baseline and of PO-TLP in one world, side by side unless it is wide; lit rooms are bright."""
     number = pair[Policy.BASELINE].item.world
     world = generator.generate(world_key(Split.TEST, number, generator.name))
     height, width = world.shape
-    figure = new_figure(11.0, 2 * (10.5 * height / width + 0.5))
+    rows, columns = (1, 2) if width < 2 * height else (2, 1)
+    figure = new_figure(11.0, rows * (11.0 / columns * height / width + 0.3))
+    figure.subplots_adjust(left=0.01, right=0.99, bottom=0.01, top=0.95, wspace=0.03, hspace=0.1)
     for place, policy in enumerate((Policy.BASELINE, Policy.POTLP)):
-        axes = figure.add_subplot(2, 1, place + 1)
+        axes = figure.add_subplot(rows, columns, place + 1)
         path = [(int(row), int(column)) for row, column in read_path(pair[policy].path)]
         draw_plan(axes, world, generator.propositions, path[0])
         axes.plot(*np.array(path, float).T[::-1], color=ROBOT, lw=1.5)
