@@ -461,6 +461,13 @@ def test_info_shows_what_the_file_says(estimator):
     assert data["metadata"]["figures"]["validation_success_rmse"] is None
 
 
+@pytest.mark.parametrize(("fovea", "words"), [(0, "nothing"), (5, "11 columns × 48 rows")])
+def test_info_says_how_closely_a_subgoal_is_looked_at(tmp_path, fovea, words):
+    config = dataclasses.replace(CONFIG, fovea=fovea)
+    save_estimator(tmp_path / "e.npz", EstimatorNetwork(config).init(jax.random.key(0)), config, {})
+    assert words in _potlp("info", tmp_path / "e.npz").stdout
+
+
 def test_bad_input_is_one_clear_message(estimator, dataset, tmp_path, monkeypatch):
     folder = dataset[0]
     other = tmp_path / "other.npz"

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from potlp_jax.cli.output import FAILED, console, fail, print_json
 from potlp_jax.learning.estimator_files import CheckpointError, load_estimator
+from potlp_jax.learning.fovea import ABOVE, BAND, BELOW
 from potlp_jax.learning.network import operation_counts, parameter_count
 
 
@@ -51,6 +52,12 @@ def evaluate_estimator(path: Path, dataset: Path, out: Path | None, ablate: str,
     run_evaluation(path, dataset, out, ablate, json)
 
 
+def _fovea(reach: int) -> str:
+    if not reach:
+        return "nothing"
+    return f"{2 * reach + 1} columns × {(ABOVE + BELOW) * BAND} rows around each subgoal"
+
+
 def _rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     """Names and values for people; what the file does not say is left out."""
     network, metadata = description["network"], description["metadata"]
@@ -58,6 +65,7 @@ def _rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [
         ("propositions", ", ".join(network["propositions"])),
         ("panorama", " × ".join(map(str, network["image_shape"])) + " pixels"),
+        ("looked at closely", _fovea(network["fovea"])),
         ("file", f"{description['bytes'] / 1e6:.2f} MB, {description['parameters']:,} parameters"),
         (
             "arithmetic",
