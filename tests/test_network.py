@@ -163,15 +163,17 @@ def test_every_input_counts(params):
     assert [name for name, answers in changed.items() if abs(float(answers.success_logit - base)) < 1e-7] == []
 
 
-def test_gradients_reach_every_parameter(params):
+@pytest.mark.parametrize("fovea", [0, 5])
+def test_gradients_reach_every_parameter(fovea):
+    network = EstimatorNetwork(dataclasses.replace(CONFIG, fovea=fovea))
     image = _images(6)
-    questions = _questions((6,))
+    bearing, distance, stay, go = _questions((6,))
 
     def total(params):
-        answers = _answers(params, image, *questions)
+        answers = network.answer(params, _gaze(network, params, image, bearing, distance), stay, go)
         return jnp.sum(answers.success_logit + answers.success_cost + answers.failure_cost)
 
-    gradients = jax.tree_util.tree_leaves_with_path(jax.grad(total)(params))
+    gradients = jax.tree_util.tree_leaves_with_path(jax.grad(total)(network.init(jax.random.key(3))))
     assert [jax.tree_util.keystr(path) for path, leaf in gradients if not np.any(leaf)] == []
     assert all(np.all(np.isfinite(leaf)) for _, leaf in gradients)
 

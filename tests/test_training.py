@@ -399,9 +399,11 @@ def test_the_command_writes_an_estimator_and_resumes(tmp_path):
         columns |= {key: [0] * 20 for key in ("outcome_class", "row", "column")}
         columns |= {"view": samples.view_of.tolist(), "task": ["F red"] * 20}
         columns |= {"success_probability": samples.success.tolist()}
-        write_shard(tmp_path / name, 0, views, columns, METADATA)
+        camera = {"horizon": 24.0, "far": 50.0, "fold": 8.0}
+        write_shard(tmp_path / name, 0, views, columns, dataclasses.replace(METADATA, camera=camera))
     command = [sys.executable, "-m", "train.fit", str(tmp_path / "training"), "--validation", tmp_path / "validation"]
     command += ["--out", str(tmp_path / "out"), "--epochs", "2", "--views-per-batch", "2", "--samples-per-view", "2"]
+    command += ["--fovea", "3", "--second-widths", *"34567899"]
     for expected in ("epoch   2.0", "ended by planned"):
         done = subprocess.run(
             command, capture_output=True, text=True, cwd=ROOT, timeout=400, env=_environment(tmp_path)
@@ -410,6 +412,7 @@ def test_the_command_writes_an_estimator_and_resumes(tmp_path):
         assert expected in done.stdout
     params, config, metadata = load_estimator(tmp_path / "out" / "estimator.npz")
     assert config.propositions == ("red", "green")
+    assert (config.fovea, config.horizon, config.second_widths) == (3, 24.0, (3, 4, 5, 6, 7, 8, 9, 9))
     assert metadata["figures"]["step"] == metadata["best_step"]
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(params))
     assert (tmp_path / "out" / "log.csv").read_text().count("\n") == 3

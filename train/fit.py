@@ -186,8 +186,15 @@ def fit(training: Samples, validation: Samples, out: Path, arguments: argparse.N
     """Everything after reading the data."""
     config = TrainingConfig(steps=1, seed=arguments.seed, **{name: getattr(arguments, name) for name in _OPTIONS})
     rows, columns, _ = decode(training.images[0]).shape
-    shape = (arguments.exclusive_within, arguments.fovea, tuple(arguments.second_widths))
-    network = EstimatorNetwork(network_config(training, (rows, columns), *shape))
+    network = EstimatorNetwork(
+        network_config(
+            training,
+            (rows, columns),
+            exclusive_within=arguments.exclusive_within,
+            fovea=arguments.fovea,
+            second_widths=tuple(arguments.second_widths),
+        )
+    )
     out.mkdir(parents=True, exist_ok=True)
     epoch = steps_per_epoch(training, config)
     began = time.perf_counter()
