@@ -6,12 +6,11 @@
 ``PLANS`` is a folder with folders of plans (docs/delivery.md), each a group of its own beside the generated floors.
 The paper's 80 simulations are the first 80 of each group; the oracle runs on the generated ones among them. The same
 network, unchanged, then runs formulas that no training task equals. Intervals and errors are clustered by building. The
-same command goes on where it was stopped, also with more worlds: each block of them is a sweep of its own.
+same command goes on where it was stopped, also with more worlds.
 ``--report`` writes NAME.json beside what is printed.
 """
 
 import argparse
-import itertools
 import json
 import os
 from collections.abc import Hashable, Mapping, Sequence
@@ -33,15 +32,12 @@ from potlp_jax.sweep.store import Row
 from potlp_jax.trial import versions
 
 POLICIES = [Policy.KNOWN_MAP.value, Policy.BASELINE.value, Policy.ORACLE.value, Policy.POTLP.value]
-WITHOUT_ORACLE = [policy for policy in POLICIES if policy != Policy.ORACLE.value]
+WITHOUT_ORACLE = [policy for policy in POLICIES if policy != Policy.ORACLE]
 """Of all but the first generated floors: true labels take as long as the network, on large grids seconds a decision."""
 
 GENERATED = "generated"
 FIRST = 80
 """Simulations of the paper: 13.5 % per trial (6.1 % standard error), 7.8 % net."""
-
-BLOCK = 120
-"""Worlds of each sweep after the first. What ends within a block begins that one anew when more worlds are asked."""
 
 
 def groups(plans: Path | None) -> dict[str, str]:
@@ -52,30 +48,25 @@ def groups(plans: Path | None) -> dict[str, str]:
     return found
 
 
-def blocks(worlds: int) -> list[range]:
-    """The numbers of the worlds of each sweep."""
-    starts = [0, *range(FIRST, worlds, BLOCK)]
-    return [range(start, end) for start, end in itertools.pairwise([*starts, worlds])]
-
-
-def run_blocks(
-    folder: Path, environment: str, tasks: list[str], worlds: int, processes: int, *, oracle: bool = False
+def run_group(
+    folder: Path, environment: str, tasks: list[str], policies: list[str], worlds: int, processes: int
 ) -> list[Row]:
-    """The rows of all blocks of test worlds; what is missing is run, with the oracle on the first block alone."""
-    rows = []
-    for block in blocks(worlds):
-        chosen = {
-            "environments": [environment],
-            "tasks": tasks,
-            "policies": POLICIES if oracle and block.start == 0 else WITHOUT_ORACLE,
-            "worlds": len(block),
-            "first_world": block.start,
-            "split": Split.TEST.value,
-        }
-        own = folder / f"{block.start}-{block.stop}"
-        sweep(own, chosen, processes)
-        rows += read_rows(own)
-    return rows
+    """The rows of test worlds; what is missing is run."""
+    chosen = {
+        "environments": [environment],
+        "tasks": tasks,
+        "policies": policies,
+        "worlds": worlds,
+        "split": Split.TEST.value,
+    }
+    sweep(folder, chosen, processes)
+    return read_rows(folder)
+
+
+def run_oracle(folder: Path, environment: str, tasks: list[str], worlds: int, processes: int) -> list[Row]:
+    """The oracle's rows; the sweep is one of its own, with the two policies that every sweep has."""
+    rows = run_group(folder, environment, tasks, [Policy.ORACLE.value], worlds, processes)
+    return [row for row in rows if row.item.policy == Policy.ORACLE]
 
 
 def building_of(generator: Generator, world: int) -> Hashable:
@@ -142,11 +133,14 @@ def main() -> None:
     for name, environment in groups(options.plans).items():
         generated = name == GENERATED
         worlds = options.worlds if generated else options.plan_worlds
-        rows = run_blocks(options.out / name, environment, [task], worlds, options.processes, oracle=generated)
+        rows = run_group(options.out / name, environment, [task], WITHOUT_ORACLE, worlds, options.processes)
+        if generated:
+            rows += run_oracle(options.out / "oracle", environment, [task], min(worlds, FIRST), options.processes)
         found[name] = results_of(rows, environment, [task])
     if options.formula_worlds:
         tasks = list(HELD_OUT["delivery"])
-        rows = run_blocks(options.out / "formulas", "delivery", tasks, options.formula_worlds, options.processes)
+        formulas = options.out / "formulas"
+        rows = run_group(formulas, "delivery", tasks, WITHOUT_ORACLE, options.formula_worlds, options.processes)
         found["other formulas"] = results_of(rows, "delivery", tasks)
     results = {"groups": found, "versions": versions(), "reported_at": source_commit()}
     print(markdown(results))

@@ -150,8 +150,12 @@ def test_a_process_that_takes_over_a_number_is_another():
 def test_a_store_of_another_sweep_is_refused_by_name(tmp_path):
     Sweep(_specification(), tmp_path)
     Sweep(_specification(), tmp_path)
-    with pytest.raises(StoreError, match="worlds was 3, is 4"):
-        Sweep(_specification(worlds=4), tmp_path)
+    with pytest.raises(StoreError, match="worlds was 3, is 2"):
+        Sweep(_specification(worlds=2), tmp_path)
+    with pytest.raises(StoreError, match="specification: first_world was 5, is 1, worlds was 3, is 4"):
+        Sweep(_specification(worlds=4, first_world=1), tmp_path)
+    with pytest.raises(StoreError, match="worlds was 3, is 2"):
+        Sweep(_specification(worlds=2), tmp_path)
 
 
 def test_other_files_are_no_store(tmp_path):
@@ -201,6 +205,14 @@ def test_a_finished_sweep_has_nothing_left_to_do(finished):
     before = _rows(finished)
     run_sweep(_specification(), finished, 1)
     assert _rows(finished) == before
+
+
+def test_a_sweep_can_be_made_longer(finished, tmp_path):
+    run_sweep(_specification(worlds=1), tmp_path, 1)
+    short = _rows(tmp_path)
+    run_sweep(_specification(), tmp_path, 1)
+    assert len(short) == 3
+    assert _rows(tmp_path) == _rows(finished)
 
 
 MANY_KILLS = """

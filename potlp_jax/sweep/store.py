@@ -137,7 +137,7 @@ class Store:
         self._connection.execute("COMMIT")
 
     def agree(self, facts: Mapping[str, Any]) -> None:
-        """Write down what the sweep is, or compare with what is written.
+        """Write down what the sweep is, or compare with what is written. More worlds than written make it longer.
 
         Raises:
             StoreError: the store was begun with something else; the message names the entries.
@@ -146,11 +146,12 @@ class Store:
             written = self.facts()
             for name, value in facts.items():
                 text = json.dumps(value, sort_keys=True)
-                if name not in written:
-                    self._connection.execute("INSERT INTO facts VALUES (?, ?)", (name, text))
-                elif json.dumps(written[name], sort_keys=True) != text:
+                given = json.loads(text)
+                if name not in written or _is_longer(given, written[name]):
+                    self._connection.execute("INSERT OR REPLACE INTO facts VALUES (?, ?)", (name, text))
+                elif given != written[name]:
                     raise StoreError(
-                        f"{self.file}: was begun with another {name}: {_difference(written[name], value)}. "
+                        f"{self.file}: was begun with another {name}: {_difference(written[name], given)}. "
                         "Give the sweep a folder of its own, or the specification that this one was begun with"
                     )
 
@@ -271,6 +272,13 @@ def process_start(process: int) -> float | None:
     # The name, in brackets, may hold anything.
     state, *fields = stat.rpartition(")")[2].split()
     return None if state == "Z" else float(fields[18])
+
+
+def _is_longer(given: Any, written: Any) -> bool:
+    """Whether a specification differs from the one that is written by more worlds alone."""
+    if not (isinstance(given, Mapping) and isinstance(written, Mapping) and "worlds" in given):
+        return False
+    return {**written, "worlds": given["worlds"]} == given and given["worlds"] > written["worlds"]
 
 
 def _difference(written: Any, given: Any) -> str:
