@@ -295,6 +295,11 @@ def versions(estimator: TrainedEstimator | None = None) -> dict[str, str]:
     return libraries if estimator is None else libraries | {"estimator": estimator.identity}
 
 
+def trial_key(world: int, seed: int = 0) -> PRNGKeyArray:
+    """The key of every policy's trial in world number ``world``, in a sweep or alone; ``seed`` gives other draws."""
+    return jax.random.fold_in(jax.random.key(seed), world)
+
+
 def planning_key(key: PRNGKeyArray) -> PRNGKeyArray:
     """What a trial's key becomes for the planner: folded by name, so that no draw depends on another use of the key."""
     return jax.random.fold_in(key, 1)

@@ -7,6 +7,7 @@ import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
+import jax
 import pytest
 from PIL import Image
 from typer.testing import CliRunner
@@ -138,6 +139,19 @@ def test_run_writes_record_picture_and_animation(recorded):
         assert len(picture.convert("RGB").getcolors(1 << 20) or []) > 20
     with Image.open(recorded / "trial.gif") as animation:
         assert animation.n_frames == len(trial.decisions) + 1
+
+
+@pytest.mark.parametrize("command", ["run", "compare"])
+def test_trials_have_the_key_of_their_world_in_a_sweep(monkeypatch, command):
+    keys = []
+
+    def run_trial(world, task, policy, key, *rest, **named):
+        keys.append(key)
+        raise WorldError("seen")
+
+    monkeypatch.setattr(f"potlp_jax.cli.{command}.run_trial", run_trial)
+    _potlp(command, "toy", "--policies" if command == "compare" else "--policy", "baseline", "--seed", "3")
+    assert (keys[0] == jax.random.fold_in(jax.random.key(0), 3)).all()
 
 
 def test_run_as_json_is_the_summary(recorded, tmp_path):

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 from rich.console import Console
 
 from potlp_jax.cli.inputs import (
@@ -41,7 +40,7 @@ from potlp_jax.sweep.runner import IMPOSSIBLE_IN_A_ROW
 from potlp_jax.sweep.statistics import KNOWN_MAP, Comparison
 from potlp_jax.sweep.store import Item, Row
 from potlp_jax.task.task import Task
-from potlp_jax.trial import run_trial
+from potlp_jax.trial import run_trial, trial_key
 from potlp_jax.trial_config import TrialConfig
 from potlp_jax.view.comparisons import draw_scatter, loss_lines, outcome_table, savings_table
 from potlp_jax.view.style import save_figure
@@ -63,7 +62,7 @@ class _Setting:
 
     def row(self, world: World, seed: int, policy: Policy) -> Row:
         """The trial of a policy in world ``seed``; its key is the same for all policies."""
-        start, key = time.perf_counter(), jax.random.key(seed)
+        start, key = time.perf_counter(), trial_key(seed)
         name = f"{self.environment}/{self.split}"
         trained = self.estimator if policy is Policy.POTLP else None
         trial = run_trial(world, self.task, policy, key, self.config, environment=name, seed=seed, estimator=trained)

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import jax
 import typer
 
 from potlp_jax.cli.inputs import (
@@ -17,7 +16,7 @@ from potlp_jax.cli.inputs import (
 from potlp_jax.cli.output import FAILED, console, output_folder, print_json, progress_bar
 from potlp_jax.environments import make
 from potlp_jax.records import Outcome, Trial
-from potlp_jax.trial import run_trial
+from potlp_jax.trial import run_trial, trial_key
 from potlp_jax.types import Status
 from potlp_jax.view.animation import save_animation
 from potlp_jax.view.maps import draw_trial
@@ -52,7 +51,7 @@ def run_one(
             world,
             task,
             policy,
-            jax.random.key(seed),
+            trial_key(seed),
             trial_config(simulations, generator),
             environment=f"{environment}/{split}",
             seed=seed,

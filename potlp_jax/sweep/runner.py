@@ -27,7 +27,7 @@ from potlp_jax.sweep.rows import batch_row
 from potlp_jax.sweep.specification import Cell, Specification
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store
 from potlp_jax.task.task import Task, TaskArrays, TaskSizes
-from potlp_jax.trial import run_trial, versions
+from potlp_jax.trial import run_trial, trial_key, versions
 from potlp_jax.world.grid import World, WorldError
 
 RESULTS: str = "results.sqlite"
@@ -183,7 +183,7 @@ class Sweep:
 
     def _key(self, world: int) -> jax.Array:
         """Of all trials in a world: it makes no world, and folded by name it serves planning and sensing."""
-        return jax.random.fold_in(jax.random.key(self.specification.seed), world)
+        return trial_key(world, self.specification.seed)
 
     @cached_property
     def _tasks(self) -> dict[tuple[str, str], tuple[Task, TaskArrays]]:
