@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from eval.real_maps.__main__ import decisions_of
 from potlp_jax.cli import app
 from potlp_jax.environments import make
 from potlp_jax.environments.splits import world_key
@@ -395,3 +396,11 @@ def test_a_task_that_is_impossible_everywhere_ends_the_sweep(tmp_path, monkeypat
     monkeypatch.setattr("potlp_jax.sweep.runner.IMPOSSIBLE_IN_A_ROW", 3)
     with pytest.raises(ValueError, match="impossible in 3 worlds in a row, up to number 7"):
         run_sweep(_specification(tasks=["F (goal & hazard)"], policies=["baseline"]), tmp_path, 1)
+
+
+def test_an_experiment_counts_the_decisions_and_flagged_trials_of_a_policy():
+    overflowed = dataclasses.replace(_row(Item("toy", "F goal", "potlp", 0)), status=5, decisions=6, seconds=3.5)
+    found = decisions_of([overflowed, _row(Item("toy", "F goal", "potlp", 1)), _row(ITEMS[0])], "potlp")
+    assert (found["number"], found["seconds"]) == (8, 0.5)
+    flagged = {name for name, count in found["flagged"].items() if count}
+    assert flagged == {"SUBGOAL_OVERFLOW", "DEPTH_OVERFLOW"}
