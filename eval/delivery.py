@@ -19,7 +19,16 @@ from typing import Any
 
 import numpy as np
 
-from eval.savings import TABLE_HEAD, audit, compare_first, read_rows, sweep, table_lines
+from eval.savings import (
+    TABLE_HEAD,
+    audit,
+    compare_first,
+    decision_lines,
+    decisions_of,
+    read_rows,
+    sweep,
+    table_lines,
+)
 from potlp_jax.environments import make
 from potlp_jax.environments.academic import PEOPLE
 from potlp_jax.environments.base import Generator
@@ -88,6 +97,7 @@ def results_of(rows: Sequence[Row], environment: str, tasks: Sequence[str]) -> d
         "violations": sum(problem.startswith("violates") for problem in problems),
         "problems": problems,
         "commits": sorted({row.commit for row in rows}),
+        "decisions": decisions_of(rows, ran),
         "seconds_per_trial": {
             policy: float(np.mean([row.seconds for row in rows if row.item.policy == policy])) for policy in ran
         },
@@ -114,7 +124,12 @@ def markdown(results: Mapping[str, Any]) -> str:
         lines += ["", f"### {name}", "", TABLE_HEAD]
         for table in group["tables"]:
             lines += table_lines(table, table["policies"])
-        lines += ["", f"{group['audited']} trials audited: {len(group['problems'])} problems."]
+        lines += [
+            "",
+            f"{group['audited']} trials audited: {len(group['problems'])} problems.",
+            "",
+            *decision_lines(group["decisions"]),
+        ]
     return "\n".join(lines)
 
 

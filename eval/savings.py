@@ -17,6 +17,7 @@ from potlp_jax.sweep.results import compare_pairs, pair_rows
 from potlp_jax.sweep.runner import RESULTS
 from potlp_jax.sweep.statistics import PolicyRow
 from potlp_jax.sweep.store import Row, Store
+from potlp_jax.types import Status
 
 SWEEP_COMMAND = (sys.executable, "-c", "from potlp_jax.cli import main; main()", "sweep")
 """``potlp sweep``, by the interpreter that runs."""
@@ -107,3 +108,31 @@ def figures(row: PolicyRow) -> str:
         f"{share} | {100 * row.net_savings:.1f} % | "
         f"{100 * row.trial_savings:.1f} ± {100 * row.trial_savings_error:.1f} %"
     )
+
+
+def decisions_of(rows: Sequence[Row], policies: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """By policy: decisions, seconds of one on a core (compilation and the way to the next in it), trials flagged."""
+    found = {}
+    for policy in policies:
+        own = [row for row in rows if row.item.policy == policy]
+        number = sum(row.decisions for row in own)
+        found[policy] = {
+            "trials": len(own),
+            "number": number,
+            "seconds": sum(row.seconds for row in own) / max(number, 1),
+            "flagged": {flag.name: sum(bool(row.status & flag) for row in own) for flag in Status},
+        }
+    return found
+
+
+def decision_lines(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """How long each policy thinks, and in how many trials it met a limit."""
+    lines = []
+    for policy, entry in found.items():
+        flagged = ", ".join(
+            f"{count} of {entry['trials']} trials {name}" for name, count in entry["flagged"].items() if count
+        )
+        lines.append(
+            f"- {policy}: {entry['number']} decisions of {entry['seconds']:.2f} s; {flagged or 'no limit was met'}"
+        )
+    return lines

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from eval.real_maps.__main__ import decisions_of
+from eval.savings import decisions_of
 from potlp_jax.cli import app
 from potlp_jax.environments import make
 from potlp_jax.environments.splits import world_key
@@ -400,7 +400,7 @@ def test_a_task_that_is_impossible_everywhere_ends_the_sweep(tmp_path, monkeypat
 
 def test_an_experiment_counts_the_decisions_and_flagged_trials_of_a_policy():
     overflowed = dataclasses.replace(_row(Item("toy", "F goal", "potlp", 0)), status=5, decisions=6, seconds=3.5)
-    found = decisions_of([overflowed, _row(Item("toy", "F goal", "potlp", 1)), _row(ITEMS[0])], "potlp")
-    assert (found["number"], found["seconds"]) == (8, 0.5)
+    found = decisions_of([overflowed, _row(Item("toy", "F goal", "potlp", 1)), _row(ITEMS[0])], ["potlp"])["potlp"]
+    assert (found["trials"], found["number"], found["seconds"]) == (2, 8, 0.5)
     flagged = {name for name, count in found["flagged"].items() if count}
     assert flagged == {"SUBGOAL_OVERFLOW", "DEPTH_OVERFLOW"}

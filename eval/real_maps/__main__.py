@@ -14,7 +14,7 @@ is dark, as the baseline and as PO-TLP solve it.
 import argparse
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,16 @@ import numpy as np
 
 from eval.contact_sheet import draw_plan
 from eval.real_maps.gdc import LABELS, rooms_from_labels
-from eval.savings import TABLE_HEAD, audit, compare_first, read_rows, sweep, table_lines
+from eval.savings import (
+    TABLE_HEAD,
+    audit,
+    compare_first,
+    decision_lines,
+    decisions_of,
+    read_rows,
+    sweep,
+    table_lines,
+)
 from potlp_jax.environments.academic import PARCELS
 from potlp_jax.environments.mapped_rooms import MappedRooms
 from potlp_jax.environments.splits import Split, world_key
@@ -30,9 +39,7 @@ from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.product import grid_distances
 from potlp_jax.sweep.results import Pair, pair_rows
 from potlp_jax.sweep.rows import read_path, source_commit
-from potlp_jax.sweep.store import Row
 from potlp_jax.trial import versions
-from potlp_jax.types import Status
 from potlp_jax.view.maps import draw_ends
 from potlp_jax.view.style import ROBOT, new_figure, save_figure
 
@@ -142,18 +149,7 @@ def results_of(generator: MappedRooms, folder: Path, policies: list[str], worlds
         "audited": len(rows),
         "problems": problems,
         "commits": sorted({row.commit for row in rows}),
-        "decisions": {policy: decisions_of(rows, policy) for policy in policies},
-    }
-
-
-def decisions_of(rows: Sequence[Row], policy: str) -> dict[str, Any]:
-    """How many decisions, seconds of one on a core (compilation and the way to the next in it), and trials flagged."""
-    own = [row for row in rows if row.item.policy == policy]
-    number = sum(row.decisions for row in own)
-    return {
-        "number": number,
-        "seconds": sum(row.seconds for row in own) / max(number, 1),
-        "flagged": {flag.name: sum(bool(row.status & flag) for row in own) for flag in Status if flag},
+        "decisions": decisions_of(rows, policies),
     }
 
 
@@ -174,17 +170,9 @@ def markdown(results: Mapping[str, Any]) -> str:
             f"{found['audited']} trials audited: {len(found['problems'])} problems. In {dark['worlds']} worlds the "
             f"nearest room is dark; it, and a lit room, was entered first by: {entered}.",
             "",
-            *(decision_line(policy, decisions) for policy, decisions in found["decisions"].items()),
+            *decision_lines(found["decisions"]),
         ]
     return "\n".join(lines)
-
-
-def decision_line(policy: str, decisions: Mapping[str, Any]) -> str:
-    """How long a policy thinks, and in how many trials it met a limit."""
-    flagged = ", ".join(f"{count} trials with {name}" for name, count in decisions["flagged"].items() if count)
-    return (
-        f"- {policy}: {decisions['number']} decisions of {decisions['seconds']:.2f} s; {flagged or 'no limit was met'}"
-    )
 
 
 def main() -> None:
