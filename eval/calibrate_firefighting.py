@@ -22,7 +22,7 @@ import numpy as np
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.firefighting import Firefighting, FirefightingConfig
 from potlp_jax.environments.splits import Split, world_key
-from potlp_jax.planning.product import product_distances, product_transitions
+from potlp_jax.planning.distances.product import product_distances, product_transitions
 from potlp_jax.task.task import Task
 from potlp_jax.trial import run_trial
 from potlp_jax.trial_config import TrialConfig

@@ -20,7 +20,7 @@ from potlp_jax.planning.exact import Bounds, ProblemTooLargeError, bound_exact, 
 from potlp_jax.planning.policies import DecisionConfig, Policy, decide
 from potlp_jax.planning.pouct import Plan, plan_actions
 from potlp_jax.planning.problem import PlanningProblem, enumerate_actions
-from potlp_jax.planning.product import product_distances, product_transitions
+from potlp_jax.planning.distances.product import product_distances, product_transitions
 from potlp_jax.planning.search_graph import SearchConfig
 from potlp_jax.records import Outcome, Trial, load_trial
 from potlp_jax.task.formula import TaskError

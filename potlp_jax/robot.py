@@ -14,7 +14,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32, PRNGKeyArray, UInt8
 
-from potlp_jax.planning.paths import KnownPath
+from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.records import NEVER_SEEN
 from potlp_jax.trial_config import TrialConfig
 from potlp_jax.world.grid import BeliefMap, World

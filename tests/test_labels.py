@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from potlp_jax.learning.labels import true_labels
-from potlp_jax.planning.product import grid_distances
+from potlp_jax.planning.distances.product import grid_distances
 from potlp_jax.task.task import Task, TaskSizes
 from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy, make_world

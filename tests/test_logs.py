@@ -29,7 +29,7 @@ from potlp_jax.logs.replaying import LoggedRobot, from_first_picture, replay
 from potlp_jax.logs.transforms import Transforms, headings, quaternion_of
 from potlp_jax.logs.working_grid import GridConfig
 from potlp_jax.logs.writing import BagFormat
-from potlp_jax.planning.paths import KnownPath
+from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.planning.policies import Policy
 from potlp_jax.records import NEVER_SEEN, Outcome, RecordError, belief_seen_by, load_trial
 from potlp_jax.replay import panorama_at

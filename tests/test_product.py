@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from potlp_jax import Task
-from potlp_jax.planning.paths import shortest_path
-from potlp_jax.planning.portals import CAPACITY, find_active_cells, portals_pay
-from potlp_jax.planning.product import (
+from potlp_jax.planning.distances.paths import shortest_path
+from potlp_jax.planning.distances.portals import CAPACITY, find_active_cells, portals_pay
+from potlp_jax.planning.distances.product import (
     LANES,
     distance_table,
     grid_distances,
@@ -20,7 +20,7 @@ from potlp_jax.planning.product import (
     product_transitions,
     reachable_cells,
 )
-from potlp_jax.planning.sweeps import DIAGONAL, Wildcard
+from potlp_jax.planning.distances.sweeping import DIAGONAL, Wildcard
 from potlp_jax.task.task import TaskSizes
 from potlp_jax.types import NO_STATE
 from tests.reference import dijkstra

@@ -19,7 +19,7 @@ from potlp_jax.learning.formulas import (
     random_formula,
 )
 from potlp_jax.learning.labels import true_labels
-from potlp_jax.planning.product import grid_distances
+from potlp_jax.planning.distances.product import grid_distances
 from potlp_jax.task.task import Task
 from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
 from potlp_jax.world.grid import BeliefMap

@@ -28,7 +28,7 @@ import pytest
 
 from potlp_jax.environments.splits import world_key
 from potlp_jax.environments.toy import Toy, ToyConfig
-from potlp_jax.planning.product import product_distances, product_transitions
+from potlp_jax.planning.distances.product import product_distances, product_transitions
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.world.grid import World, WorldError
 

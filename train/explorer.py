@@ -17,9 +17,9 @@ from jaxtyping import Array, Int32
 
 from potlp_jax.learning.formulas import LARGEST
 from potlp_jax.learning.sampling import Pose
-from potlp_jax.planning.paths import KnownPath, shortest_path
+from potlp_jax.planning.distances.paths import KnownPath, shortest_path
 from potlp_jax.planning.policies import Situation, assess
-from potlp_jax.planning.sweeps import DIAGONAL
+from potlp_jax.planning.distances.sweeping import DIAGONAL
 from potlp_jax.robot import SimulatedRobot, Stop
 from potlp_jax.task.task import Task
 from potlp_jax.trial_config import TrialConfig

@@ -31,8 +31,8 @@ from scipy import ndimage
 from scipy.sparse.csgraph import dijkstra
 
 from potlp_jax.environments.rooms import Rooms, RoomsConfig
-from potlp_jax.planning.product import distance_table, product_distances, product_transitions
-from potlp_jax.planning.sweeps import NEIGHBOURS
+from potlp_jax.planning.distances.product import distance_table, product_distances, product_transitions
+from potlp_jax.planning.distances.sweeping import NEIGHBOURS
 from potlp_jax.task.task import Task
 
 mpl.use("Agg")
@@ -70,7 +70,7 @@ QUICK = tuple(case for case in CASES if case.size == 64)
 
 @dataclasses.dataclass(frozen=True)
 class Instance:
-    """A case made concrete; see ``potlp_jax.planning.product`` for the arrays."""
+    """A case made concrete; see ``potlp_jax.planning.distances.product`` for the arrays."""
 
     free: Bool[np.ndarray, "H W"]
     transitions: Int32[np.ndarray, "H W Z"]

@@ -36,7 +36,7 @@ from potlp_jax.environments.academic import PARCELS
 from potlp_jax.environments.mapped_rooms import MappedRooms
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.planning.policies import Policy
-from potlp_jax.planning.product import grid_distances
+from potlp_jax.planning.distances.product import grid_distances
 from potlp_jax.sweep.results import Pair, pair_rows
 from potlp_jax.sweep.rows import read_path, source_commit
 from potlp_jax.trial import versions

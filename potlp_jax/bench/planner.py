@@ -18,11 +18,11 @@ from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.estimates import Estimator, ask
 from potlp_jax.planning.families import family_problem
-from potlp_jax.planning.paths import shortest_path
+from potlp_jax.planning.distances.paths import shortest_path
 from potlp_jax.planning.policies import DecisionConfig, Move, Policy, Situation, assess, decide, planning_problem
 from potlp_jax.planning.pouct import plan_actions, search
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.product import grid_distances, product_distances, product_transitions
+from potlp_jax.planning.distances.product import grid_distances, product_distances, product_transitions
 from potlp_jax.planning.search_graph import SearchConfig
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.types import NO_STATE

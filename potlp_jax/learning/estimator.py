@@ -22,7 +22,7 @@ from potlp_jax.learning.estimator_files import CheckpointError, load_estimator, 
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
 from potlp_jax.learning.views import Views, look_of_subgoals, no_views, places_of_looks, remember
 from potlp_jax.planning.estimates import Estimates
-from potlp_jax.planning.product import product_distances
+from potlp_jax.planning.distances.product import product_distances
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_STATE
 from potlp_jax.world.frontiers import Subgoals

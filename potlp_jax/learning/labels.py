@@ -17,7 +17,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 
 from potlp_jax.planning.estimates import Estimates
-from potlp_jax.planning.product import LANES, arrivals_by_lane, distances_by_lane
+from potlp_jax.planning.distances.product import LANES, arrivals_by_lane, distances_by_lane
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_STATE
 from potlp_jax.world.frontiers import Subgoals, frontier_cells

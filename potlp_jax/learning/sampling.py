@@ -22,7 +22,7 @@ from potlp_jax.learning.formulas import Question, draw_questions, question_sheet
 from potlp_jax.learning.labels import true_labels
 from potlp_jax.learning.weights import WeightBounds, Weights, loss_weights
 from potlp_jax.planning.estimates import Estimates
-from potlp_jax.planning.product import grid_distances
+from potlp_jax.planning.distances.product import grid_distances
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
 from potlp_jax.world.grid import BeliefMap, World

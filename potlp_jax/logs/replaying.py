@@ -13,7 +13,7 @@ from potlp_jax.logs.drive import Drive, Eyes
 from potlp_jax.logs.errors import LogError
 from potlp_jax.logs.poses import Cell
 from potlp_jax.planning.estimates import Estimator
-from potlp_jax.planning.paths import KnownPath
+from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.planning.policies import Policy
 from potlp_jax.records import LOG_PREFIX, NEVER_SEEN, Outcome, Trial
 from potlp_jax.robot import DIAGONAL, Leg, Stop

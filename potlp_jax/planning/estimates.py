@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 
-from potlp_jax.planning.product import reachable_states
+from potlp_jax.planning.distances.product import reachable_states
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.world.frontiers import Subgoals
 from potlp_jax.world.grid import BeliefMap

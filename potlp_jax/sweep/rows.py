@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Int32, PRNGKeyArray
 
 from potlp_jax.batch import Finished
-from potlp_jax.planning.sweeps import NEIGHBOURS
+from potlp_jax.planning.distances.sweeping import NEIGHBOURS
 from potlp_jax.records import Trial
 from potlp_jax.sweep.specification import configuration_hash
 from potlp_jax.sweep.store import Item, Row

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 
-from potlp_jax.planning.sweeps import DIAGONAL, NEIGHBOURS, Wildcard
+from potlp_jax.planning.distances.sweeping import DIAGONAL, NEIGHBOURS, Wildcard
 
 
 @struct.dataclass(kw_only=True)
