@@ -18,10 +18,10 @@ from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.exact import Bounds, ProblemTooLargeError, bound_exact, solve_exact
 from potlp_jax.planning.policies import DecisionConfig, Policy, decide
-from potlp_jax.planning.pouct import Plan, plan_actions
+from potlp_jax.planning.search.api import Plan, plan_actions
 from potlp_jax.planning.problem import PlanningProblem, enumerate_actions
 from potlp_jax.planning.distances.product import product_distances, product_transitions
-from potlp_jax.planning.search_graph import SearchConfig
+from potlp_jax.planning.search.graph import SearchConfig
 from potlp_jax.records import Outcome, Trial, load_trial
 from potlp_jax.task.formula import TaskError
 from potlp_jax.task.task import Task, TaskArrays, TaskSizes, stack_tasks

@@ -32,7 +32,7 @@ from potlp_jax.planning.policies import (
     planned_move,
     planning_problem,
 )
-from potlp_jax.planning.pouct import plan_actions
+from potlp_jax.planning.search.api import plan_actions
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.records import NEVER_SEEN, Outcome
 from potlp_jax.robot import DIAGONAL, Stop, follow, photograph

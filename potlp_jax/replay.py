@@ -11,9 +11,9 @@ from potlp_jax.learning.estimator_files import CheckpointError
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.estimates import Estimator, ask
 from potlp_jax.planning.policies import DecisionConfig, Policy, assess, planning_problem
-from potlp_jax.planning.pouct import Plan, search_tree
+from potlp_jax.planning.search.api import Plan, search_tree
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.search_graph import Tree
+from potlp_jax.planning.search.graph import Tree
 from potlp_jax.records import LOG_PREFIX, Decision, RecordError, Trial
 from potlp_jax.robot import photograph
 from potlp_jax.task.task import Task, TaskArrays

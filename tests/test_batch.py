@@ -13,7 +13,7 @@ from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.policies import DecisionConfig, Policy
-from potlp_jax.planning.search_graph import SearchConfig
+from potlp_jax.planning.search.graph import SearchConfig
 from potlp_jax.records import Outcome
 from potlp_jax.task.task import Task
 from potlp_jax.trial import run_trial

@@ -25,8 +25,8 @@ from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.families import family_problem
 from potlp_jax.planning.policies import DecisionConfig
-from potlp_jax.planning.pouct import search_tree
-from potlp_jax.planning.search_graph import SearchConfig
+from potlp_jax.planning.search.api import search_tree
+from potlp_jax.planning.search.graph import SearchConfig
 from potlp_jax.task.task import Task
 from potlp_jax.world.frontiers import FrontierConfig
 
@@ -229,8 +229,8 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.families import family_problem
-from potlp_jax.planning.pouct import plan_actions
-from potlp_jax.planning.search_graph import SearchConfig
+from potlp_jax.planning.search.api import plan_actions
+from potlp_jax.planning.search.graph import SearchConfig
 problem = family_problem("find", 2, "tuning", 0)
 plan = jax.jit(plan_actions, static_argnums=2)(problem, jax.random.key(0), SearchConfig(simulations=12))
 print(json.dumps({"folder": str(folder), "hits": sum(hits), "q": repr(plan.q_values.tolist())}))

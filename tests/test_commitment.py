@@ -7,7 +7,7 @@ import pytest
 
 from potlp_jax.planning.commitment import SAME_WITHIN, Intention, intention_of, keep_on
 from potlp_jax.planning.policies import DecisionConfig
-from potlp_jax.planning.pouct import Plan
+from potlp_jax.planning.search.api import Plan
 from potlp_jax.task.task import Task
 from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL
 from potlp_jax.world.frontiers import Subgoals

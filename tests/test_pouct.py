@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from potlp_jax.planning.exact import solve_exact
 from potlp_jax.planning.families import family_problem
-from potlp_jax.planning.pouct import plan_actions, plan_within, search, search_tree
-from potlp_jax.planning.search_arrays import uniform
-from potlp_jax.planning.search_graph import SearchConfig, SearchMode, Tree
-from potlp_jax.planning.tree_top import tree_top
+from potlp_jax.planning.search.api import plan_actions, plan_within, search, search_tree
+from potlp_jax.planning.search.arrays import uniform
+from potlp_jax.planning.search.graph import SearchConfig, SearchMode, Tree
+from potlp_jax.planning.search.inspect import tree_top
 from potlp_jax.task.task import TaskSizes
 from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL, Status
 from tests.reference.planning import FINISH, ReferenceProblem, authors_pouct, dictionary_pouct

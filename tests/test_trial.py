@@ -19,7 +19,7 @@ from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning import policies
 from potlp_jax.planning.policies import DecisionConfig, MoveKind, Policy, decide
-from potlp_jax.planning.search_graph import SearchConfig
+from potlp_jax.planning.search.graph import SearchConfig
 from potlp_jax.records import Outcome, RecordError, load_trial
 from potlp_jax.replay import replay_decision
 from potlp_jax.robot import Leg, SimulatedRobot

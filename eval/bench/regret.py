@@ -33,10 +33,10 @@ import numpy as np
 
 from potlp_jax.planning.exact import ProblemTooLargeError, bound_exact, solve_exact
 from potlp_jax.planning.families import FAMILIES, SUBGOAL_COUNTS, Split, family_problem
-from potlp_jax.planning.pouct import plan_actions
+from potlp_jax.planning.search.api import plan_actions
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.search_graph import Context, SearchConfig, SearchMode, Tree, new_search
-from potlp_jax.planning.search_kernel import choose, is_open, simulate
+from potlp_jax.planning.search.graph import Context, SearchConfig, SearchMode, Tree, new_search
+from potlp_jax.planning.search.best_first import choose, is_open, simulate
 from potlp_jax.types import NO_ACTION
 
 mpl.use("Agg")

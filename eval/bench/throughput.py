@@ -31,9 +31,9 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 
-from potlp_jax.planning.pouct import plan_actions, search
+from potlp_jax.planning.search.api import plan_actions, search
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.search_graph import SearchConfig, SearchMode
+from potlp_jax.planning.search.graph import SearchConfig, SearchMode
 from potlp_jax.task.task import Task
 
 mpl.use("Agg")

@@ -5,9 +5,9 @@ import math
 
 import jax
 
-from potlp_jax.planning.pouct import search_tree
+from potlp_jax.planning.search.api import search_tree
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.search_graph import SearchConfig
+from potlp_jax.planning.search.graph import SearchConfig
 
 
 @dataclasses.dataclass(frozen=True)

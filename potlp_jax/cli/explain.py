@@ -9,7 +9,7 @@ from potlp_jax.cli.inputs import read_trained_estimator
 from potlp_jax.cli.output import console, fail, note, print_json
 from potlp_jax.cli.run import RECORD
 from potlp_jax.learning.estimator import TrainedEstimator
-from potlp_jax.planning.tree_top import tree_top
+from potlp_jax.planning.search.inspect import tree_top
 from potlp_jax.records import Decision, Trial, load_trial
 from potlp_jax.replay import panorama_at, replay_decision
 from potlp_jax.view.decisions import action_table, decision_to_dict, describe_decision

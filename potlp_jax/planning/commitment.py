@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float32, Int32
 
-from potlp_jax.planning.pouct import Plan
+from potlp_jax.planning.search.api import Plan
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_ACTION, NO_STATE
 from potlp_jax.world.frontiers import Subgoals

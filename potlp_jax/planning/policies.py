@@ -23,7 +23,7 @@ from potlp_jax.planning.commitment import Intention, intention_of, keep_on
 from potlp_jax.planning.estimates import Estimates, Estimator, ask
 from potlp_jax.planning.history import ActionTerms, action_terms, initial_history
 from potlp_jax.planning.distances.paths import KnownPath, shortest_path
-from potlp_jax.planning.pouct import Plan, plan_actions
+from potlp_jax.planning.search.api import Plan, plan_actions
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.distances.product import (
     distance_table,
@@ -33,7 +33,7 @@ from potlp_jax.planning.distances.product import (
     reachable_cells,
     reachable_states,
 )
-from potlp_jax.planning.search_graph import SearchConfig
+from potlp_jax.planning.search.graph import SearchConfig
 from potlp_jax.planning.distances.sweeping import Wildcard
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_ACTION, NO_STATE, Status, status_array, status_if

@@ -1,4 +1,4 @@
-"""The top of a searched tree as a picture, from the nested values of ``potlp_jax.planning.tree_top.tree_top``."""
+"""The top of a searched tree as a picture, from the nested values of ``potlp_jax.planning.search.inspect.tree_top``."""
 
 import dataclasses
 import math

@@ -8,7 +8,7 @@ import numpy as np
 
 from potlp_jax.planning.history import ActionTerms, History, action_terms, initial_history, step
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.search_graph import Tree
+from potlp_jax.planning.search.graph import Tree
 
 
 def tree_top(problem: PlanningProblem, tree: Tree, *, depth: int = 2, width: int = 4) -> dict[str, Any]:

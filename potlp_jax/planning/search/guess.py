@@ -20,7 +20,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 
 from potlp_jax.planning.history import ActionTables
-from potlp_jax.planning.search_arrays import least_of_each
+from potlp_jax.planning.search.arrays import least_of_each
 from potlp_jax.types import NO_STATE
 
 NEGLIGIBLE: float = 1e-3

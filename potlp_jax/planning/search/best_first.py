@@ -1,4 +1,4 @@
-"""The search of ``potlp_jax.planning.pouct``: many planning problems in lockstep, in fixed memory.
+"""The search of ``potlp_jax.planning.search.api``: many planning problems in lockstep, in fixed memory.
 
 Every row of a batch owns a graph of histories of fixed capacity. One simulation of all rows is
 
@@ -18,8 +18,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
 from potlp_jax.planning.history import step_row
-from potlp_jax.planning.search_arrays import least_of_each, status_of_rows, uniform, unpack_rows
-from potlp_jax.planning.search_graph import (
+from potlp_jax.planning.search.arrays import least_of_each, status_of_rows, uniform, unpack_rows
+from potlp_jax.planning.search.graph import (
     Context,
     SearchConfig,
     SearchMode,

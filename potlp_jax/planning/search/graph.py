@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
-from potlp_jax.planning.heuristic import Rule, guess_outcomes, make_rule
+from potlp_jax.planning.search.guess import Rule, guess_outcomes, make_rule
 from potlp_jax.planning.history import (
     ActionTables,
     History,
@@ -24,7 +24,7 @@ from potlp_jax.planning.history import (
     terms_of_all,
 )
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.search_arrays import least_of_each, mix, pack_rows
+from potlp_jax.planning.search.arrays import least_of_each, mix, pack_rows
 from potlp_jax.planning.state_relations import transitive_closure
 from potlp_jax.types import NO_STATE
 
