@@ -16,7 +16,7 @@ The public names, from a formula to a trial:
 from potlp_jax.batch import Finished, Start, run_batch
 from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimates
-from potlp_jax.planning.exact import Bounds, ProblemTooLargeError, bound_exact, solve_exact
+from potlp_jax.planning.exact.api import Bounds, ProblemTooLargeError, bound_exact, solve_exact
 from potlp_jax.planning.policies import DecisionConfig, Policy, decide
 from potlp_jax.planning.search.api import Plan, plan_actions
 from potlp_jax.planning.problem import PlanningProblem, enumerate_actions

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from potlp_jax.planning.estimates import Estimates, ask, classes_ahead
-from potlp_jax.planning.exact import solve_exact
+from potlp_jax.planning.exact.api import solve_exact
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
 from potlp_jax.world.grid import BeliefMap, make_world

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from potlp_jax.planning.exact import solve_exact
+from potlp_jax.planning.exact.api import solve_exact
 from potlp_jax.planning.families import family_problem
 from potlp_jax.planning.search.api import plan_actions, plan_within, search, search_tree
 from potlp_jax.planning.search.arrays import uniform

@@ -9,7 +9,7 @@ References:
 import numpy as np
 from jaxtyping import Int32, Int64
 
-from potlp_jax.planning.rollouts import Rollouts, Settled
+from potlp_jax.planning.exact.rollouts import Rollouts, Settled
 
 ACCEPTED = -2
 NOWHERE = -1

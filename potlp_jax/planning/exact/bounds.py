@@ -10,8 +10,8 @@ References:
 
 import numpy as np
 
-from potlp_jax.planning.exact_graph import CHUNK, Graph
-from potlp_jax.planning.exact_knowledge import NOWHERE
+from potlp_jax.planning.exact.graph import CHUNK, Graph
+from potlp_jax.planning.exact.knowledge import NOWHERE
 
 FINISH = -1
 """State in ``best_way`` where the way goes to acceptance."""

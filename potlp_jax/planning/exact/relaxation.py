@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int32
 
-from potlp_jax.planning.exact_knowledge import Knowledge
+from potlp_jax.planning.exact.knowledge import Knowledge
 
 
 class Relaxation:

@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from potlp_jax.planning.exact_knowledge import ACCEPTED, NOWHERE, Knowledge
-from potlp_jax.planning.exact_relaxation import Relaxation
+from potlp_jax.planning.exact.knowledge import ACCEPTED, NOWHERE, Knowledge
+from potlp_jax.planning.exact.relaxation import Relaxation
 
 CHUNK = 4096
 """Nodes handled together."""

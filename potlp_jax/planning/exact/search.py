@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from potlp_jax.planning.exact_bounds import FINISH, GraphBounds
-from potlp_jax.planning.exact_graph import CHUNK, Graph
+from potlp_jax.planning.exact.bounds import FINISH, GraphBounds
+from potlp_jax.planning.exact.graph import CHUNK, Graph
 
 _BREADTH = 2000
 _BATCH = 1000
