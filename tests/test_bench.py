@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from potlp_jax.bench.looking import measure_looking
+from potlp_jax.bench.perception import measure_looking
 from potlp_jax.bench.memory import tree_memory
 from potlp_jax.bench.planner import as_dict, make_scene, mean_depth, measure_distances
 from potlp_jax.bench.timing import Timing, compile_call, environment, measure, timed_runs
@@ -23,7 +23,7 @@ from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.environments.toy import Toy
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
-from potlp_jax.planning.families import family_problem
+from potlp_jax.bench.problems import family_problem
 from potlp_jax.planning.policies import DecisionConfig
 from potlp_jax.planning.search.api import search_tree
 from potlp_jax.planning.search.graph import SearchConfig
@@ -228,7 +228,7 @@ folder = enable_compilation_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
-from potlp_jax.planning.families import family_problem
+from potlp_jax.bench.problems import family_problem
 from potlp_jax.planning.search.api import plan_actions
 from potlp_jax.planning.search.graph import SearchConfig
 problem = family_problem("find", 2, "tuning", 0)

@@ -38,7 +38,7 @@ from potlp_jax.learning.evaluation import (
     roc_auc,
 )
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
-from potlp_jax.view.estimator import draw_costs, draw_predictions, draw_reliability, probability_table
+from potlp_jax.view.calibration import draw_costs, draw_predictions, draw_reliability, probability_table
 from potlp_jax.view.style import CHOSEN, rgb
 
 SHAPE = (64, 128)

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from potlp_jax.planning.families import FAMILIES, SUBGOAL_COUNTS, family_problem, random_metric
+from potlp_jax.bench.problems import FAMILIES, SUBGOAL_COUNTS, family_problem, random_metric
 from potlp_jax.planning.problem import enumerate_actions
 from potlp_jax.task.task import Task
 

@@ -17,7 +17,7 @@ from potlp_jax.environments.rooms import Rooms, RoomsConfig
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.estimates import Estimator, ask
-from potlp_jax.planning.families import family_problem
+from potlp_jax.bench.problems import family_problem
 from potlp_jax.planning.distances.paths import shortest_path
 from potlp_jax.planning.policies import DecisionConfig, Move, Policy, Situation, assess, decide, planning_problem
 from potlp_jax.planning.search.api import plan_actions, search

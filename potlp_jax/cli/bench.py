@@ -6,7 +6,7 @@ from typing import Any
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from potlp_jax.bench.looking import measure_looking
+from potlp_jax.bench.perception import measure_looking
 from potlp_jax.bench.planner import (
     DistanceRow,
     PhaseRow,
@@ -24,7 +24,7 @@ from potlp_jax.cli.inputs import read_environment_task, trial_config
 from potlp_jax.cli.output import console, fail, package_version, print_json, progress_bar
 from potlp_jax.environments import make
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for
-from potlp_jax.planning.families import FAMILIES
+from potlp_jax.bench.problems import FAMILIES
 from potlp_jax.planning.policies import DecisionConfig
 
 PARTS = ("search", "distances", "decision", "looking")

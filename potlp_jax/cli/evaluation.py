@@ -27,7 +27,7 @@ from potlp_jax.learning.evaluation import (
     prior_of,
 )
 from potlp_jax.learning.network import EstimatorNetwork, NetworkError, Params
-from potlp_jax.view.estimator import (
+from potlp_jax.view.calibration import (
     VARIANTS,
     ablation_table,
     cost_table,

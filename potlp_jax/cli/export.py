@@ -9,7 +9,7 @@ from rich.table import Table
 
 from potlp_jax.cli.inputs import read_task, trial_config
 from potlp_jax.cli.output import FAILED, console, fail, output_folder, print_json, progress_bar
-from potlp_jax.planning.export import ANY_BATCH, MANIFEST, ExportConfig, export_planner
+from potlp_jax.export import ANY_BATCH, MANIFEST, ExportConfig, export_planner
 
 KNOWN_PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 

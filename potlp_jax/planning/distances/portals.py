@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 
-from potlp_jax.planning.state_relations import transitive_closure
+from potlp_jax.task.relations import transitive_closure
 from potlp_jax.types import NO_STATE
 
 CAPACITY: int = 64

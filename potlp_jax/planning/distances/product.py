@@ -15,7 +15,7 @@ from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Bool, Float32, Int32
 
 from potlp_jax.planning.distances.portals import find_active_cells, portals_pay, table_by_portals
-from potlp_jax.planning.state_relations import transitive_closure
+from potlp_jax.task.relations import transitive_closure
 from potlp_jax.planning.distances.sweeping import Links, Sweeper, Wildcard
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_STATE

@@ -25,7 +25,7 @@ from potlp_jax.planning.history import (
 )
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.arrays import least_of_each, mix, pack_rows
-from potlp_jax.planning.state_relations import transitive_closure
+from potlp_jax.task.relations import transitive_closure
 from potlp_jax.types import NO_STATE
 
 WINDOW: int = 8
