@@ -30,11 +30,11 @@ from eval.savings import (
     table_lines,
 )
 from potlp_jax.environments import make
-from potlp_jax.environments.academic import PEOPLE
+from potlp_jax.environments.campus.furnishing import PEOPLE
 from potlp_jax.environments.base import Generator
-from potlp_jax.environments.floorplan import FloorPlans
+from potlp_jax.environments.campus.floor_plans import FloorPlans
 from potlp_jax.environments.splits import Split, world_key
-from potlp_jax.learning.formulas import HELD_OUT
+from potlp_jax.learning.questions import HELD_OUT
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.rows import source_commit
 from potlp_jax.sweep.store import Row

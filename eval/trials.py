@@ -31,10 +31,10 @@ from eval.audit import problems_of
 from eval.formulas import random_tasks, traits
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.firefighting import Firefighting
-from potlp_jax.environments.map_server import load_map
-from potlp_jax.environments.places import Disc, Places
+from potlp_jax.environments.ros.map_files import load_map
+from potlp_jax.environments.ros.places import Disc, Places
 from potlp_jax.environments.rooms import Rooms
-from potlp_jax.environments.ros_map import RosMap, RosMapConfig, clean_map
+from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig, clean_map
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.planning.policies import Policy
 from potlp_jax.records import Outcome

@@ -21,7 +21,7 @@ from jaxtyping import Array, Int32, PRNGKeyArray
 from potlp_jax.batch_step import EMPTY, OUTCOMES, Progress, Rules, Scene, begin, step
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import Params
-from potlp_jax.learning.views import Views
+from potlp_jax.learning.memory import Views
 from potlp_jax.planning.policies import Policy
 from potlp_jax.records import Outcome
 from potlp_jax.task.task import TaskArrays

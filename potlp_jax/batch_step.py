@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float32, Int8, Int16, Int32, Key, PRNGKeyArra
 from potlp_jax.learning.estimator import NetworkEstimator
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
-from potlp_jax.learning.views import Views, remember
+from potlp_jax.learning.memory import Views, remember
 from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimates, Estimator, ask
 from potlp_jax.planning.policies import (

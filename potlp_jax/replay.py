@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int32, UInt8
 
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, look
-from potlp_jax.learning.estimator_files import CheckpointError
+from potlp_jax.learning.serialization import CheckpointError
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.estimates import Estimator, ask
 from potlp_jax.planning.policies import DecisionConfig, Policy, assess, planning_problem

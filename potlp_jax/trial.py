@@ -14,7 +14,7 @@ from jaxtyping import PRNGKeyArray
 
 from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator, estimator_for, look
 from potlp_jax.learning.labels import TrueMapEstimator
-from potlp_jax.learning.views import look_of_subgoals
+from potlp_jax.learning.memory import look_of_subgoals
 from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.history import ActionTerms

@@ -26,8 +26,8 @@ from potlp_jax.learning.dataset import (
     samples_file,
     views_file,
 )
-from potlp_jax.learning.formulas import TaskDistribution
-from potlp_jax.learning.sampling import survey
+from potlp_jax.learning.questions import TaskDistribution
+from potlp_jax.learning.recording import survey
 from potlp_jax.task.task import Task
 from potlp_jax.world.panorama import CameraConfig, render
 from potlp_jax.world.sensing import SensorConfig

@@ -11,7 +11,7 @@ import pytest
 from scipy import ndimage
 
 from potlp_jax.environments import make
-from potlp_jax.environments.academic import (
+from potlp_jax.environments.campus.furnishing import (
     NO_ROOM,
     PEOPLE,
     Floor,
@@ -20,7 +20,7 @@ from potlp_jax.environments.academic import (
     furnish,
     missing_kinds,
 )
-from potlp_jax.environments.delivery import Delivery, DeliveryConfig
+from potlp_jax.environments.campus.delivery import Delivery, DeliveryConfig
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.planning.policies import Policy
 from potlp_jax.records import Outcome

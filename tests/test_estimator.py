@@ -19,7 +19,7 @@ from potlp_jax.learning.estimator import (
     read_estimator,
     shipped_estimator,
 )
-from potlp_jax.learning.estimator_files import CheckpointError, save_estimator
+from potlp_jax.learning.serialization import CheckpointError, save_estimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.decision import subgoals_at
 from potlp_jax.planning.policies import Policy

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 
 from potlp_jax.cli import app
 from potlp_jax.learning.dataset import DatasetMetadata, Samples, decode, encode, view_id, write_shard
-from potlp_jax.learning.estimator_files import CheckpointError, save_estimator
-from potlp_jax.learning.evaluation import (
+from potlp_jax.learning.serialization import CheckpointError, save_estimator
+from potlp_jax.learning.metrics import (
     BINS,
     DISTANCE_BANDS,
     INTACT,

@@ -13,10 +13,10 @@ from scipy import ndimage
 
 from potlp_jax.cli.inputs import read_split
 from potlp_jax.environments import make
-from potlp_jax.environments.academic import NO_ROOM, PEOPLE, Kind, missing_kinds
-from potlp_jax.environments.floorplan import FloorPlanConfig, FloorPlans, PlanFloor, rasterise
-from potlp_jax.environments.floorplan_xml import read_kinds, read_plan
-from potlp_jax.environments.map_server import MapError, MapWarning
+from potlp_jax.environments.campus.furnishing import NO_ROOM, PEOPLE, Kind, missing_kinds
+from potlp_jax.environments.campus.floor_plans import FloorPlanConfig, FloorPlans, PlanFloor, rasterise
+from potlp_jax.environments.campus.floor_plan_xml import read_kinds, read_plan
+from potlp_jax.environments.ros.map_files import MapError, MapWarning
 from potlp_jax.environments.splits import Split, default_split, usable_splits, world_key
 from potlp_jax.sweep.specification import SpecificationError, specification_from_dict
 from potlp_jax.world.grid import WorldError

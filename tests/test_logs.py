@@ -13,12 +13,12 @@ import pytest
 from typer.testing import CliRunner
 
 from potlp_jax.cli import app
-from potlp_jax.environments.map_server import MapError
-from potlp_jax.environments.places import Places, load_places
+from potlp_jax.environments.ros.map_files import MapError
+from potlp_jax.environments.ros.places import Places, load_places
 from potlp_jax.learning.dataset import decode, encode, finished_shards, read_dataset, samples_file, views_file
-from potlp_jax.learning.formulas import TaskDistribution
-from potlp_jax.learning.sampling import Pose, Recorder, ViewConfig, record_views, settled, survey
-from potlp_jax.learning.weights import WeightBounds
+from potlp_jax.learning.questions import TaskDistribution
+from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views, settled, survey
+from potlp_jax.learning.mistake_costs import WeightBounds
 from potlp_jax.logs import writing
 from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
 from potlp_jax.logs.drive import Eyes

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from potlp_jax.environments import make
-from potlp_jax.environments.academic import PARCELS, Floor, FurnishConfig, Kind, furnish
-from potlp_jax.environments.delivery import Delivery
-from potlp_jax.environments.map_server import MapError, MapWarning
-from potlp_jax.environments.mapped_rooms import (
+from potlp_jax.environments.campus.furnishing import PARCELS, Floor, FurnishConfig, Kind, furnish
+from potlp_jax.environments.campus.delivery import Delivery
+from potlp_jax.environments.ros.map_files import MapError, MapWarning
+from potlp_jax.environments.ros.mapped_rooms import (
     LEARNED_RESOLUTION,
     MANY_SLIVERS,
     MappedRooms,
     MappedRoomsConfig,
 )
-from potlp_jax.environments.ros_map import NARROW_DOORS
+from potlp_jax.environments.ros.ros_map import NARROW_DOORS
 from potlp_jax.environments.splits import world_key
 from potlp_jax.sweep.specification import SpecificationError, specification_from_dict
 from potlp_jax.task.task import Task

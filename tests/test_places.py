@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from potlp_jax.environments.map_server import GridFrame, MapError
-from potlp_jax.environments.places import Disc, Places, Polygon, load_places, place_letters
+from potlp_jax.environments.ros.map_files import GridFrame, MapError
+from potlp_jax.environments.ros.places import Disc, Places, Polygon, load_places, place_letters
 from tests.reference.map_files import PLACES, TWO_ROOMS, occupancy_map
 
 

@@ -10,9 +10,9 @@ import pytest
 import yaml
 from matplotlib.path import Path as Outline
 
-from potlp_jax.environments.map_server import GridFrame, MapError, MapWarning, load_map
-from potlp_jax.environments.places import Disc, Places
-from potlp_jax.environments.ros_map import RosMap, RosMapConfig, clean_map
+from potlp_jax.environments.ros.map_files import GridFrame, MapError, MapWarning, load_map
+from potlp_jax.environments.ros.places import Disc, Places
+from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig, clean_map
 from tests.reference.map_files import p5, png, write_map
 
 
@@ -75,7 +75,7 @@ def test_rooms_of_plans_stay_connected(external_data, name, rooms, reached):
     assert len(large & found) == reached
 
 
-@pytest.mark.filterwarnings("ignore:.*cut off:potlp_jax.environments.map_server.MapWarning")
+@pytest.mark.filterwarnings("ignore:.*cut off:potlp_jax.environments.ros.map_files.MapWarning")
 @pytest.mark.parametrize(
     ("name", "resolution", "radius", "shape"),
     [

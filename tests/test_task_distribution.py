@@ -8,7 +8,7 @@ import pytest
 from potlp_jax.environments import make
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.splits import world_key
-from potlp_jax.learning.formulas import (
+from potlp_jax.learning.questions import (
     HELD_OUT,
     LARGEST,
     TaskDistribution,

@@ -19,7 +19,7 @@ import pytest
 from potlp_jax.learning.batches import Batch, Batches, TrainingError, batch_answers
 from potlp_jax.learning.checkpoints import checkpoint_steps
 from potlp_jax.learning.dataset import DatasetMetadata, Samples, encode
-from potlp_jax.learning.estimator_files import CheckpointError, load_estimator
+from potlp_jax.learning.serialization import CheckpointError, load_estimator
 from potlp_jax.learning.loss import DataScale, evaluation_of, loss_sums, network_config, total_loss
 from potlp_jax.learning.network import Answers, EstimatorNetwork
 from potlp_jax.learning.training import (

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from potlp_jax.learning.views import NO_LOOK, look_of_subgoals, no_views, places_of_looks, remember
+from potlp_jax.learning.memory import NO_LOOK, look_of_subgoals, no_views, places_of_looks, remember
 from potlp_jax.types import Status
 from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy

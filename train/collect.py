@@ -41,9 +41,9 @@ from potlp_jax.learning.dataset import (
     remove_unfinished_files,
     write_shard,
 )
-from potlp_jax.learning.formulas import HELD_OUT, TaskDistribution
-from potlp_jax.learning.sampling import Pose, Recorder, ViewConfig, record_views
-from potlp_jax.learning.weights import WeightBounds
+from potlp_jax.learning.questions import HELD_OUT, TaskDistribution
+from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views
+from potlp_jax.learning.mistake_costs import WeightBounds
 from potlp_jax.trial import versions
 from potlp_jax.trial_config import TrialConfig, with_settings
 from potlp_jax.world.grid import World

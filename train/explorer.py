@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int32
 
-from potlp_jax.learning.formulas import LARGEST
-from potlp_jax.learning.sampling import Pose
+from potlp_jax.learning.questions import LARGEST
+from potlp_jax.learning.recording import Pose
 from potlp_jax.planning.distances.paths import KnownPath, shortest_path
 from potlp_jax.planning.policies import Situation, assess
 from potlp_jax.planning.distances.sweeping import DIAGONAL

@@ -31,7 +31,7 @@ from tqdm import tqdm
 
 from potlp_jax.learning.batches import TrainingError
 from potlp_jax.learning.dataset import DatasetError, Samples, decode, read_dataset
-from potlp_jax.learning.estimator_files import CheckpointError, save_estimator
+from potlp_jax.learning.serialization import CheckpointError, save_estimator
 from potlp_jax.learning.loss import DataScale, network_config
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, NetworkError, operation_counts, parameter_count
 from potlp_jax.learning.training import Progress, Trained, TrainingConfig, seconds_per_step, steps_per_epoch, train

@@ -32,8 +32,8 @@ from eval.savings import (
     sweep,
     table_lines,
 )
-from potlp_jax.environments.academic import PARCELS
-from potlp_jax.environments.mapped_rooms import MappedRooms
+from potlp_jax.environments.campus.furnishing import PARCELS
+from potlp_jax.environments.ros.mapped_rooms import MappedRooms
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.distances.product import grid_distances

@@ -9,7 +9,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from potlp_jax.cli.output import FAILED, console, fail, print_json
-from potlp_jax.learning.estimator_files import CheckpointError, load_estimator
+from potlp_jax.learning.serialization import CheckpointError, load_estimator
 from potlp_jax.learning.fovea import ABOVE, BAND, BELOW
 from potlp_jax.learning.network import operation_counts, parameter_count
 

@@ -11,8 +11,8 @@ from potlp_jax.cli.output import console, fail, note, output_folder, print_json,
 from potlp_jax.environments.splits import Split
 from potlp_jax.learning.batches import TrainingError
 from potlp_jax.learning.dataset import DatasetError, Samples, read_dataset
-from potlp_jax.learning.estimator_files import CheckpointError, load_estimator
-from potlp_jax.learning.evaluation import (
+from potlp_jax.learning.serialization import CheckpointError, load_estimator
+from potlp_jax.learning.metrics import (
     ABLATIONS,
     INTACT,
     EvaluationError,

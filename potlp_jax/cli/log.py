@@ -18,7 +18,7 @@ from potlp_jax.cli.inputs import read_policy, read_task, read_trained_estimator,
 from potlp_jax.cli.output import BAD_INPUT, FAILED, console, fail, note, output_folder, print_json, progress_bar
 from potlp_jax.cli.run import RECORD
 from potlp_jax.cli.view import PAGE
-from potlp_jax.environments.places import load_places
+from potlp_jax.environments.ros.places import load_places
 from potlp_jax.learning.estimator import TrainedEstimator, shipped_estimator
 from potlp_jax.logs.drive import Drive, read_drive
 from potlp_jax.logs.inspection import inspect
@@ -168,7 +168,7 @@ def logs_to_dataset(
     if importlib.util.find_spec("pyarrow") is None:
         fail("datasets are Parquet files, and pyarrow is not installed: pip install 'potlp-jax[train]'", FAILED)
     from potlp_jax.learning.dataset import DatasetError, read_dataset
-    from potlp_jax.learning.formulas import HELD_OUT
+    from potlp_jax.learning.questions import HELD_OUT
     from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
 
     name = labels.name.split(".")[0] if environment is None else environment

@@ -14,10 +14,10 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from potlp_jax.cli.output import console, fail, print_json
-from potlp_jax.environments.map_server import MapWarning, OccupancyMap, load_map
-from potlp_jax.environments.map_survey import MapSurvey, Passage, survey_map
-from potlp_jax.environments.map_writer import save_map
-from potlp_jax.environments.places import (
+from potlp_jax.environments.ros.map_files import MapWarning, OccupancyMap, load_map
+from potlp_jax.environments.ros.survey import MapSurvey, Passage, survey_map
+from potlp_jax.environments.ros.map_writer import save_map
+from potlp_jax.environments.ros.places import (
     Disc,
     Places,
     Point,
@@ -28,7 +28,7 @@ from potlp_jax.environments.places import (
     place_letters,
     save_places,
 )
-from potlp_jax.environments.ros_map import CleanMap, RosMap, RosMapConfig, clean_map
+from potlp_jax.environments.ros.ros_map import CleanMap, RosMap, RosMapConfig, clean_map
 from potlp_jax.task.formula import check_propositions
 from potlp_jax.task.task import Task
 from potlp_jax.view.map_preview import draw_map, draw_places

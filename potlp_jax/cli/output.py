@@ -78,7 +78,7 @@ def _show_warning(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, *rest: TextIO | str | None
 ) -> None:
     """A warning about the user's input as a note, without the place in the program; any other as Python shows it."""
-    from potlp_jax.environments.map_server import MapWarning
+    from potlp_jax.environments.ros.map_files import MapWarning
 
     if issubclass(category, MapWarning):
         note(str(message))
@@ -88,8 +88,8 @@ def _show_warning(
 
 def _input_errors() -> tuple[type[Exception], ...]:
     """The errors that say what is wrong with an input; any other is a fault of the program and keeps its traceback."""
-    from potlp_jax.environments.map_server import MapError
-    from potlp_jax.learning.estimator_files import CheckpointError
+    from potlp_jax.environments.ros.map_files import MapError
+    from potlp_jax.learning.serialization import CheckpointError
     from potlp_jax.logs.errors import LogError
     from potlp_jax.records import RecordError
     from potlp_jax.sweep.specification import SpecificationError

@@ -38,11 +38,11 @@ def make(name: str) -> Generator:
 
         return Firefighting()
     if name == "delivery":
-        from potlp_jax.environments.delivery import Delivery
+        from potlp_jax.environments.campus.delivery import Delivery
 
         return Delivery()
     if name == "parcels":
-        from potlp_jax.environments.delivery import Delivery
+        from potlp_jax.environments.campus.delivery import Delivery
 
         return Delivery.parcels()
     if name == "rooms":
@@ -50,15 +50,15 @@ def make(name: str) -> Generator:
 
         return Rooms()
     if name.startswith("map:"):
-        from potlp_jax.environments.ros_map import RosMap
+        from potlp_jax.environments.ros.ros_map import RosMap
 
         return RosMap.from_spec(name)
     if name.startswith("parcels:"):
-        from potlp_jax.environments.mapped_rooms import MappedRooms
+        from potlp_jax.environments.ros.mapped_rooms import MappedRooms
 
         return MappedRooms.from_spec(name)
     if name.startswith("floorplan:"):
-        from potlp_jax.environments.floorplan import FloorPlans
+        from potlp_jax.environments.campus.floor_plans import FloorPlans
 
         return FloorPlans.from_spec(name)
     raise WorldError(f"unknown environment {name!r}; choose one of: {', '.join(FAMILIES)}")

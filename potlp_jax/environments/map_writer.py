@@ -1,11 +1,11 @@
-"""Writes occupancy maps in the format that `potlp_jax.environments.map_server` reads."""
+"""Writes occupancy maps in the format that `potlp_jax.environments.ros.map_files` reads."""
 
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool
 
-from potlp_jax.environments.map_server import (
+from potlp_jax.environments.ros.map_files import (
     DEFAULT_FREE_THRESH,
     DEFAULT_OCCUPIED_THRESH,
     GridFrame,

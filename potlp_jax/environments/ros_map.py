@@ -1,6 +1,6 @@
 """Worlds on real buildings: a ROS map, cleaned until it can serve as the truth, with propositions placed in metres.
 
-``map:FILE.yaml`` takes the propositions from ``FILE.places.yaml`` beside it (`potlp_jax.environments.places`). Options
+``map:FILE.yaml`` takes the propositions from ``FILE.places.yaml`` beside it (`potlp_jax.environments.ros.places`). Options
 follow after commas: ``map:FILE.yaml,places=OTHER.yaml,resolution=0.2,radius=0.1``. Names of files hold no comma.
 
 A raw map does not describe a closed building: pixels are free that no robot reached, and free space touches unknown
@@ -33,9 +33,9 @@ from jaxtyping import Bool, Int, Int32, PRNGKeyArray, Shaped
 from scipy import ndimage
 
 from potlp_jax.environments.base import host_generators
-from potlp_jax.environments.map_server import GridFrame, MapError, MapWarning, OccupancyMap, load_map
+from potlp_jax.environments.ros.map_files import GridFrame, MapError, MapWarning, OccupancyMap, load_map
 from potlp_jax.environments.options import parse_options
-from potlp_jax.environments.places import Places, Point, component_labels, load_places, nearest_free, place_letters
+from potlp_jax.environments.ros.places import Places, Point, component_labels, load_places, nearest_free, place_letters
 from potlp_jax.world.grid import World, make_world
 
 PREFIX = "map:"
@@ -139,7 +139,7 @@ class RosMap:
 
         Warns:
             MapWarning: a part of the building is cut off by the size of the cells; see also
-                `potlp_jax.environments.map_server.load_map`.
+                `potlp_jax.environments.ros.map_files.load_map`.
         """
         self.config = config
         self.image_map = load_map(config.file)

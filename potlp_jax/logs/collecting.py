@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import pyarrow
 
-from potlp_jax.environments.places import Places
+from potlp_jax.environments.ros.places import Places
 from potlp_jax.learning.dataset import DatasetError, DatasetMetadata, finished_shards, write_shard
-from potlp_jax.learning.formulas import TaskDistribution
-from potlp_jax.learning.sampling import Pose, Recorder, ViewConfig, record_views
-from potlp_jax.learning.weights import WeightBounds
+from potlp_jax.learning.questions import TaskDistribution
+from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views
+from potlp_jax.learning.mistake_costs import WeightBounds
 from potlp_jax.logs.drive import Drive, Eyes
 from potlp_jax.logs.errors import LogError
 from potlp_jax.robot import DIAGONAL

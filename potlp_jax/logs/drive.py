@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Int32, Int64, UInt8
 from scipy import ndimage
 
-from potlp_jax.environments.map_server import GridFrame
-from potlp_jax.environments.places import Places, place_letters
+from potlp_jax.environments.ros.map_files import GridFrame
+from potlp_jax.environments.ros.places import Places, place_letters
 from potlp_jax.logs.errors import LogError
 from potlp_jax.logs.log import Log, MapMessage, Picture
 from potlp_jax.logs.pictures import match_pictures, vertical_field

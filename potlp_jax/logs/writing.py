@@ -18,7 +18,7 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
-from potlp_jax.environments.map_server import FREE, OCCUPIED, UNKNOWN, GridFrame
+from potlp_jax.environments.ros.map_files import FREE, OCCUPIED, UNKNOWN, GridFrame
 from potlp_jax.logs.errors import LogError
 from potlp_jax.logs.log import FIXED_TOPIC, IMAGE_TYPE, MAP_TYPE, ODOMETRY_TYPE, SECOND, TRANSFORM_TYPES, typestore
 from potlp_jax.logs.transforms import Quaternion, quaternion_of

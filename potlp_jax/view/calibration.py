@@ -14,7 +14,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from potlp_jax.learning.dataset import Samples, decode
-from potlp_jax.learning.evaluation import INTACT, CostErrors, Figures, Predictions, Report, class_in_words
+from potlp_jax.learning.metrics import INTACT, CostErrors, Figures, Predictions, Report, class_in_words
 from potlp_jax.view.style import CHOSEN, FAINT, INK, STATE_COLOURS, new_figure
 from potlp_jax.world.panorama import roll_to
 

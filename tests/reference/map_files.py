@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from potlp_jax.environments.map_server import GridFrame, MapSettings, OccupancyMap
+from potlp_jax.environments.ros.map_files import GridFrame, MapSettings, OccupancyMap
 
 FIELDS = {
     "image": "map.pgm",

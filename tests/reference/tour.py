@@ -6,7 +6,7 @@ import numpy as np
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 
-from potlp_jax.environments.places import load_places
+from potlp_jax.environments.ros.places import load_places
 from potlp_jax.environments.toy import Toy, ToyConfig
 from potlp_jax.logs import writing
 from potlp_jax.logs.drive import read_drive

@@ -20,7 +20,7 @@ import jax
 import numpy as np
 from jaxtyping import Int, PRNGKeyArray
 
-from potlp_jax.environments.academic import (
+from potlp_jax.environments.campus.furnishing import (
     MANY_DOORS,
     NO_ROOM,
     PARCELS,

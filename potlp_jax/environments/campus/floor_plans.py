@@ -28,7 +28,7 @@ import jax
 import numpy as np
 from jaxtyping import Int, Int32, PRNGKeyArray
 
-from potlp_jax.environments.academic import (
+from potlp_jax.environments.campus.furnishing import (
     MANY_DOORS,
     NO_ROOM,
     PEOPLE,
@@ -41,10 +41,10 @@ from potlp_jax.environments.academic import (
     name_kinds,
 )
 from potlp_jax.environments.base import host_generators
-from potlp_jax.environments.floorplan_xml import FloorPlan, PlanDoor, PlanRoom, read_kinds, read_plan
-from potlp_jax.environments.map_server import GridFrame, MapError, MapWarning
+from potlp_jax.environments.campus.floor_plan_xml import FloorPlan, PlanDoor, PlanRoom, read_kinds, read_plan
+from potlp_jax.environments.ros.map_files import GridFrame, MapError, MapWarning
 from potlp_jax.environments.options import parse_options
-from potlp_jax.environments.places import Polygon, component_labels
+from potlp_jax.environments.ros.places import Polygon, component_labels
 from potlp_jax.environments.splits import FLOOR_PLAN_PREFIX
 from potlp_jax.world.grid import World
 

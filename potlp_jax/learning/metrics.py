@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float32, Float64, Int8, Int64
 
 from potlp_jax.learning.batches import Batch, Batches, batch_answers
 from potlp_jax.learning.dataset import Samples, decode, encode
-from potlp_jax.learning.estimator_files import require_propositions
+from potlp_jax.learning.serialization import require_propositions
 from potlp_jax.learning.network import Answers, EstimatorNetwork, NetworkConfig, Params
 
 BINS: int = 10
