@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from potlp_jax.records import NEVER_SEEN, Outcome, Trial
+from potlp_jax.trials.record import NEVER_SEEN, Outcome, Trial
 from potlp_jax.sweep.rows import read_path
 from potlp_jax.sweep.statistics import SATISFIED
 from potlp_jax.sweep.store import Row

@@ -38,7 +38,7 @@ from potlp_jax.learning.questions import HELD_OUT
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.rows import source_commit
 from potlp_jax.sweep.store import Row
-from potlp_jax.trial import versions
+from potlp_jax.trials.loop import versions
 
 POLICIES = [Policy.KNOWN_MAP.value, Policy.BASELINE.value, Policy.ORACLE.value, Policy.POTLP.value]
 WITHOUT_ORACLE = [policy for policy in POLICIES if policy != Policy.ORACLE]

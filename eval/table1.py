@@ -33,7 +33,7 @@ from potlp_jax.sweep.rows import source_commit
 from potlp_jax.sweep.runner import RESULTS
 from potlp_jax.sweep.statistics import PolicyRow
 from potlp_jax.sweep.store import Row, Store
-from potlp_jax.trial import versions
+from potlp_jax.trials.loop import versions
 from potlp_jax.view.comparisons import scatter_costs
 from potlp_jax.view.style import new_figure, save_figure
 

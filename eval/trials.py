@@ -37,10 +37,10 @@ from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig, clean_map
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.planning.policies import Policy
-from potlp_jax.records import Outcome
+from potlp_jax.trials.record import Outcome
 from potlp_jax.task.task import Task, TaskSizes
-from potlp_jax.trial import run_trial
-from potlp_jax.trial_config import TrialConfig
+from potlp_jax.trials.loop import run_trial
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.world.grid import World
 from potlp_jax.world.sensing import SensorConfig
 

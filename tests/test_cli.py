@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from potlp_jax.cli import app
 from potlp_jax.environments import FAMILIES, make
 from potlp_jax.environments.splits import world_key
-from potlp_jax.records import Outcome, load_trial
+from potlp_jax.trials.record import Outcome, load_trial
 from potlp_jax.task.task import Task
 from potlp_jax.world.grid import WorldError
 

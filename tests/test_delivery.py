@@ -23,9 +23,9 @@ from potlp_jax.environments.campus.furnishing import (
 from potlp_jax.environments.campus.delivery import Delivery, DeliveryConfig
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.planning.policies import Policy
-from potlp_jax.records import Outcome
+from potlp_jax.trials.record import Outcome
 from potlp_jax.task.task import Task, shipped_tasks
-from potlp_jax.trial import run_trial
+from potlp_jax.trials.loop import run_trial
 from potlp_jax.world.grid import WorldError
 
 GENERATOR = Delivery()

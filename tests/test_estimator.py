@@ -23,11 +23,11 @@ from potlp_jax.learning.serialization import CheckpointError, save_estimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.decision import subgoals_at
 from potlp_jax.planning.policies import Policy
-from potlp_jax.records import ActionRecord, load_trial
-from potlp_jax.replay import panorama_at, replay_decision
+from potlp_jax.trials.record import ActionRecord, load_trial
+from potlp_jax.trials.replay import panorama_at, replay_decision
 from potlp_jax.task.task import Task
-from potlp_jax.trial import run_trial
-from potlp_jax.trial_config import TrialConfig
+from potlp_jax.trials.loop import run_trial
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.view.panoramas import draw_panoramas
 from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
 from potlp_jax.world.grid import BeliefMap

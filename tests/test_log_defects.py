@@ -20,7 +20,7 @@ from potlp_jax.logs.inspection import inspect
 from potlp_jax.logs.log import Log, LogConfig, typestore
 from potlp_jax.logs.transforms import quaternion_of
 from potlp_jax.logs.writing import BagFormat
-from potlp_jax.records import NEVER_SEEN
+from potlp_jax.trials.record import NEVER_SEEN
 from tests.reference.tour import (
     CAMERA,
     FORMATS,

@@ -31,11 +31,11 @@ from potlp_jax.logs.working_grid import GridConfig
 from potlp_jax.logs.writing import BagFormat
 from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.planning.policies import Policy
-from potlp_jax.records import NEVER_SEEN, Outcome, RecordError, belief_seen_by, load_trial
-from potlp_jax.replay import panorama_at
-from potlp_jax.robot import Robot, Stop
+from potlp_jax.trials.record import NEVER_SEEN, Outcome, RecordError, belief_seen_by, load_trial
+from potlp_jax.trials.replay import panorama_at
+from potlp_jax.trials.robot import Robot, Stop
 from potlp_jax.task.task import Task
-from potlp_jax.trial import run_trial
+from potlp_jax.trials.loop import run_trial
 from potlp_jax.world.grid import BeliefMap, make_world
 from potlp_jax.world.panorama import CameraConfig
 from tests.reference.tour import (

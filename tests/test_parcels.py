@@ -20,7 +20,7 @@ from potlp_jax.environments.ros.ros_map import NARROW_DOORS
 from potlp_jax.environments.splits import world_key
 from potlp_jax.sweep.specification import SpecificationError, specification_from_dict
 from potlp_jax.task.task import Task
-from potlp_jax.trial_config import TrialConfig, with_settings
+from potlp_jax.trials.config import TrialConfig, with_settings
 from potlp_jax.world.grid import WorldError
 from tests.reference.map_files import drawn, p5, write_map
 

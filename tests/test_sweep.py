@@ -26,7 +26,7 @@ from potlp_jax.sweep.runner import RESULTS, Sweep, run_sweep
 from potlp_jax.sweep.specification import SpecificationError, read_specification, specification_from_dict
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store, StoreError, process_start
 from potlp_jax.task.task import Task
-from potlp_jax.trial import run_trial
+from potlp_jax.trials.loop import run_trial
 from potlp_jax.view.report_page import Cell, report_page
 from tests.reference.browser import BROWSER, dump_page
 

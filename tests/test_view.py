@@ -16,7 +16,7 @@ from matplotlib.patches import Circle
 from PIL import Image, ImageSequence
 from rich.console import Console
 
-from potlp_jax.records import NEVER_SEEN, ActionRecord, Decision, Outcome, Trial
+from potlp_jax.trials.record import NEVER_SEEN, ActionRecord, Decision, Outcome, Trial
 from potlp_jax.sweep.statistics import Comparison, TrialResult
 from potlp_jax.sweep.store import Item, Row
 from potlp_jax.task.task import Task

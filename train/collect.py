@@ -44,8 +44,8 @@ from potlp_jax.learning.dataset import (
 from potlp_jax.learning.questions import HELD_OUT, TaskDistribution
 from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views
 from potlp_jax.learning.mistake_costs import WeightBounds
-from potlp_jax.trial import versions
-from potlp_jax.trial_config import TrialConfig, with_settings
+from potlp_jax.trials.loop import versions
+from potlp_jax.trials.config import TrialConfig, with_settings
 from potlp_jax.world.grid import World
 from potlp_jax.world.panorama import CameraConfig, Disturbance, disturb, render
 from train.explorer import Explorer, ExplorerConfig

@@ -10,8 +10,8 @@ from potlp_jax.cli.output import console, fail, note, print_json
 from potlp_jax.cli.run import RECORD
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.planning.search.inspect import tree_top
-from potlp_jax.records import Decision, Trial, load_trial
-from potlp_jax.replay import panorama_at, replay_decision
+from potlp_jax.trials.record import Decision, Trial, load_trial
+from potlp_jax.trials.replay import panorama_at, replay_decision
 from potlp_jax.view.decisions import action_table, decision_to_dict, describe_decision
 from potlp_jax.view.panoramas import draw_panoramas
 from potlp_jax.view.style import save_figure

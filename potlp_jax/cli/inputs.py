@@ -10,7 +10,7 @@ from potlp_jax.environments.splits import MAX_INDEX, Split, check_split, default
 from potlp_jax.learning.estimator import TrainedEstimator, read_estimator, shipped_estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task, shipped_tasks
-from potlp_jax.trial_config import TrialConfig, with_settings
+from potlp_jax.trials.config import TrialConfig, with_settings
 from potlp_jax.world.grid import World
 
 

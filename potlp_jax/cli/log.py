@@ -27,7 +27,7 @@ from potlp_jax.logs.replaying import replay
 from potlp_jax.logs.working_grid import GridConfig
 from potlp_jax.logs.writing import BagFormat, write_trial
 from potlp_jax.planning.policies import Policy
-from potlp_jax.records import load_trial
+from potlp_jax.trials.record import load_trial
 from potlp_jax.view.maps import draw_trial
 from potlp_jax.view.replay_page import replay_page
 from potlp_jax.view.style import save_figure

@@ -91,7 +91,7 @@ def _input_errors() -> tuple[type[Exception], ...]:
     from potlp_jax.environments.ros.map_files import MapError
     from potlp_jax.learning.serialization import CheckpointError
     from potlp_jax.logs.errors import LogError
-    from potlp_jax.records import RecordError
+    from potlp_jax.trials.record import RecordError
     from potlp_jax.sweep.specification import SpecificationError
     from potlp_jax.sweep.store import StoreError
     from potlp_jax.task.formula import TaskError

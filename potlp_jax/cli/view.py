@@ -8,8 +8,8 @@ from jaxtyping import UInt8
 
 from potlp_jax.cli.output import console, fail, note
 from potlp_jax.cli.run import RECORD
-from potlp_jax.records import Trial, load_trial
-from potlp_jax.replay import panorama_at
+from potlp_jax.trials.record import Trial, load_trial
+from potlp_jax.trials.replay import panorama_at
 from potlp_jax.view.replay_page import replay_page
 
 PAGE: str = "replay.html"

@@ -17,8 +17,8 @@ from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_view
 from potlp_jax.learning.mistake_costs import WeightBounds
 from potlp_jax.logs.drive import Drive, Eyes
 from potlp_jax.logs.errors import LogError
-from potlp_jax.robot import DIAGONAL
-from potlp_jax.trial import versions
+from potlp_jax.trials.robot import DIAGONAL
+from potlp_jax.trials.loop import versions
 from potlp_jax.world.panorama import CameraConfig, Disturbance
 
 

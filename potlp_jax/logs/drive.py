@@ -22,7 +22,7 @@ from potlp_jax.logs.log import Log, MapMessage, Picture
 from potlp_jax.logs.pictures import match_pictures, vertical_field
 from potlp_jax.logs.poses import Cell, drive_path, read_poses
 from potlp_jax.logs.working_grid import NEVER, GridConfig, WorkingGrid
-from potlp_jax.records import NEVER_SEEN, belief_seen_by
+from potlp_jax.trials.record import NEVER_SEEN, belief_seen_by
 from potlp_jax.world.equirectangular import from_equirectangular
 from potlp_jax.world.frontiers import FrontierConfig, frontier_cells
 from potlp_jax.world.grid import BeliefMap, World, make_world

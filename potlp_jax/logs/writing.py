@@ -22,9 +22,9 @@ from potlp_jax.environments.ros.map_files import FREE, OCCUPIED, UNKNOWN, GridFr
 from potlp_jax.logs.errors import LogError
 from potlp_jax.logs.log import FIXED_TOPIC, IMAGE_TYPE, MAP_TYPE, ODOMETRY_TYPE, SECOND, TRANSFORM_TYPES, typestore
 from potlp_jax.logs.transforms import Quaternion, quaternion_of
-from potlp_jax.records import Trial, belief_seen_by
-from potlp_jax.robot import DIAGONAL, photograph
-from potlp_jax.trial_config import trial_config_from_dict
+from potlp_jax.trials.record import Trial, belief_seen_by
+from potlp_jax.trials.robot import DIAGONAL, photograph
+from potlp_jax.trials.config import trial_config_from_dict
 from potlp_jax.world.equirectangular import to_equirectangular
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.panorama import CameraConfig

@@ -30,7 +30,7 @@ from potlp_jax.environments import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
-from potlp_jax.trial_config import TrialConfig, trial_config_from_dict, with_settings
+from potlp_jax.trials.config import TrialConfig, trial_config_from_dict, with_settings
 from potlp_jax.world.grid import WorldError
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from potlp_jax.records import ActionRecord, Decision, Trial
+from potlp_jax.trials.record import ActionRecord, Decision, Trial
 
 
 def rank_actions(decision: Decision) -> list[ActionRecord]:

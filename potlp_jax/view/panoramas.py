@@ -8,7 +8,7 @@ from jaxtyping import UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from potlp_jax.records import Decision, Trial
+from potlp_jax.trials.record import Decision, Trial
 from potlp_jax.view.decisions import describe_decision, rank_actions
 from potlp_jax.view.style import CHOSEN, INK, new_figure
 from potlp_jax.world.panorama import bearing, roll_to

@@ -14,10 +14,10 @@ from potlp_jax.planning.policies import DecisionConfig, Policy, assess, planning
 from potlp_jax.planning.search.api import Plan, search_tree
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.graph import Tree
-from potlp_jax.records import LOG_PREFIX, Decision, RecordError, Trial
-from potlp_jax.robot import photograph
+from potlp_jax.trials.record import LOG_PREFIX, Decision, RecordError, Trial
+from potlp_jax.trials.robot import photograph
 from potlp_jax.task.task import Task, TaskArrays
-from potlp_jax.trial_config import TrialConfig, trial_config_from_dict
+from potlp_jax.trials.config import TrialConfig, trial_config_from_dict
 from potlp_jax.world.grid import BeliefMap
 from potlp_jax.world.panorama import Disturbance
 

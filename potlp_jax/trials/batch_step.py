@@ -34,11 +34,11 @@ from potlp_jax.planning.policies import (
 )
 from potlp_jax.planning.search.api import plan_actions
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.records import NEVER_SEEN, Outcome
-from potlp_jax.robot import DIAGONAL, Stop, follow, photograph
+from potlp_jax.trials.record import NEVER_SEEN, Outcome
+from potlp_jax.trials.robot import DIAGONAL, Stop, follow, photograph
 from potlp_jax.task.task import TaskArrays
-from potlp_jax.trial import STUCK_REPEATS, planning_key, sensing_key
-from potlp_jax.trial_config import TrialConfig
+from potlp_jax.trials.loop import STUCK_REPEATS, planning_key, sensing_key
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.types import status_array
 from potlp_jax.world.frontiers import Subgoals
 from potlp_jax.world.grid import BeliefMap, World

@@ -18,14 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int32, PRNGKeyArray
 
-from potlp_jax.batch_step import EMPTY, OUTCOMES, Progress, Rules, Scene, begin, step
+from potlp_jax.trials.batch_step import EMPTY, OUTCOMES, Progress, Rules, Scene, begin, step
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import Params
 from potlp_jax.learning.memory import Views
 from potlp_jax.planning.policies import Policy
-from potlp_jax.records import Outcome
+from potlp_jax.trials.record import Outcome
 from potlp_jax.task.task import TaskArrays
-from potlp_jax.trial_config import TrialConfig
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.world.grid import World
 
 SLOTS: int = 8
