@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from eval.audit import problems_of_row
+from potlp_jax.verify.audit import problems_of_row
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.planning.policies import Policy

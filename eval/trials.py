@@ -27,7 +27,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from eval.audit import problems_of
+from potlp_jax.verify.audit import problems_of
 from eval.formulas import random_tasks, traits
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.firefighting import Firefighting

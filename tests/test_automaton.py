@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from potlp_jax.task import Task, TaskError
 from potlp_jax.task.automaton import Dfa, canonical_dfa
 from potlp_jax.task.hoa import read_hoa, write_hoa
-from tests.reference.ltl_semantics import satisfies_lasso, word_satisfies, word_violates
+from potlp_jax.verify.semantics import satisfies_lasso, word_satisfies, word_violates
 
 HEADER = 'HOA: v1\nStates: 2\nStart: 0\nAP: 2 "a" "b"\nacc-name: Buchi\nAcceptance: 1 Inf(0)\n'
 EVENTUALLY_A = HEADER + "--BODY--\nState: 0\n[!0] 0\n[0] 1\nState: 1 {0}\n[t] 1\n--END--\n"

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from eval.audit import problems_of, satisfaction_is_promised
+from potlp_jax.verify.audit import problems_of, satisfaction_is_promised
 from eval.formulas import random_tasks
 from potlp_jax.trials import robot
 from potlp_jax import trial as trial_module

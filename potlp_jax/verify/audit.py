@@ -1,6 +1,6 @@
 """Check a finished trial against the truth, independently of the planner.
 
-The word is judged by ``tests.reference.ltl_semantics``, an evaluator of the formula's semantics that shares no code
+The word is judged by ``potlp_jax.verify.semantics``, an evaluator of the formula's semantics that shares no code
 with the library; moves, letters, cost and what was observed when are checked against the world.
 """
 
@@ -18,7 +18,7 @@ from potlp_jax.sweep.store import Row
 from potlp_jax.task.task import Task
 from potlp_jax.world.grid import World
 from tests.reference.dijkstra import grid_moves
-from tests.reference.ltl_semantics import word_satisfies, word_violates
+from potlp_jax.verify.semantics import word_satisfies, word_violates
 
 
 def problems_of(trial: Trial, task: Task) -> list[str]:
