@@ -24,8 +24,8 @@ from potlp_jax.environments.firefighting import Firefighting, FirefightingConfig
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.planning.distances.product import product_distances, product_transitions
 from potlp_jax.task.task import Task
-from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.loop import run_trial
 from potlp_jax.world.sensing import SensorConfig
 
 PAPER = {

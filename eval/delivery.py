@@ -30,9 +30,9 @@ from eval.savings import (
     table_lines,
 )
 from potlp_jax.environments import make
-from potlp_jax.environments.campus.furnishing import PEOPLE
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.campus.floor_plans import FloorPlans
+from potlp_jax.environments.campus.furnishing import PEOPLE
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.learning.questions import HELD_OUT
 from potlp_jax.planning.policies import Policy

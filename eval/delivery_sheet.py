@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from scipy import ndimage
 
 from eval.contact_sheet import Cell, draw_plan, mark_bearings
-from potlp_jax.environments.campus.furnishing import PEOPLE, Floor, Kind, Placement
 from potlp_jax.environments.campus.delivery import Delivery
 from potlp_jax.environments.campus.floor_plans import FloorPlanConfig, FloorPlans
+from potlp_jax.environments.campus.furnishing import PEOPLE, Floor, Kind, Placement
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.view.style import INK, new_figure
 from potlp_jax.world.grid import World

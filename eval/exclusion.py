@@ -16,9 +16,9 @@ import pyarrow.parquet as pq
 from jaxtyping import Float64
 
 from potlp_jax.learning.dataset import read_dataset
-from potlp_jax.learning.serialization import load_estimator
 from potlp_jax.learning.metrics import predict
 from potlp_jax.learning.network import EstimatorNetwork
+from potlp_jax.learning.serialization import load_estimator
 
 EDGES = (0, 10, 16, 25, 40, 80, 200)
 """Of the classes of distance, in cells."""

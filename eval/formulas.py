@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from potlp_jax.task.formula import TaskError
+from potlp_jax.errors import TaskError
 from potlp_jax.task.task import Task, TaskSizes
 
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from potlp_jax.verify.audit import problems_of_row
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.planning.policies import Policy
@@ -18,6 +17,7 @@ from potlp_jax.sweep.runner import RESULTS
 from potlp_jax.sweep.statistics import PolicyRow
 from potlp_jax.sweep.store import Row, Store
 from potlp_jax.types import Status
+from potlp_jax.verify.audit import problems_of_row
 
 SWEEP_COMMAND = (sys.executable, "-c", "from potlp_jax.cli import main; main()", "sweep")
 """``potlp sweep``, by the interpreter that runs."""

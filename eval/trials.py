@@ -27,20 +27,20 @@ from typing import Any
 import jax
 import numpy as np
 
-from potlp_jax.verify.audit import problems_of
 from eval.formulas import random_tasks, traits
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.firefighting import Firefighting
+from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.ros.map_files import load_map
 from potlp_jax.environments.ros.places import Disc, Places
-from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig, clean_map
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.planning.policies import Policy
-from potlp_jax.trials.record import Outcome
 from potlp_jax.task.task import Task, TaskSizes
-from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.loop import run_trial
+from potlp_jax.trials.record import Outcome
+from potlp_jax.verify.audit import problems_of
 from potlp_jax.world.grid import World
 from potlp_jax.world.sensing import SensorConfig
 

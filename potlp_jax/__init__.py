@@ -13,20 +13,20 @@ The public names, from a formula to a trial:
 * sentinels and flags: ``NO_ACTION``, ``Status``
 """
 
-from potlp_jax.trials.batch import Finished, Start, run_batch
+from potlp_jax.errors import TaskError
 from potlp_jax.planning.commitment import Intention
+from potlp_jax.planning.distances.product import product_distances, product_transitions
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.exact.api import Bounds, ProblemTooLargeError, bound_exact, solve_exact
 from potlp_jax.planning.policies import DecisionConfig, Policy, decide
-from potlp_jax.planning.search.api import Plan, plan_actions
 from potlp_jax.planning.problem import PlanningProblem, enumerate_actions
-from potlp_jax.planning.distances.product import product_distances, product_transitions
+from potlp_jax.planning.search.api import Plan, plan_actions
 from potlp_jax.planning.search.graph import SearchConfig
-from potlp_jax.trials.record import Outcome, Trial, load_trial
-from potlp_jax.task.formula import TaskError
 from potlp_jax.task.task import Task, TaskArrays, TaskSizes, stack_tasks
-from potlp_jax.trials.loop import run_trial
+from potlp_jax.trials.batch import Finished, Start, run_batch
 from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.loop import run_trial
+from potlp_jax.trials.record import Outcome, Trial, load_trial
 from potlp_jax.types import NO_ACTION, Status
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
 from potlp_jax.world.grid import BeliefMap, World, make_world

@@ -6,18 +6,19 @@ import jax
 import numpy as np
 import pytest
 
-from potlp_jax.trials import batch
-from potlp_jax.trials.batch import BatchError, Start, run_batch
 from potlp_jax.environments import make
 from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.errors import BatchError
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.policies import DecisionConfig, Policy
 from potlp_jax.planning.search.graph import SearchConfig
-from potlp_jax.trials.record import Outcome
 from potlp_jax.task.task import Task
-from potlp_jax.trials.loop import run_trial
+from potlp_jax.trials import batch
+from potlp_jax.trials.batch import Start, run_batch
 from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.loop import run_trial
+from potlp_jax.trials.record import Outcome
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import pad_world
 from potlp_jax.world.sensing import SensorConfig

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from potlp_jax.bench.perception import measure_looking
 from potlp_jax.bench.memory import tree_memory
+from potlp_jax.bench.perception import measure_looking
 from potlp_jax.bench.planner import as_dict, make_scene, mean_depth, measure_distances
+from potlp_jax.bench.problems import family_problem
 from potlp_jax.bench.timing import Timing, compile_call, environment, measure, timed_runs
 from potlp_jax.cache import SWITCH, cache_folder, enable_compilation_cache, machine_fingerprint
 from potlp_jax.cli import app
@@ -23,7 +24,6 @@ from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.environments.toy import Toy
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
-from potlp_jax.bench.problems import family_problem
 from potlp_jax.planning.policies import DecisionConfig
 from potlp_jax.planning.search.api import search_tree
 from potlp_jax.planning.search.graph import SearchConfig

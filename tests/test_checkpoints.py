@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from potlp_jax.errors import CheckpointError
 from potlp_jax.learning import serialization as estimator_files
 from potlp_jax.learning.checkpoints import checkpoint_steps, load_checkpoint, save_checkpoint
-from potlp_jax.learning.serialization import CheckpointError, load_estimator, require_propositions, save_estimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
+from potlp_jax.learning.serialization import load_estimator, require_propositions, save_estimator
 
 CONFIG = NetworkConfig(
     propositions=("fire", "exit"),

@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 from potlp_jax.cli import app
 from potlp_jax.environments import FAMILIES, make
 from potlp_jax.environments.splits import world_key
-from potlp_jax.trials.record import Outcome, load_trial
+from potlp_jax.errors import WorldError
 from potlp_jax.task.task import Task
-from potlp_jax.world.grid import WorldError
+from potlp_jax.trials.record import Outcome, load_trial
 
 # Few simulations: what is tested is the command line, not the planner.
 FAST = ("--simulations", "20")

@@ -17,15 +17,8 @@ import pytest
 
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.splits import Split, world_key
-from potlp_jax.learning.dataset import (
-    DatasetError,
-    decode,
-    finished_shards,
-    read_dataset,
-    read_metadata,
-    samples_file,
-    views_file,
-)
+from potlp_jax.errors import DatasetError
+from potlp_jax.learning.dataset import decode, finished_shards, read_dataset, read_metadata, samples_file, views_file
 from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.recording import survey
 from potlp_jax.task.task import Task

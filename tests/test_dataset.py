@@ -8,9 +8,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from potlp_jax.errors import DatasetError
 from potlp_jax.learning.dataset import (
     SCHEMA_VERSION,
-    DatasetError,
     DatasetMetadata,
     decode,
     encode,

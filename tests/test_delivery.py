@@ -11,6 +11,7 @@ import pytest
 from scipy import ndimage
 
 from potlp_jax.environments import make
+from potlp_jax.environments.campus.delivery import Delivery, DeliveryConfig
 from potlp_jax.environments.campus.furnishing import (
     NO_ROOM,
     PEOPLE,
@@ -20,13 +21,12 @@ from potlp_jax.environments.campus.furnishing import (
     furnish,
     missing_kinds,
 )
-from potlp_jax.environments.campus.delivery import Delivery, DeliveryConfig
 from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.errors import WorldError
 from potlp_jax.planning.policies import Policy
-from potlp_jax.trials.record import Outcome
 from potlp_jax.task.task import Task, shipped_tasks
 from potlp_jax.trials.loop import run_trial
-from potlp_jax.world.grid import WorldError
+from potlp_jax.trials.record import Outcome
 
 GENERATOR = Delivery()
 FLOORS = 80

@@ -11,6 +11,7 @@ import pytest
 from potlp_jax.cli.explain import explain_decision
 from potlp_jax.environments import make
 from potlp_jax.environments.splits import world_key
+from potlp_jax.errors import CheckpointError
 from potlp_jax.learning.estimator import (
     SURE,
     estimator_for,
@@ -19,15 +20,15 @@ from potlp_jax.learning.estimator import (
     read_estimator,
     shipped_estimator,
 )
-from potlp_jax.learning.serialization import CheckpointError, save_estimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
+from potlp_jax.learning.serialization import save_estimator
 from potlp_jax.planning.decision import subgoals_at
 from potlp_jax.planning.policies import Policy
+from potlp_jax.task.task import Task
+from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import ActionRecord, load_trial
 from potlp_jax.trials.replay import panorama_at, replay_decision
-from potlp_jax.task.task import Task
-from potlp_jax.trials.loop import run_trial
-from potlp_jax.trials.config import TrialConfig
 from potlp_jax.view.panoramas import draw_panoramas
 from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
 from potlp_jax.world.grid import BeliefMap

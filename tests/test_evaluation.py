@@ -16,13 +16,12 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from potlp_jax.cli import app
+from potlp_jax.errors import CheckpointError, EvaluationError
 from potlp_jax.learning.dataset import DatasetMetadata, Samples, decode, encode, view_id, write_shard
-from potlp_jax.learning.serialization import CheckpointError, save_estimator
 from potlp_jax.learning.metrics import (
     BINS,
     DISTANCE_BANDS,
     INTACT,
-    EvaluationError,
     Predictions,
     Prior,
     ablated,
@@ -38,6 +37,7 @@ from potlp_jax.learning.metrics import (
     roc_auc,
 )
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
+from potlp_jax.learning.serialization import save_estimator
 from potlp_jax.view.calibration import draw_costs, draw_predictions, draw_reliability, probability_table
 from potlp_jax.view.style import CHOSEN, rgb
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 
+from potlp_jax.bench.problems import FAMILIES, family_problem
 from potlp_jax.planning.exact import search as exact_search
 from potlp_jax.planning.exact.api import ProblemTooLargeError, bound_exact, solve_exact
-from potlp_jax.bench.problems import FAMILIES, family_problem
 from potlp_jax.types import NO_ACTION, Status
 from tests.reference.planning import Recursion, ReferenceProblem
 from tests.reference.problems import FORMULAS, problem_of, random_fields, random_problem, task_of

@@ -19,7 +19,8 @@ from potlp_jax.environments.firefighting import (
     room_columns,
 )
 from potlp_jax.environments.splits import world_key
-from potlp_jax.world.grid import World, WorldError
+from potlp_jax.errors import WorldError
+from potlp_jax.world.grid import World
 from potlp_jax.world.sensing import SensorConfig
 
 BITS = {name: 1 << index for index, name in enumerate(Firefighting.propositions)}

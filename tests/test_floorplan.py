@@ -13,13 +13,12 @@ from scipy import ndimage
 
 from potlp_jax.cli.inputs import read_split
 from potlp_jax.environments import make
-from potlp_jax.environments.campus.furnishing import NO_ROOM, PEOPLE, Kind, missing_kinds
-from potlp_jax.environments.campus.floor_plans import FloorPlanConfig, FloorPlans, PlanFloor, rasterise
 from potlp_jax.environments.campus.floor_plan_xml import read_kinds, read_plan
-from potlp_jax.environments.ros.map_files import MapError, MapWarning
+from potlp_jax.environments.campus.floor_plans import FloorPlanConfig, FloorPlans, PlanFloor, rasterise
+from potlp_jax.environments.campus.furnishing import NO_ROOM, PEOPLE, Kind, missing_kinds
 from potlp_jax.environments.splits import Split, default_split, usable_splits, world_key
-from potlp_jax.sweep.specification import SpecificationError, specification_from_dict
-from potlp_jax.world.grid import WorldError
+from potlp_jax.errors import MapError, MapWarning, SpecificationError, WorldError
+from potlp_jax.sweep.specification import specification_from_dict
 
 CLEAN = {"rooms_lost": 0, "doors_without_point": 0, "doors_unplaced": 0, "doors_narrowed": 0}
 USABLE = 25

@@ -6,7 +6,8 @@ import types
 
 import pytest
 
-from potlp_jax.task.formula import TaskError, parse_formula
+from potlp_jax.errors import TaskError
+from potlp_jax.task.formula import parse_formula
 
 
 def error_of(text, propositions=None) -> str:

@@ -1,4 +1,4 @@
-"""Frontiers equal flood fill and fractions; order, sizes, overflow and edges as MODEL.md section 6 has them."""
+"""Frontiers equal flood fill and fractions; order, sizes, overflow and edges as docs/model.md section 6 has them."""
 
 import functools
 

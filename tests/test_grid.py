@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from potlp_jax.errors import WorldError
 from potlp_jax.world.grid import (
     Appearance,
     BeliefMap,
     World,
-    WorldError,
     belief_from_numpy,
     make_world,
     pad_world,

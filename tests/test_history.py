@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from potlp_jax.planning.history import action_terms, initial_history, pack_bits, step, unpack_bits
 from potlp_jax.planning.exact.rollouts import Rollouts
+from potlp_jax.planning.history import action_terms, initial_history, pack_bits, step, unpack_bits
 from tests.reference.planning import FINISH, ReferenceProblem
 from tests.reference.problems import FORMULAS, SIZES, padded_problem, problem_of, random_fields, task_of
 

@@ -11,11 +11,11 @@ import pytest
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 
+from potlp_jax.errors import LogError
 from potlp_jax.logs import writing
 from potlp_jax.logs.bag import open_bag
 from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
 from potlp_jax.logs.drive import Eyes, read_drive
-from potlp_jax.logs.errors import LogError
 from potlp_jax.logs.inspection import inspect
 from potlp_jax.logs.log import Log, LogConfig, typestore
 from potlp_jax.logs.transforms import quaternion_of

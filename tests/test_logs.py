@@ -13,16 +13,15 @@ import pytest
 from typer.testing import CliRunner
 
 from potlp_jax.cli import app
-from potlp_jax.environments.ros.map_files import MapError
 from potlp_jax.environments.ros.places import Places, load_places
+from potlp_jax.errors import LogError, MapError, RecordError
 from potlp_jax.learning.dataset import decode, encode, finished_shards, read_dataset, samples_file, views_file
+from potlp_jax.learning.mistake_costs import WeightBounds
 from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views, settled, survey
-from potlp_jax.learning.mistake_costs import WeightBounds
 from potlp_jax.logs import writing
 from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
 from potlp_jax.logs.drive import Eyes
-from potlp_jax.logs.errors import LogError
 from potlp_jax.logs.inspection import inspect
 from potlp_jax.logs.log import Log, LogConfig
 from potlp_jax.logs.replaying import LoggedRobot, from_first_picture, replay
@@ -31,11 +30,11 @@ from potlp_jax.logs.working_grid import GridConfig
 from potlp_jax.logs.writing import BagFormat
 from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.planning.policies import Policy
-from potlp_jax.trials.record import NEVER_SEEN, Outcome, RecordError, belief_seen_by, load_trial
-from potlp_jax.trials.replay import panorama_at
-from potlp_jax.trials.robot import Robot, Stop
 from potlp_jax.task.task import Task
 from potlp_jax.trials.loop import run_trial
+from potlp_jax.trials.record import NEVER_SEEN, Outcome, belief_seen_by, load_trial
+from potlp_jax.trials.replay import panorama_at
+from potlp_jax.trials.robot import Robot, Stop
 from potlp_jax.world.grid import BeliefMap, make_world
 from potlp_jax.world.panorama import CameraConfig
 from tests.reference.tour import (

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from potlp_jax.environments.ros.map_files import GridFrame, MapError, MapWarning, load_map
+from potlp_jax.environments.ros.map_files import GridFrame, load_map
+from potlp_jax.errors import MapError, MapWarning
 from tests.reference.map_files import p2, p5, png, write_map
 
 # The image and the thresholds.

@@ -7,14 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from potlp_jax.learning.network import (
-    STRIDE,
-    EstimatorNetwork,
-    NetworkConfig,
-    NetworkError,
-    operation_counts,
-    parameter_count,
-)
+from potlp_jax.errors import NetworkError
+from potlp_jax.learning.network import STRIDE, EstimatorNetwork, NetworkConfig, operation_counts, parameter_count
 
 CONFIG = NetworkConfig(
     propositions=("fire", "alarm", "exit"),

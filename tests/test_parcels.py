@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from potlp_jax.environments import make
-from potlp_jax.environments.campus.furnishing import PARCELS, Floor, FurnishConfig, Kind, furnish
 from potlp_jax.environments.campus.delivery import Delivery
-from potlp_jax.environments.ros.map_files import MapError, MapWarning
+from potlp_jax.environments.campus.furnishing import PARCELS, Floor, FurnishConfig, Kind, furnish
 from potlp_jax.environments.ros.mapped_rooms import (
     LEARNED_RESOLUTION,
     MANY_SLIVERS,
@@ -18,10 +17,10 @@ from potlp_jax.environments.ros.mapped_rooms import (
 )
 from potlp_jax.environments.ros.ros_map import NARROW_DOORS
 from potlp_jax.environments.splits import world_key
-from potlp_jax.sweep.specification import SpecificationError, specification_from_dict
+from potlp_jax.errors import MapError, MapWarning, SpecificationError, WorldError
+from potlp_jax.sweep.specification import specification_from_dict
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig, with_settings
-from potlp_jax.world.grid import WorldError
 from tests.reference.map_files import drawn, p5, write_map
 
 # Three rooms above a hallway; a sign is half a metre.

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from potlp_jax.planning.exact.api import solve_exact
 from potlp_jax.bench.problems import family_problem
+from potlp_jax.planning.exact.api import solve_exact
 from potlp_jax.planning.search.api import plan_actions, plan_within, search, search_tree
 from potlp_jax.planning.search.arrays import uniform
 from potlp_jax.planning.search.graph import SearchConfig, SearchMode, Tree

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from potlp_jax.errors import ProblemError
 from potlp_jax.planning.history import action_terms, initial_history
-from potlp_jax.planning.problem import PlanningProblem, ProblemError, enumerate_actions
+from potlp_jax.planning.problem import PlanningProblem, enumerate_actions
 from tests.reference.problems import FORMULAS, SIZES, padded_problem, problem_of, random_fields, random_problem, task_of
 
 TASK = "F a & F b"

@@ -15,8 +15,8 @@ from potlp_jax.environments import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
-from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.loop import run_trial
 from potlp_jax.view.replay_page import replay_data, replay_page
 from potlp_jax.world.sensing import SensorConfig
 from tests.reference.browser import BROWSER, dump_page

@@ -20,11 +20,12 @@ from eval.savings import decisions_of
 from potlp_jax.cli import app
 from potlp_jax.environments import make
 from potlp_jax.environments.splits import world_key
+from potlp_jax.errors import SpecificationError, StoreError
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.rows import path_text, read_path
 from potlp_jax.sweep.runner import RESULTS, Sweep, run_sweep
-from potlp_jax.sweep.specification import SpecificationError, read_specification, specification_from_dict
-from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store, StoreError, process_start
+from potlp_jax.sweep.specification import read_specification, specification_from_dict
+from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store, process_start
 from potlp_jax.task.task import Task
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.view.report_page import Cell, report_page

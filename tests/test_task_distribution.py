@@ -8,6 +8,7 @@ import pytest
 from potlp_jax.environments import make
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.splits import world_key
+from potlp_jax.learning.labels import true_labels
 from potlp_jax.learning.questions import (
     HELD_OUT,
     LARGEST,
@@ -18,7 +19,6 @@ from potlp_jax.learning.questions import (
     questions_of,
     random_formula,
 )
-from potlp_jax.learning.labels import true_labels
 from potlp_jax.planning.distances.product import grid_distances
 from potlp_jax.task.task import Task
 from potlp_jax.world.frontiers import FrontierConfig, find_subgoals

@@ -28,9 +28,10 @@ import pytest
 
 from potlp_jax.environments.splits import world_key
 from potlp_jax.environments.toy import Toy, ToyConfig
+from potlp_jax.errors import WorldError
 from potlp_jax.planning.distances.product import product_distances, product_transitions
 from potlp_jax.task.task import Task, TaskArrays
-from potlp_jax.world.grid import World, WorldError
+from potlp_jax.world.grid import World
 
 BY_HAND = ToyConfig(door_row=4, start=(4, 2), goal=(4, 12), hazard=(4, 10))
 GOAL, HAZARD = 1, 2

@@ -16,12 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from potlp_jax.learning.batches import Batch, Batches, TrainingError, batch_answers
+from potlp_jax.errors import CheckpointError, TrainingError
+from potlp_jax.learning.batches import Batch, Batches, batch_answers
 from potlp_jax.learning.checkpoints import checkpoint_steps
 from potlp_jax.learning.dataset import DatasetMetadata, Samples, encode
-from potlp_jax.learning.serialization import CheckpointError, load_estimator
 from potlp_jax.learning.loss import DataScale, evaluation_of, loss_sums, network_config, total_loss
 from potlp_jax.learning.network import Answers, EstimatorNetwork
+from potlp_jax.learning.serialization import load_estimator
 from potlp_jax.learning.training import (
     TrainingConfig,
     augment,

@@ -1,4 +1,4 @@
-"""Whole trials on small worlds: every promise of MODEL.md section 7, checked by the independent evaluator."""
+"""Whole trials on small worlds: every promise of docs/model.md section 7, checked by the independent evaluator."""
 
 import dataclasses
 import json
@@ -8,25 +8,26 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from potlp_jax.verify.audit import problems_of, satisfaction_is_promised
 from eval.formulas import random_tasks
-from potlp_jax.trials import robot
-from potlp_jax import trial as trial_module
 from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.errors import RecordError
 from potlp_jax.learning.estimator import TrainedEstimator, look
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning import policies
 from potlp_jax.planning.policies import DecisionConfig, MoveKind, Policy, decide
 from potlp_jax.planning.search.graph import SearchConfig
-from potlp_jax.trials.record import Outcome, RecordError, load_trial
+from potlp_jax.task.task import Task, TaskSizes
+from potlp_jax.trials import loop as trial_module
+from potlp_jax.trials import robot
+from potlp_jax.trials.config import TrialConfig, trial_config_from_dict
+from potlp_jax.trials.loop import Loop, run_trial
+from potlp_jax.trials.record import Outcome, load_trial
 from potlp_jax.trials.replay import replay_decision
 from potlp_jax.trials.robot import Leg, SimulatedRobot
-from potlp_jax.task.task import Task, TaskSizes
-from potlp_jax.trials.loop import Loop, run_trial
-from potlp_jax.trials.config import TrialConfig, trial_config_from_dict
 from potlp_jax.types import NO_STATE, Status
+from potlp_jax.verify.audit import problems_of, satisfaction_is_promised
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy, make_world, pad_world
 from potlp_jax.world.sensing import SensorConfig

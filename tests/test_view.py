@@ -16,10 +16,11 @@ from matplotlib.patches import Circle
 from PIL import Image, ImageSequence
 from rich.console import Console
 
-from potlp_jax.trials.record import NEVER_SEEN, ActionRecord, Decision, Outcome, Trial
+from potlp_jax.errors import PictureError
 from potlp_jax.sweep.statistics import Comparison, TrialResult
 from potlp_jax.sweep.store import Item, Row
 from potlp_jax.task.task import Task
+from potlp_jax.trials.record import NEVER_SEEN, ActionRecord, Decision, Outcome, Trial
 from potlp_jax.view.animation import frame_steps, save_animation
 from potlp_jax.view.automata import Automaton, draw_automaton
 from potlp_jax.view.comparisons import draw_scatter, loss_lines, outcome_table, savings_table
@@ -35,7 +36,7 @@ from potlp_jax.view.maps import (
     draw_trial,
     place_labels,
 )
-from potlp_jax.view.style import CHOSEN, PictureError, area_colour, new_figure, rgb, save_figure, state_colour
+from potlp_jax.view.style import CHOSEN, area_colour, new_figure, rgb, save_figure, state_colour
 from potlp_jax.view.trees import draw_tree
 from potlp_jax.world.grid import make_world, pad_world
 

@@ -31,8 +31,8 @@ from tqdm import tqdm
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments import Generator, make
 from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.errors import DatasetError
 from potlp_jax.learning.dataset import (
-    DatasetError,
     DatasetMetadata,
     Samples,
     finished_shards,
@@ -41,11 +41,11 @@ from potlp_jax.learning.dataset import (
     remove_unfinished_files,
     write_shard,
 )
+from potlp_jax.learning.mistake_costs import WeightBounds
 from potlp_jax.learning.questions import HELD_OUT, TaskDistribution
 from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views
-from potlp_jax.learning.mistake_costs import WeightBounds
-from potlp_jax.trials.loop import versions
 from potlp_jax.trials.config import TrialConfig, with_settings
+from potlp_jax.trials.loop import versions
 from potlp_jax.world.grid import World
 from potlp_jax.world.panorama import CameraConfig, Disturbance, disturb, render
 from train.explorer import Explorer, ExplorerConfig

@@ -18,11 +18,11 @@ from jaxtyping import Array, Int32
 from potlp_jax.learning.questions import LARGEST
 from potlp_jax.learning.recording import Pose
 from potlp_jax.planning.distances.paths import KnownPath, shortest_path
-from potlp_jax.planning.policies import Situation, assess
 from potlp_jax.planning.distances.sweeping import DIAGONAL
-from potlp_jax.trials.robot import SimulatedRobot, Stop
+from potlp_jax.planning.policies import Situation, assess
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.robot import SimulatedRobot, Stop
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.sensing import SensorConfig

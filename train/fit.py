@@ -29,11 +29,11 @@ import matplotlib.pyplot as plt
 from tensorboardX import SummaryWriter
 from tqdm import tqdm
 
-from potlp_jax.learning.batches import TrainingError
-from potlp_jax.learning.dataset import DatasetError, Samples, decode, read_dataset
-from potlp_jax.learning.serialization import CheckpointError, save_estimator
+from potlp_jax.errors import CheckpointError, DatasetError, NetworkError, TrainingError
+from potlp_jax.learning.dataset import Samples, decode, read_dataset
 from potlp_jax.learning.loss import DataScale, network_config
-from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, NetworkError, operation_counts, parameter_count
+from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, operation_counts, parameter_count
+from potlp_jax.learning.serialization import save_estimator
 from potlp_jax.learning.training import Progress, Trained, TrainingConfig, seconds_per_step, steps_per_epoch, train
 
 # Of the time asked for: what validation, checkpoints and a busy machine may take.

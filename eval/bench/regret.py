@@ -31,12 +31,12 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 
-from potlp_jax.planning.exact.api import ProblemTooLargeError, bound_exact, solve_exact
 from potlp_jax.bench.problems import FAMILIES, SUBGOAL_COUNTS, Split, family_problem
-from potlp_jax.planning.search.api import plan_actions
+from potlp_jax.planning.exact.api import ProblemTooLargeError, bound_exact, solve_exact
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.search.graph import Context, SearchConfig, SearchMode, Tree, new_search
+from potlp_jax.planning.search.api import plan_actions
 from potlp_jax.planning.search.best_first import choose, is_open, simulate
+from potlp_jax.planning.search.graph import Context, SearchConfig, SearchMode, Tree, new_search
 from potlp_jax.types import NO_ACTION
 
 mpl.use("Agg")

@@ -31,8 +31,8 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 
-from potlp_jax.planning.search.api import plan_actions, search
 from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.search.api import plan_actions, search
 from potlp_jax.planning.search.graph import SearchConfig, SearchMode
 from potlp_jax.task.task import Task
 

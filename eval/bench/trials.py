@@ -12,13 +12,13 @@ from collections.abc import Sequence
 
 import jax
 
-from potlp_jax.trials.batch import Start, run_batch
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.learning.estimator import shipped_estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
+from potlp_jax.trials.batch import Start, run_batch
 from potlp_jax.trials.loop import run_trial
 
 FIRST_WORLD = 2000

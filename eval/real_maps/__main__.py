@@ -35,8 +35,8 @@ from eval.savings import (
 from potlp_jax.environments.campus.furnishing import PARCELS
 from potlp_jax.environments.ros.mapped_rooms import MappedRooms
 from potlp_jax.environments.splits import Split, world_key
-from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.distances.product import grid_distances
+from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.results import Pair, pair_rows
 from potlp_jax.sweep.rows import read_path, source_commit
 from potlp_jax.trials.loop import versions

@@ -5,8 +5,8 @@ import math
 
 import jax
 
-from potlp_jax.planning.search.api import search_tree
 from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.search.api import search_tree
 from potlp_jax.planning.search.graph import SearchConfig
 
 

@@ -11,18 +11,18 @@ from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Int32
 
 from potlp_jax.bench.memory import tree_memory
+from potlp_jax.bench.problems import family_problem
 from potlp_jax.bench.timing import Timing, compile_call
 from potlp_jax.environments import make
 from potlp_jax.environments.rooms import Rooms, RoomsConfig
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.learning.labels import TrueMapEstimator
-from potlp_jax.planning.estimates import Estimator, ask
-from potlp_jax.bench.problems import family_problem
 from potlp_jax.planning.distances.paths import shortest_path
-from potlp_jax.planning.policies import DecisionConfig, Move, Policy, Situation, assess, decide, planning_problem
-from potlp_jax.planning.search.api import plan_actions, search
-from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.distances.product import grid_distances, product_distances, product_transitions
+from potlp_jax.planning.estimates import Estimator, ask
+from potlp_jax.planning.policies import DecisionConfig, Move, Policy, Situation, assess, decide, planning_problem
+from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.search.api import plan_actions, search
 from potlp_jax.planning.search.graph import SearchConfig
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.types import NO_STATE

@@ -33,15 +33,15 @@ from potlp_jax.environments import Generator, make
 from potlp_jax.environments.splits import Split
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.planning.policies import Policy
-from potlp_jax.trials.record import Outcome
 from potlp_jax.sweep.results import Pair, compare_pairs
 from potlp_jax.sweep.rows import trial_row
 from potlp_jax.sweep.runner import IMPOSSIBLE_IN_A_ROW
 from potlp_jax.sweep.statistics import KNOWN_MAP, Comparison
 from potlp_jax.sweep.store import Item, Row
 from potlp_jax.task.task import Task
-from potlp_jax.trials.loop import run_trial, trial_key
 from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.loop import run_trial, trial_key
+from potlp_jax.trials.record import Outcome
 from potlp_jax.view.comparisons import draw_scatter, loss_lines, outcome_table, savings_table
 from potlp_jax.view.style import save_figure
 from potlp_jax.world.grid import World

@@ -9,9 +9,10 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from potlp_jax.cli.output import FAILED, console, fail, print_json
-from potlp_jax.learning.serialization import CheckpointError, load_estimator
+from potlp_jax.errors import CheckpointError
 from potlp_jax.learning.fovea import ABOVE, BAND, BELOW
 from potlp_jax.learning.network import operation_counts, parameter_count
+from potlp_jax.learning.serialization import load_estimator
 
 
 def show_estimator(path: Path, json: bool) -> None:

@@ -9,13 +9,11 @@ from rich.console import Console
 from potlp_jax.cli.estimator import finite
 from potlp_jax.cli.output import console, fail, note, output_folder, print_json, progress_bar, to_json
 from potlp_jax.environments.splits import Split
-from potlp_jax.learning.batches import TrainingError
-from potlp_jax.learning.dataset import DatasetError, Samples, read_dataset
-from potlp_jax.learning.serialization import CheckpointError, load_estimator
+from potlp_jax.errors import CheckpointError, DatasetError, EvaluationError, NetworkError, TrainingError
+from potlp_jax.learning.dataset import Samples, read_dataset
 from potlp_jax.learning.metrics import (
     ABLATIONS,
     INTACT,
-    EvaluationError,
     Predictions,
     Prior,
     Report,
@@ -26,7 +24,8 @@ from potlp_jax.learning.metrics import (
     predict,
     prior_of,
 )
-from potlp_jax.learning.network import EstimatorNetwork, NetworkError, Params
+from potlp_jax.learning.network import EstimatorNetwork, Params
+from potlp_jax.learning.serialization import load_estimator
 from potlp_jax.view.calibration import (
     VARIANTS,
     ablation_table,

@@ -167,7 +167,8 @@ def logs_to_dataset(
     """Write the samples of some drives."""
     if importlib.util.find_spec("pyarrow") is None:
         fail("datasets are Parquet files, and pyarrow is not installed: pip install 'potlp-jax[train]'", FAILED)
-    from potlp_jax.learning.dataset import DatasetError, read_dataset
+    from potlp_jax.errors import DatasetError
+    from potlp_jax.learning.dataset import read_dataset
     from potlp_jax.learning.questions import HELD_OUT
     from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
 

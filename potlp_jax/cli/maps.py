@@ -14,8 +14,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from potlp_jax.cli.output import console, fail, print_json
-from potlp_jax.environments.ros.map_files import MapWarning, OccupancyMap, load_map
-from potlp_jax.environments.ros.survey import MapSurvey, Passage, survey_map
+from potlp_jax.environments.ros.map_files import OccupancyMap, load_map
 from potlp_jax.environments.ros.map_writer import save_map
 from potlp_jax.environments.ros.places import (
     Disc,
@@ -29,6 +28,8 @@ from potlp_jax.environments.ros.places import (
     save_places,
 )
 from potlp_jax.environments.ros.ros_map import CleanMap, RosMap, RosMapConfig, clean_map
+from potlp_jax.environments.ros.survey import MapSurvey, Passage, survey_map
+from potlp_jax.errors import MapWarning
 from potlp_jax.task.formula import check_propositions
 from potlp_jax.task.task import Task
 from potlp_jax.view.map_preview import draw_map, draw_places

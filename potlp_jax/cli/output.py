@@ -12,6 +12,8 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from potlp_jax.errors import PotlpError, PotlpWarning
+
 FAILED = 1
 BAD_INPUT = 2
 
@@ -62,9 +64,7 @@ def clear_errors(command: Callable[..., None]) -> Callable[..., None]:
             with warnings.catch_warnings():
                 warnings.showwarning = _show_warning
                 command(*args, **kwargs)
-        except ValueError as error:
-            if not isinstance(error, _input_errors()):
-                raise
+        except PotlpError as error:
             fail(str(error))
         except OSError as error:
             if error.filename is None:
@@ -78,37 +78,10 @@ def _show_warning(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, *rest: TextIO | str | None
 ) -> None:
     """A warning about the user's input as a note, without the place in the program; any other as Python shows it."""
-    from potlp_jax.environments.ros.map_files import MapWarning
-
-    if issubclass(category, MapWarning):
+    if issubclass(category, PotlpWarning):
         note(str(message))
     else:
         error_console().print(warnings.formatwarning(message, category, filename, lineno), markup=False)
-
-
-def _input_errors() -> tuple[type[Exception], ...]:
-    """The errors that say what is wrong with an input; any other is a fault of the program and keeps its traceback."""
-    from potlp_jax.environments.ros.map_files import MapError
-    from potlp_jax.learning.serialization import CheckpointError
-    from potlp_jax.logs.errors import LogError
-    from potlp_jax.trials.record import RecordError
-    from potlp_jax.sweep.specification import SpecificationError
-    from potlp_jax.sweep.store import StoreError
-    from potlp_jax.task.formula import TaskError
-    from potlp_jax.view.style import PictureError
-    from potlp_jax.world.grid import WorldError
-
-    return (
-        TaskError,
-        WorldError,
-        MapError,
-        LogError,
-        RecordError,
-        PictureError,
-        CheckpointError,
-        SpecificationError,
-        StoreError,
-    )
 
 
 def progress_bar() -> Progress:

@@ -1,7 +1,7 @@
 """Where worlds come from: one file a family, each a ``Generator``; ``make`` finds them by name."""
 
 from potlp_jax.environments.base import Generator
-from potlp_jax.world.grid import WorldError
+from potlp_jax.errors import WorldError
 
 FAMILIES: tuple[str, ...] = (
     "toy",

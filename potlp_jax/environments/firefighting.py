@@ -20,7 +20,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32, PRNGKeyArray, UInt8
 
 from potlp_jax.environments.base import NO_SETTINGS, host_generators
-from potlp_jax.world.grid import Appearance, World, WorldError, make_world
+from potlp_jax.errors import WorldError
+from potlp_jax.world.grid import Appearance, World, make_world
 
 Cell = tuple[int, int]
 

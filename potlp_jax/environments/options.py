@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from potlp_jax.environments.ros.map_files import MapError
+from potlp_jax.errors import MapError
 
 
 def parse_options(

@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Int32, PRNGKeyArray
 
 from potlp_jax.environments.base import NO_SETTINGS, host_generators
-from potlp_jax.world.grid import World, WorldError, make_world, pad_world
+from potlp_jax.errors import WorldError
+from potlp_jax.world.grid import World, make_world, pad_world
 
 
 @dataclasses.dataclass(frozen=True)

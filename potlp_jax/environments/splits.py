@@ -21,7 +21,7 @@ import zlib
 import jax
 from jaxtyping import PRNGKeyArray
 
-from potlp_jax.world.grid import WorldError
+from potlp_jax.errors import WorldError
 
 _INDEX_BITS = 28
 MAX_INDEX: int = 2**_INDEX_BITS - 1

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from potlp_jax.environments.base import NO_SETTINGS, host_generators
-from potlp_jax.world.grid import World, WorldError, make_world
+from potlp_jax.errors import WorldError
+from potlp_jax.world.grid import World, make_world
 
 Cell = tuple[int, int]
 

@@ -1,0 +1,1 @@
+"""The paper's section IV: the estimator, from labels to training to answers."""

@@ -14,14 +14,11 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int8, Int32, UInt8
 
+from potlp_jax.errors import TrainingError
 from potlp_jax.learning.dataset import Samples, decode
 from potlp_jax.learning.network import Answers, EstimatorNetwork, Params
 
 _PREFETCHED = 4
-
-
-class TrainingError(ValueError):
-    """The data cannot be trained on, or training has diverged; the message says what to do."""
 
 
 @struct.dataclass(kw_only=True)

@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
-from potlp_jax.learning.serialization import CheckpointError, array_shapes, differences, named_arrays
+from potlp_jax.errors import CheckpointError
+from potlp_jax.learning.serialization import array_shapes, differences, named_arrays
 
 CHECKPOINT_FORMAT: str = "potlp-checkpoint-1"
 """Changed when older checkpoints can no longer be read."""

@@ -21,6 +21,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float32, Int8, Int32, UInt8
 
+from potlp_jax.errors import DatasetError
+
 SCHEMA_VERSION: int = 1
 """Changes when a column or its meaning does."""
 
@@ -60,10 +62,6 @@ SAMPLES_SCHEMA = pa.schema(
         "failure_weight": pa.float32(),
     }
 )
-
-
-class DatasetError(ValueError):
-    """A dataset cannot be read, or not be continued; the message says which file and what to do."""
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,12 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float32, Int32, UInt8
 
-from potlp_jax.learning.serialization import CheckpointError, load_estimator, require_propositions
-from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
+from potlp_jax.errors import CheckpointError
 from potlp_jax.learning.memory import Views, look_of_subgoals, no_views, places_of_looks, remember
-from potlp_jax.planning.estimates import Estimates
+from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
+from potlp_jax.learning.serialization import load_estimator, require_propositions
 from potlp_jax.planning.distances.product import product_distances
+from potlp_jax.planning.estimates import Estimates
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_STATE
 from potlp_jax.world.frontiers import Subgoals

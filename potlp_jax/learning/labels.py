@@ -1,4 +1,4 @@
-"""True P_S, R_S and R_F of every (subgoal, outcome class), from the underlying map (MODEL.md section 6).
+"""True P_S, R_S and R_F of every (subgoal, outcome class), from the underlying map (docs/model.md section 6).
 
 A path of subgoal ``s`` starts at ``s``. It passes through phases, which serve as automaton states of a product:
 
@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 
-from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.distances.product import LANES, arrivals_by_lane, distances_by_lane
+from potlp_jax.planning.estimates import Estimates
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_STATE
 from potlp_jax.world.frontiers import Subgoals, frontier_cells
@@ -28,7 +28,7 @@ PORCH, HIDDEN, SEEN = range(3)
 
 @struct.dataclass(kw_only=True)
 class TrueMapEstimator:
-    """The oracle of MODEL.md section 8: estimates are the true labels of ``world``."""
+    """The oracle of docs/model.md section 8: estimates are the true labels of ``world``."""
 
     world: World
 

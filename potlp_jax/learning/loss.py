@@ -22,7 +22,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float32
 
-from potlp_jax.learning.batches import Batch, TrainingError
+from potlp_jax.errors import TrainingError
+from potlp_jax.learning.batches import Batch
 from potlp_jax.learning.dataset import Samples
 from potlp_jax.learning.network import Answers, NetworkConfig
 

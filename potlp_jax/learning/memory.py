@@ -1,4 +1,4 @@
-"""Panoramas that the robot remembers, and in which of them each cell was last in line of sight (MODEL.md section 6).
+"""Panoramas that the robot remembers, and in which of them each cell was last seen (docs/model.md section 6).
 
 A look adds one panorama, as the features of the network's first stage: they are computed once, whatever is asked of
 them later. Memory is fixed: a new look takes the place of one that no frontier refers to any more.

@@ -27,10 +27,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int8, Int64
 
+from potlp_jax.errors import EvaluationError
 from potlp_jax.learning.batches import Batch, Batches, batch_answers
 from potlp_jax.learning.dataset import Samples, decode, encode
-from potlp_jax.learning.serialization import require_propositions
 from potlp_jax.learning.network import Answers, EstimatorNetwork, NetworkConfig, Params
+from potlp_jax.learning.serialization import require_propositions
 
 BINS: int = 10
 
@@ -44,10 +45,6 @@ SHUFFLE_SEED: int = 0
 
 _VIEWS_PER_BATCH = 16
 _SAMPLES_PER_VIEW = 16
-
-
-class EvaluationError(ValueError):
-    """An estimator cannot be evaluated on a data set; the message names what does not fit."""
 
 
 @dataclass(frozen=True)

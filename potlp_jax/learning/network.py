@@ -34,6 +34,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float32, Int8, PRNGKeyArray, UInt8
 
+from potlp_jax.errors import NetworkError
 from potlp_jax.learning.fovea import ABOVE, BAND, BELOW, bands_of, packed, patch, unpacked
 from potlp_jax.world.panorama import CameraConfig, floor_rows
 
@@ -50,10 +51,6 @@ _OUTPUTS = 3
 _FINE = STRIDE // BAND * STRIDE * 3
 _FOVEA_WIDTHS = (256, 128)
 _SLOPE = 0.1
-
-
-class NetworkError(ValueError):
-    """A network's configuration does not fit together, or does not fit what it is asked."""
 
 
 @dataclasses.dataclass(frozen=True)

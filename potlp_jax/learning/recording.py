@@ -18,11 +18,11 @@ from jaxtyping import Array, Bool, Float32, Int32, UInt8
 from scipy import ndimage
 
 from potlp_jax.learning.dataset import JPEG_QUALITY, SAMPLES_SCHEMA, VIEWS_SCHEMA, encode, view_id
-from potlp_jax.learning.questions import Question, draw_questions, question_sheet
 from potlp_jax.learning.labels import true_labels
 from potlp_jax.learning.mistake_costs import WeightBounds, Weights, loss_weights
-from potlp_jax.planning.estimates import Estimates
+from potlp_jax.learning.questions import Question, draw_questions, question_sheet
 from potlp_jax.planning.distances.product import grid_distances
+from potlp_jax.planning.estimates import Estimates
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
 from potlp_jax.world.grid import BeliefMap, World

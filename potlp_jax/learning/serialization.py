@@ -17,17 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, NetworkError, Params
+from potlp_jax.errors import CheckpointError, NetworkError
+from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
 
 ESTIMATOR_FORMAT: str = "potlp-estimator-3"
 """Changed when older files can no longer be read."""
 
 
 _HEADER = "header"
-
-
-class CheckpointError(ValueError):
-    """A checkpoint or an estimator cannot be read or is not of this training; the message names what differs."""
 
 
 def differences(stored: Any, expected: Any, name: str = "") -> list[str]:

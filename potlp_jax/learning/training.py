@@ -20,7 +20,8 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
-from potlp_jax.learning.batches import Batch, Batches, TrainingError, batch_answers, prefetched
+from potlp_jax.errors import TrainingError
+from potlp_jax.learning.batches import Batch, Batches, batch_answers, prefetched
 from potlp_jax.learning.checkpoints import checkpoint_steps, load_checkpoint, save_checkpoint
 from potlp_jax.learning.dataset import Samples
 from potlp_jax.learning.loss import DataScale, Evaluation, Sums, evaluation_of, loss_sums, total_loss

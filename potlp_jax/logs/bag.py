@@ -23,7 +23,7 @@ from rosbags.rosbag2 import Reader as Rosbag2Reader
 from rosbags.rosbag2.storage_mcap import decompress, read_exact, read_string
 from rosbags.typesys.msg import normalize_msgtype
 
-from potlp_jax.logs.errors import LogError
+from potlp_jax.errors import LogError
 
 FORMATS = {".bag": "ROS 1 bag", ".db3": "ROS 2 bag (sqlite3)", ".mcap": "MCAP"}
 """Formats by the ending of their files."""

@@ -11,14 +11,14 @@ import numpy as np
 import pyarrow
 
 from potlp_jax.environments.ros.places import Places
-from potlp_jax.learning.dataset import DatasetError, DatasetMetadata, finished_shards, write_shard
+from potlp_jax.errors import DatasetError, LogError
+from potlp_jax.learning.dataset import DatasetMetadata, finished_shards, write_shard
+from potlp_jax.learning.mistake_costs import WeightBounds
 from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views
-from potlp_jax.learning.mistake_costs import WeightBounds
 from potlp_jax.logs.drive import Drive, Eyes
-from potlp_jax.logs.errors import LogError
-from potlp_jax.trials.robot import DIAGONAL
 from potlp_jax.trials.loop import versions
+from potlp_jax.trials.robot import DIAGONAL
 from potlp_jax.world.panorama import CameraConfig, Disturbance
 
 

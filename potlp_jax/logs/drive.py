@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from potlp_jax.environments.ros.map_files import GridFrame
 from potlp_jax.environments.ros.places import Places, place_letters
-from potlp_jax.logs.errors import LogError
+from potlp_jax.errors import LogError
 from potlp_jax.logs.log import Log, MapMessage, Picture
 from potlp_jax.logs.pictures import match_pictures, vertical_field
 from potlp_jax.logs.poses import Cell, drive_path, read_poses

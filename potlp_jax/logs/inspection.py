@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from potlp_jax.logs.errors import LogError
+from potlp_jax.errors import LogError
 from potlp_jax.logs.log import (
     IMAGE_TYPE,
     MAP_TYPE,

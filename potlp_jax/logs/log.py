@@ -22,8 +22,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from potlp_jax.environments.ros.map_files import OCCUPIED, GridFrame
+from potlp_jax.errors import LogError
 from potlp_jax.logs.bag import RawMessage, open_bag
-from potlp_jax.logs.errors import LogError
 from potlp_jax.logs.transforms import Edge, Quaternion, Transforms, yaw_of
 
 MAP_TYPE = "nav_msgs/msg/OccupancyGrid"

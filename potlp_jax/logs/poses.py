@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64, Int64
 from scipy import ndimage
 
 from potlp_jax.environments.ros.places import component_labels
-from potlp_jax.logs.errors import LogError
+from potlp_jax.errors import LogError
 from potlp_jax.logs.log import SECOND, Log
 from potlp_jax.logs.working_grid import WorkingGrid
 

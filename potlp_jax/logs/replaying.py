@@ -7,19 +7,19 @@ import jax
 import numpy as np
 from jaxtyping import Array, Int32, PRNGKeyArray, UInt8
 
+from potlp_jax.errors import LogError
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.logs.drive import Drive, Eyes
-from potlp_jax.logs.errors import LogError
 from potlp_jax.logs.poses import Cell
-from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.distances.paths import KnownPath
+from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy
+from potlp_jax.task.task import Task
+from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.loop import Loop, versions
 from potlp_jax.trials.record import LOG_PREFIX, NEVER_SEEN, Outcome, Trial
 from potlp_jax.trials.robot import DIAGONAL, Leg, Stop
-from potlp_jax.task.task import Task
-from potlp_jax.trials.loop import Loop, versions
-from potlp_jax.trials.config import TrialConfig
 from potlp_jax.world.grid import BeliefMap
 from potlp_jax.world.panorama import CameraConfig
 

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from potlp_jax.environments.ros.map_files import BOUNDARY_DECIMALS, GridFrame
 from potlp_jax.environments.ros.ros_map import inflate, resample
-from potlp_jax.logs.errors import LogError
+from potlp_jax.errors import LogError
 from potlp_jax.logs.log import Log, MapMessage
 
 RESOLUTION = 0.2

@@ -19,12 +19,12 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
 from potlp_jax.environments.ros.map_files import FREE, OCCUPIED, UNKNOWN, GridFrame
-from potlp_jax.logs.errors import LogError
+from potlp_jax.errors import LogError
 from potlp_jax.logs.log import FIXED_TOPIC, IMAGE_TYPE, MAP_TYPE, ODOMETRY_TYPE, SECOND, TRANSFORM_TYPES, typestore
 from potlp_jax.logs.transforms import Quaternion, quaternion_of
+from potlp_jax.trials.config import trial_config_from_dict
 from potlp_jax.trials.record import Trial, belief_seen_by
 from potlp_jax.trials.robot import DIAGONAL, photograph
-from potlp_jax.trials.config import trial_config_from_dict
 from potlp_jax.world.equirectangular import to_equirectangular
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.panorama import CameraConfig

@@ -1,0 +1,1 @@
+"""The paper's section III: from estimates to a choice."""

@@ -27,7 +27,7 @@ def frontier_subgoals(
     task: TaskArrays,
     config: DecisionConfig = DecisionConfig(),
 ) -> Subgoals:
-    """The subgoals of a belief, nearest first by product distance from the robot (MODEL.md section 6).
+    """The subgoals of a belief, nearest first by product distance from the robot (docs/model.md section 6).
 
     Args:
       belief: what is known of the map.

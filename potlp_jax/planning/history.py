@@ -204,7 +204,7 @@ def terms_of_all(tables: ActionTables, history: History) -> ActionTerms:
 
 
 def distance_of(rows: ActionRow, history: History, way: Float32[Array, "*A"]) -> Float32[Array, "*A"]:
-    """D: the way and what is owed; nothing for going on beyond the same subgoal in the same state (MODEL.md 5)."""
+    """D (docs/model.md section 5): the way and what is owed; nothing for going on beyond the same subgoal and state."""
     inside = (rows.subgoal == history.place) & (rows.from_state == history.state)
     return jnp.where(inside, 0.0, way + history.owed)
 
@@ -214,7 +214,7 @@ def knowledge_terms(
 ) -> tuple[Float32[Array, "*A"], Float32[Array, "*A"], Bool[Array, "*A"]]:
     """P_S, R_S and whether the condition is known to hold, from the masks of each action's own subgoal.
 
-    Cubes are tried in order of R_S (MODEL.md section 3): P = 1 - Π(1 - P_i), R_S = Σ R_i P_i Π_{j<i}(1 - P_j) / P,
+    Cubes are tried in order of R_S (docs/model.md section 3): P = 1 - Π(1 - P_i), R_S = Σ R_i P_i Π_{j<i}(1 - P_j) / P,
     with P_i = 1 or 0 where cube i is known. The first cube that can succeed is taken as it is, so that padding does
     not change a result by rounding.
     """

@@ -20,11 +20,7 @@ from flax import struct
 from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
 from potlp_jax.planning.commitment import Intention, intention_of, keep_on
-from potlp_jax.planning.estimates import Estimates, Estimator, ask
-from potlp_jax.planning.history import ActionTerms, action_terms, initial_history
 from potlp_jax.planning.distances.paths import KnownPath, shortest_path
-from potlp_jax.planning.search.api import Plan, plan_actions
-from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.distances.product import (
     distance_table,
     one_letter_successors,
@@ -33,8 +29,12 @@ from potlp_jax.planning.distances.product import (
     reachable_cells,
     reachable_states,
 )
-from potlp_jax.planning.search.graph import SearchConfig
 from potlp_jax.planning.distances.sweeping import Wildcard
+from potlp_jax.planning.estimates import Estimates, Estimator, ask
+from potlp_jax.planning.history import ActionTerms, action_terms, initial_history
+from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.search.api import Plan, plan_actions
+from potlp_jax.planning.search.graph import SearchConfig
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_ACTION, NO_STATE, Status, status_array, status_if
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
@@ -42,7 +42,7 @@ from potlp_jax.world.grid import BeliefMap
 
 
 class Policy(StrEnum):
-    """The planners that a trial can run (MODEL.md section 8)."""
+    """The planners that a trial can run (docs/model.md section 8)."""
 
     KNOWN_MAP = "known-map"
     BASELINE = "baseline"
@@ -70,7 +70,7 @@ class MoveKind:
 @dataclasses.dataclass(frozen=True)
 class DecisionConfig:
     """Settings of a decision. ``path_horizon`` is the number of moves that a decision hands out at most; None means
-    ``4 (H + W)``. ``dead_end_factor`` times ``(H + W)`` times the resolution is the cost of a dead end (MODEL.md 5).
+    ``4 (H + W)``. ``dead_end_factor`` times ``(H + W)`` times the resolution is the cost of a dead end (docs/model.md).
     ``commitment`` is by how much, as a fraction of its expected cost, another action must be cheaper before a robot on
     its way turns to it; 0: at once, as published."""
 
@@ -225,7 +225,7 @@ def planning_problem(situation: Situation, estimates: Estimates, config: Decisio
 def _subgoal_travel(
     situation: Situation, estimates: Estimates
 ) -> tuple[Float32[Array, "S Z S Z"], Float32[Array, "S Z"]]:
-    """Costs from each subgoal in each state, after re-entering the subgoal's cell (MODEL.md section 5)."""
+    """Costs from each subgoal in each state, after re-entering the subgoal's cell (docs/model.md section 5)."""
     task, subgoals = situation.task, situation.subgoals
     count, states = subgoals.mask.shape[0], task.transitions.shape[0]
     reentered = situation.transitions[subgoals.cells[:, 0], subgoals.cells[:, 1]]
@@ -355,7 +355,7 @@ def _optimistic(situation: Situation, config: DecisionConfig) -> Move:
 
 
 def _cut_before_unobserved(path: KnownPath, belief: BeliefMap) -> KnownPath:
-    """The part of a path before its first unobserved cell: a path never enters one (MODEL.md section 7)."""
+    """The part of a path before its first unobserved cell: a path never enters one (docs/model.md section 7)."""
     hidden = belief.unknown[path.cells[:, 0], path.cells[:, 1]]
     index = jnp.arange(hidden.shape[0], dtype=jnp.int32)
     first_hidden = jnp.min(jnp.where(hidden, index, path.length + 1))

@@ -10,12 +10,9 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float32, Int32
 
+from potlp_jax.errors import ProblemError
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_CLASS
-
-
-class ProblemError(ValueError):
-    """A planning problem holds a value that the model does not allow; the message names field, index and value."""
 
 
 @struct.dataclass(kw_only=True)

@@ -9,12 +9,12 @@ import jax
 import numpy as np
 from jaxtyping import Int32, PRNGKeyArray
 
-from potlp_jax.trials.batch import Finished
 from potlp_jax.planning.distances.sweeping import NEIGHBOURS
-from potlp_jax.trials.record import Trial
 from potlp_jax.sweep.specification import configuration_hash
 from potlp_jax.sweep.store import Item, Row
+from potlp_jax.trials.batch import Finished
 from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.record import Trial
 from potlp_jax.world.grid import World
 
 

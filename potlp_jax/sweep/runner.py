@@ -1,6 +1,6 @@
 """Runs a sweep: workers, one pinned to each core, take trials from the store until none is left.
 
-Each worker looks at the store, claims a few trials at a time and runs them as one batch (``potlp_jax.trials.batch``), in
+Each worker looks at the store, claims a few trials at a time and runs them as one batch (``trials.batch``), in
 which a trial that has ended makes room for the next. A row is written as soon as its trial has ended. A worker needs
 nothing else, so workers may be killed, started again, or belong to several commands on one store.
 """
@@ -17,18 +17,19 @@ from pathlib import Path
 
 import jax
 
-from potlp_jax.trials.batch import Finished, Start, run_batch
 from potlp_jax.environments import Generator, make
 from potlp_jax.environments.splits import MAX_INDEX, world_key
+from potlp_jax.errors import WorldError
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, read_estimator
 from potlp_jax.planning.policies import Policy
-from potlp_jax.trials.record import Outcome, Trial
 from potlp_jax.sweep.rows import batch_row
 from potlp_jax.sweep.specification import Cell, Specification
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store
 from potlp_jax.task.task import Task, TaskArrays, TaskSizes
+from potlp_jax.trials.batch import Finished, Start, run_batch
 from potlp_jax.trials.loop import run_trial, trial_key, versions
-from potlp_jax.world.grid import World, WorldError
+from potlp_jax.trials.record import Outcome, Trial
+from potlp_jax.world.grid import World
 
 RESULTS: str = "results.sqlite"
 """Name of the store in a sweep's folder."""

@@ -28,14 +28,10 @@ import yaml
 
 from potlp_jax.environments import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
+from potlp_jax.errors import SpecificationError, WorldError
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig, trial_config_from_dict, with_settings
-from potlp_jax.world.grid import WorldError
-
-
-class SpecificationError(ValueError):
-    """A specification cannot be used: names the file, the entry and what to do."""
 
 
 @dataclasses.dataclass(frozen=True)

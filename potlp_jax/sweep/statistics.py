@@ -26,7 +26,7 @@ LOSSES: Status = Status.SUBGOAL_OVERFLOW | Status.TREE_OVERFLOW | Status.DEPTH_O
 
 UNRELIABLE: Status = Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW | Status.NOT_CONVERGED
 """Losses after which a trial is not what its planner would have done. It is never averaged in. (That only the nearest
-subgoals are kept is part of the model, MODEL.md section 6.)"""
+subgoals are kept is part of the model, docs/model.md section 6.)"""
 
 CONFIDENCE: float = 0.95
 RESAMPLES: int = 9_999

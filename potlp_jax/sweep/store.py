@@ -17,16 +17,14 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from potlp_jax.errors import StoreError
+
 FORMAT = "potlp-sweep-2"
 LEASE: float = 600.0
 """Seconds after which a claim of another host is void."""
 
 PATIENCE: float = 60.0
 """Seconds to wait for another process that is writing."""
-
-
-class StoreError(ValueError):
-    """A store cannot be used: names the file, what is wrong, and what to do."""
 
 
 POSSIBLE: str = "possible"

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Int, Int32
 
-from potlp_jax.task.formula import Formula, TaskError, load_spot
+from potlp_jax.errors import TaskError
+from potlp_jax.task.formula import Formula, load_spot
 
 
 @dataclass(frozen=True, eq=False)

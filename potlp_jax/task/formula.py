@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from potlp_jax.errors import TaskError
+
 MAX_PROPOSITIONS: int = 16
 """Propositions of a task, at most: tables are dense over ``2 ** n`` letters."""
 
@@ -21,10 +23,6 @@ _WORD_OR_STRING = re.compile(r'"(?:[^"\\]|\\.)*"|[A-Za-z_][A-Za-z0-9_.]*|.')
 _OPERATOR_PREFIX = re.compile(r"^[FGX]+")
 _CARET_INDENT = 4
 """Columns that Spot's error report puts before the formula (``>>> ``)."""
-
-
-class TaskError(ValueError):
-    """What is wrong with a task: its formula, its automaton or its propositions."""
 
 
 def error_at(message: str, text: str, column: int) -> TaskError:

@@ -14,9 +14,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Int
 
+from potlp_jax.errors import TaskError
 from potlp_jax.task.automaton import Dfa
 from potlp_jax.task.cubes import Phi, minimal_cover
-from potlp_jax.task.formula import MAX_PROPOSITIONS, TaskError
+from potlp_jax.task.formula import MAX_PROPOSITIONS
 
 _TOKEN = re.compile(
     r"""(?P<skip>\s+|/\*.*?\*/)

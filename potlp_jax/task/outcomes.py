@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int32
 
+from potlp_jax.errors import TaskError
 from potlp_jax.task.automaton import Dfa
 from potlp_jax.task.cubes import Phi, cube_letters, hull, minimal_cover
-from potlp_jax.task.formula import TaskError
 
 MAX_CLASSES: int = 4096
 """Outcome classes of a task, at most: each is asked of an estimator, and stored with its letters."""

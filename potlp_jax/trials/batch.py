@@ -18,22 +18,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int32, PRNGKeyArray
 
-from potlp_jax.trials.batch_step import EMPTY, OUTCOMES, Progress, Rules, Scene, begin, step
+from potlp_jax.errors import BatchError
 from potlp_jax.learning.estimator import TrainedEstimator
-from potlp_jax.learning.network import Params
 from potlp_jax.learning.memory import Views
+from potlp_jax.learning.network import Params
 from potlp_jax.planning.policies import Policy
-from potlp_jax.trials.record import Outcome
 from potlp_jax.task.task import TaskArrays
+from potlp_jax.trials.batch_step import EMPTY, OUTCOMES, Progress, Rules, Scene, begin, step
 from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.record import Outcome
 from potlp_jax.world.grid import World
 
 SLOTS: int = 8
 """Trials that run at a time; what is best on a CPU (docs/sweeps.md)."""
-
-
-class BatchError(ValueError):
-    """Trials do not fit into one batch; the message says which and why."""
 
 
 @dataclasses.dataclass(frozen=True)

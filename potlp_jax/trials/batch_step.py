@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float32, Int8, Int16, Int32, Key, PRNGKeyArra
 
 from potlp_jax.learning.estimator import NetworkEstimator
 from potlp_jax.learning.labels import TrueMapEstimator
-from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
 from potlp_jax.learning.memory import Views, remember
+from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
 from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimates, Estimator, ask
 from potlp_jax.planning.policies import (
@@ -32,13 +32,13 @@ from potlp_jax.planning.policies import (
     planned_move,
     planning_problem,
 )
-from potlp_jax.planning.search.api import plan_actions
 from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.search.api import plan_actions
+from potlp_jax.task.task import TaskArrays
+from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.loop import STUCK_REPEATS, planning_key, sensing_key
 from potlp_jax.trials.record import NEVER_SEEN, Outcome
 from potlp_jax.trials.robot import DIAGONAL, Stop, follow, photograph
-from potlp_jax.task.task import TaskArrays
-from potlp_jax.trials.loop import STUCK_REPEATS, planning_key, sensing_key
-from potlp_jax.trials.config import TrialConfig
 from potlp_jax.types import status_array
 from potlp_jax.world.frontiers import Subgoals
 from potlp_jax.world.grid import BeliefMap, World
@@ -149,7 +149,7 @@ def begin(
 
 
 def _arrive(scene: Scene, progress: Progress, config: TrialConfig) -> Progress:
-    """At the place of a decision: whether the trial ends here (MODEL.md section 7), in the order of ``trial.Loop``."""
+    """At the place of a decision: whether the trial ends here (docs/model.md section 7); in the order of ``Loop``."""
     known = jnp.sum(~progress.belief.unknown, dtype=jnp.int32)
     visits = jnp.where(known == progress.known, progress.visits, 0).astype(jnp.int8)
     visits = visits.at[progress.cell[0], progress.cell[1], progress.state].add(jnp.int8(1))

@@ -13,7 +13,7 @@ from potlp_jax.world.sensing import SensorConfig
 
 @dataclasses.dataclass(frozen=True)
 class TrialConfig:
-    """Settings of a trial (MODEL.md section 7).
+    """Settings of a trial (docs/model.md section 7).
 
     ``replan_distance`` is in cells; ``budget_factor`` times the map's ``height + width`` cells may be travelled;
     ``revealed`` starts from the whole map. ``camera`` and ``disturbance`` matter to policies that look.

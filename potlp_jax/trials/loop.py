@@ -19,10 +19,10 @@ from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.history import ActionTerms
 from potlp_jax.planning.policies import Move, MoveKind, Policy, decide
-from potlp_jax.trials.record import ActionRecord, Decision, Outcome, Trial
-from potlp_jax.trials.robot import DIAGONAL, Robot, SimulatedRobot, Stop, as_cell
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.record import ActionRecord, Decision, Outcome, Trial
+from potlp_jax.trials.robot import DIAGONAL, Robot, SimulatedRobot, Stop, as_cell
 from potlp_jax.types import NO_ACTION
 from potlp_jax.world.grid import BeliefMap, World
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int32
 
+from potlp_jax.errors import RecordError
 from potlp_jax.world.grid import (
     BeliefMap,
     World,
@@ -33,12 +34,8 @@ LOG_PREFIX: str = "log:"
 """How the ``environment`` of a trial begins that was made from a robot's log."""
 
 
-class RecordError(ValueError):
-    """A file is not a trial record of this version; the message names the file and what is wrong."""
-
-
 class Outcome(StrEnum):
-    """How a trial ended (MODEL.md section 7); ``UNFINISHED``: the log of a drive ended before the task was decided."""
+    """How a trial ended (docs/model.md section 7); ``UNFINISHED``: the log ended before the task was decided."""
 
     SATISFIED = "satisfied"
     INFEASIBLE = "infeasible"

@@ -6,18 +6,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int32, UInt8
 
+from potlp_jax.errors import CheckpointError, RecordError
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, look
-from potlp_jax.learning.serialization import CheckpointError
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.estimates import Estimator, ask
 from potlp_jax.planning.policies import DecisionConfig, Policy, assess, planning_problem
-from potlp_jax.planning.search.api import Plan, search_tree
 from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.search.api import Plan, search_tree
 from potlp_jax.planning.search.graph import Tree
-from potlp_jax.trials.record import LOG_PREFIX, Decision, RecordError, Trial
-from potlp_jax.trials.robot import photograph
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials.config import TrialConfig, trial_config_from_dict
+from potlp_jax.trials.record import LOG_PREFIX, Decision, Trial
+from potlp_jax.trials.robot import photograph
 from potlp_jax.world.grid import BeliefMap
 from potlp_jax.world.panorama import Disturbance
 

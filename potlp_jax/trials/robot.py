@@ -15,8 +15,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32, PRNGKeyArray, UInt8
 
 from potlp_jax.planning.distances.paths import KnownPath
-from potlp_jax.trials.record import NEVER_SEEN
 from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.record import NEVER_SEEN
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.panorama import CameraConfig, Disturbance, disturb, render
 from potlp_jax.world.sensing import SensorConfig, observe

@@ -11,18 +11,17 @@ from itertools import pairwise
 
 import numpy as np
 
-from potlp_jax.trials.record import NEVER_SEEN, Outcome, Trial
 from potlp_jax.sweep.rows import read_path
-from potlp_jax.sweep.statistics import SATISFIED
 from potlp_jax.sweep.store import Row
 from potlp_jax.task.task import Task
+from potlp_jax.trials.record import NEVER_SEEN, Outcome, Trial
+from potlp_jax.verify.semantics import word_satisfies, word_violates
 from potlp_jax.world.grid import World
 from tests.reference.dijkstra import grid_moves
-from potlp_jax.verify.semantics import word_satisfies, word_violates
 
 
 def problems_of(trial: Trial, task: Task) -> list[str]:
-    """What is wrong with a trial; empty if nothing. Not ending satisfied is wrong only where MODEL.md 7 promises it."""
+    """What is wrong with a trial; empty if nothing. Not ending satisfied is wrong where docs/model.md section 7 promises it."""
     found = [*_moves(trial), *_observation(trial), *_word(trial, task)]
     if trial.outcome is not Outcome.SATISFIED and satisfaction_is_promised(trial, task):
         found.append(f"ended {trial.outcome} although acceptance stays within reach of every state")
@@ -43,7 +42,7 @@ def problems_of_row(row: Row, world: World, propositions: Sequence[str]) -> list
     if cost is None or abs(cost - row.cost) > 1e-6 * max(cost, 1.0):
         problems.append(f"moves of {row.item}: they cost {cost}, the row says {row.cost}")
     word = np.asarray(world.letters)[path[:, 0], path[:, 1]].tolist()
-    if word_satisfies(row.item.task, propositions, word) != (row.outcome == SATISFIED):
+    if word_satisfies(row.item.task, propositions, word) != (row.outcome == Outcome.SATISFIED):
         problems.append(f"outcome of {row.item}: {row.outcome} is not what the word says")
     if len(word) > 1 and word_violates(row.item.task, propositions, word):
         problems.append(f"violates: {row.item}")

@@ -13,8 +13,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from PIL import Image
 
-from potlp_jax.trials.record import NEVER_SEEN, ActionRecord, Decision, Trial
 from potlp_jax.task.task import Task
+from potlp_jax.trials.record import NEVER_SEEN, ActionRecord, Decision, Trial
 from potlp_jax.view.decisions import action_name, rank_actions
 from potlp_jax.view.maps import (
     FREE_UNSEEN,

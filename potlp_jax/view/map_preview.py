@@ -13,9 +13,9 @@ from matplotlib.patches import Patch
 from matplotlib.transforms import Affine2D, blended_transform_factory
 
 from potlp_jax.environments.ros.map_files import GridFrame, OccupancyMap
-from potlp_jax.environments.ros.survey import SPECK
 from potlp_jax.environments.ros.places import component_labels
 from potlp_jax.environments.ros.ros_map import CleanMap, RosMap
+from potlp_jax.environments.ros.survey import SPECK
 from potlp_jax.view.maps import AreaLabel, draw_labels, place_labels
 from potlp_jax.view.style import CHOSEN, FAINT, INK, area_colour, new_figure, rgb
 from potlp_jax.world.grid import World

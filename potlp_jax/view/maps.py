@@ -17,8 +17,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from scipy import ndimage
 
-from potlp_jax.trials.record import NEVER_SEEN, Decision, Trial
 from potlp_jax.task.task import Task
+from potlp_jax.trials.record import NEVER_SEEN, Decision, Trial
 from potlp_jax.view.style import CHOSEN, FAINT, INK, ROBOT, area_colour, new_figure, rgb, state_colour
 from potlp_jax.world.grid import World
 

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from potlp_jax.trials.record import Decision, Trial
 from potlp_jax.task.task import Task
+from potlp_jax.trials.record import Decision, Trial
 from potlp_jax.view.decisions import action_name, describe_decision, rank_actions
 from potlp_jax.view.maps import map_extent
 from potlp_jax.view.style import area_colour, state_colour

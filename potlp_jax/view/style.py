@@ -12,6 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
+from potlp_jax.errors import PictureError
+
 STATE_COLOURS: tuple[str, ...] = (
     "#0072B2",
     "#D55E00",
@@ -47,10 +49,6 @@ CHOSEN_ROW = "#FCE1F0"
 ROBOT = "#FFD400"
 
 DOTS_PER_INCH: int = 110
-
-
-class PictureError(ValueError):
-    """A picture cannot be written as asked; the message names the file and what to do."""
 
 
 def state_colour(state: int) -> str:

@@ -1,0 +1,1 @@
+"""What is there, and what has been sensed of it."""

@@ -1,4 +1,4 @@
-"""Frontiers: where known space ends, as connected components, one subgoal each (MODEL.md section 6).
+"""Frontiers: where known space ends, as connected components, one subgoal each (docs/model.md section 6).
 
 Components of any shape and number are found exactly: the cells of the frontier are listed, and every pass over them
 runs in blocks of the list, so that the cost follows the length of the frontier and not the size of the grid.

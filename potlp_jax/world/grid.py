@@ -19,15 +19,13 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int, Int8, Int32, Num, Shaped, UInt8
 
+from potlp_jax.errors import WorldError
+
 MAX_LETTER: int = 2**16 - 1
 """Largest letter: sixteen propositions."""
 
 _FLOOR_COLOUR = (150, 150, 150)
 _WALL_COLOUR = (205, 200, 190)
-
-
-class WorldError(ValueError):
-    """A world, or the configuration of a world, is not valid; the message says what and where."""
 
 
 @struct.dataclass(kw_only=True)

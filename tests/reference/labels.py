@@ -1,4 +1,4 @@
-"""Slow and obvious true labels of MODEL.md section 6: Dijkstra over (cell, phase) of the path that a subgoal allows."""
+"""Slow and obvious true labels of docs/model.md section 6: Dijkstra over (cell, phase) of an allowed path."""
 
 import math
 

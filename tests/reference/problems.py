@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from potlp_jax.planning.search.api import plan_actions
 from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.search.api import plan_actions
 from potlp_jax.task.task import Task, TaskSizes
 
 FORMULAS = (

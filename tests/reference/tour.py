@@ -13,9 +13,9 @@ from potlp_jax.logs.drive import read_drive
 from potlp_jax.logs.log import SECOND, Log, LogConfig, typestore
 from potlp_jax.logs.working_grid import GridConfig
 from potlp_jax.logs.writing import BagFormat, labels_text, write_drive
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import NEVER_SEEN
 from potlp_jax.trials.robot import photograph
-from potlp_jax.trials.config import TrialConfig
 from potlp_jax.world.grid import BeliefMap
 from potlp_jax.world.panorama import CameraConfig, Disturbance
 from potlp_jax.world.sensing import SensorConfig, observe

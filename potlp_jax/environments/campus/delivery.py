@@ -20,6 +20,7 @@ import jax
 import numpy as np
 from jaxtyping import Int, PRNGKeyArray
 
+from potlp_jax.environments.base import host_generators
 from potlp_jax.environments.campus.furnishing import (
     MANY_DOORS,
     NO_ROOM,
@@ -33,8 +34,8 @@ from potlp_jax.environments.campus.furnishing import (
     furnish,
     missing_kinds,
 )
-from potlp_jax.environments.base import host_generators
-from potlp_jax.world.grid import World, WorldError
+from potlp_jax.errors import WorldError
+from potlp_jax.world.grid import World
 
 _HALLWAYS = 0
 _MIN_SIDE = 5

@@ -8,7 +8,8 @@
                                                    opening without a door; features DOUBLE: a double door
         portals > portal                           linesegment: the id of a door; target > id, id: the rooms it joins
 
-What the files leave open or get wrong, and what is done about it, is told in ``potlp_jax.environments.campus.floor_plans``.
+What the files leave open or get wrong, and what is done about it, is told in
+``potlp_jax.environments.campus.floor_plans``.
 """
 
 import math
@@ -19,8 +20,9 @@ from importlib import resources
 from pathlib import Path
 
 from potlp_jax.environments.campus.furnishing import Kind
-from potlp_jax.environments.ros.map_files import MapError, read_yaml
+from potlp_jax.environments.ros.map_files import read_yaml
 from potlp_jax.environments.ros.places import Point
+from potlp_jax.errors import MapError
 
 _METRES = {"cm": 0.01, "m": 1.0, "mm": 0.001}
 

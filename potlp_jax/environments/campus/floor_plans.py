@@ -28,6 +28,8 @@ import jax
 import numpy as np
 from jaxtyping import Int, Int32, PRNGKeyArray
 
+from potlp_jax.environments.base import host_generators
+from potlp_jax.environments.campus.floor_plan_xml import FloorPlan, PlanDoor, PlanRoom, read_kinds, read_plan
 from potlp_jax.environments.campus.furnishing import (
     MANY_DOORS,
     NO_ROOM,
@@ -40,12 +42,11 @@ from potlp_jax.environments.campus.furnishing import (
     missing_kinds,
     name_kinds,
 )
-from potlp_jax.environments.base import host_generators
-from potlp_jax.environments.campus.floor_plan_xml import FloorPlan, PlanDoor, PlanRoom, read_kinds, read_plan
-from potlp_jax.environments.ros.map_files import GridFrame, MapError, MapWarning
 from potlp_jax.environments.options import parse_options
+from potlp_jax.environments.ros.map_files import GridFrame
 from potlp_jax.environments.ros.places import Polygon, component_labels
 from potlp_jax.environments.splits import FLOOR_PLAN_PREFIX
+from potlp_jax.errors import MapError, MapWarning
 from potlp_jax.world.grid import World
 
 DOOR_WIDTH = 0.9

@@ -25,7 +25,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32, PRNGKeyArray
 
 from potlp_jax.environments.base import host_generators
-from potlp_jax.world.grid import Appearance, World, WorldError, make_world
+from potlp_jax.errors import WorldError
+from potlp_jax.world.grid import Appearance, World, make_world
 
 Cell = tuple[int, int]
 

@@ -1,0 +1,1 @@
+"""Worlds on maps that robots made: reading, cleaning, surveying and labelling them."""

@@ -37,6 +37,8 @@ import numpy as np
 import yaml
 from jaxtyping import Bool, Float64, Int8, Int64, Shaped
 
+from potlp_jax.errors import MapError, MapWarning
+
 MODES = ("trinary", "scale", "raw")
 OCCUPIED = 100
 FREE = 0
@@ -59,17 +61,6 @@ BOUNDARY_DECIMALS = 6
 _REQUIRED_KEYS = ("image", "resolution", "origin")
 _OPTIONAL_KEYS = ("mode", "negate", "occupied_thresh", "free_thresh")
 _BOOLEANS = {"0": False, "1": True, "false": False, "true": True, "no": False, "yes": True}
-
-
-class MapError(ValueError):
-    """A map, or what is placed in it, cannot be used: names the file, the field, and what to do."""
-
-    def __init__(self, file: Path | str, field: str, message: str) -> None:
-        super().__init__(f"{file}: {field}: {message}" if field else f"{file}: {message}")
-
-
-class MapWarning(UserWarning):
-    """A map can be used but probably does not mean what it says."""
 
 
 @dataclass(frozen=True)

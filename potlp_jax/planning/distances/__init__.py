@@ -1,0 +1,1 @@
+"""Shortest distances and paths through map and automaton."""

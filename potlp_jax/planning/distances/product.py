@@ -1,4 +1,4 @@
-"""Shortest distances and paths through the product of known space and the task automaton (MODEL.md section 2).
+"""Shortest distances and paths through the product of known space and the task automaton (docs/model.md section 2).
 
 Product states are ``(cell, z)``. Grid moves are 8-connected, cost 1 and √2 times the resolution and never cut a corner:
 a diagonal move needs both cells beside it free. Entering a cell in state ``z`` leads to ``transitions[cell, z]``.
@@ -15,8 +15,8 @@ from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Bool, Float32, Int32
 
 from potlp_jax.planning.distances.portals import find_active_cells, portals_pay, table_by_portals
-from potlp_jax.task.relations import transitive_closure
 from potlp_jax.planning.distances.sweeping import Links, Sweeper, Wildcard
+from potlp_jax.task.relations import transitive_closure
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_STATE
 
@@ -30,7 +30,7 @@ def product_transitions(
     """State of the automaton after entering each cell from each state.
 
     ``NO_STATE`` where the cell is not ``known_free`` (True = may be entered) or the letter leads to a trap state:
-    such moves do not exist in the product (MODEL.md section 2).
+    such moves do not exist in the product (docs/model.md section 2).
     """
     following = jnp.moveaxis(task.transitions[:, letters], 0, -1)
     allowed = known_free[:, :, None] & ~task.trap[following] & task.state_mask[None, None, :]

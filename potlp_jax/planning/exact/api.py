@@ -19,12 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from potlp_jax.errors import ProblemTooLargeError
 from potlp_jax.planning.exact.bounds import GraphBounds
 from potlp_jax.planning.exact.graph import Graph
-from potlp_jax.planning.exact.knowledge import Knowledge, ProblemTooLargeError
+from potlp_jax.planning.exact.knowledge import Knowledge
+from potlp_jax.planning.exact.rollouts import Rollouts
 from potlp_jax.planning.exact.search import Search
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.exact.rollouts import Rollouts
 from potlp_jax.types import NO_ACTION, Status
 
 __all__ = ["Bounds", "ExactSolution", "ProblemTooLargeError", "bound_exact", "solve_exact"]

@@ -9,6 +9,7 @@ References:
 import numpy as np
 from jaxtyping import Int32, Int64
 
+from potlp_jax.errors import ProblemTooLargeError
 from potlp_jax.planning.exact.rollouts import Rollouts, Settled
 
 ACCEPTED = -2
@@ -17,10 +18,6 @@ NOWHERE = -1
 
 _MOST_ROWS = 300_000
 """Rows of knowledge at most."""
-
-
-class ProblemTooLargeError(ValueError):
-    """The problem has more states than the exact solver was allowed to look at."""
 
 
 class Knowledge:

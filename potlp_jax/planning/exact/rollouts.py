@@ -144,7 +144,7 @@ class Rollouts:
         return Position(subgoal, state, knowledge, here)
 
     def combined(self, subgoal: int, condition: int, settled: Settled) -> Terms:
-        """P_S, R_S, R_F of a condition from its cubes, tried in order of R_S (MODEL.md section 3)."""
+        """P_S, R_S, R_F of a condition from its cubes, tried in order of R_S (docs/model.md section 3)."""
         probabilities, success_costs, failure_costs = (values[subgoal] for values in self._estimates)
         classes = self._classes[condition]
         certain = bool(settled.holds >> condition & 1)

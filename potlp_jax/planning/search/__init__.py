@@ -1,0 +1,1 @@
+"""The search over histories: what to attempt first, what next after success and after failure."""

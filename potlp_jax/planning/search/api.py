@@ -31,8 +31,8 @@ from flax import struct
 from jaxtyping import Array, Float32, Int32, Key, PRNGKeyArray, UInt32
 
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.search.graph import SearchConfig, Tree, new_search, prepare
 from potlp_jax.planning.search.best_first import choose, is_open, simulate
+from potlp_jax.planning.search.graph import SearchConfig, Tree, new_search, prepare
 
 
 @struct.dataclass(kw_only=True)

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
-from potlp_jax.planning.search.guess import Rule, guess_outcomes, make_rule
 from potlp_jax.planning.history import (
     ActionTables,
     History,
@@ -25,6 +24,7 @@ from potlp_jax.planning.history import (
 )
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.arrays import least_of_each, mix, pack_rows
+from potlp_jax.planning.search.guess import Rule, guess_outcomes, make_rule
 from potlp_jax.task.relations import transitive_closure
 from potlp_jax.types import NO_STATE
 

@@ -5,12 +5,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from potlp_jax.environments.ros.map_files import (
-    DEFAULT_FREE_THRESH,
-    DEFAULT_OCCUPIED_THRESH,
-    GridFrame,
-    MapError,
-)
+from potlp_jax.environments.ros.map_files import DEFAULT_FREE_THRESH, DEFAULT_OCCUPIED_THRESH, GridFrame
+from potlp_jax.errors import MapError
 
 FREE_GREY = 254
 OCCUPIED_GREY = 0

@@ -1,6 +1,6 @@
 """Worlds on real buildings: a ROS map, cleaned until it can serve as the truth, with propositions placed in metres.
 
-``map:FILE.yaml`` takes the propositions from ``FILE.places.yaml`` beside it (`potlp_jax.environments.ros.places`). Options
+``map:FILE.yaml`` takes the propositions from ``FILE.places.yaml`` beside it (`environments.ros.places`). Options
 follow after commas: ``map:FILE.yaml,places=OTHER.yaml,resolution=0.2,radius=0.1``. Names of files hold no comma.
 
 A raw map does not describe a closed building: pixels are free that no robot reached, and free space touches unknown
@@ -33,9 +33,10 @@ from jaxtyping import Bool, Int, Int32, PRNGKeyArray, Shaped
 from scipy import ndimage
 
 from potlp_jax.environments.base import host_generators
-from potlp_jax.environments.ros.map_files import GridFrame, MapError, MapWarning, OccupancyMap, load_map
 from potlp_jax.environments.options import parse_options
+from potlp_jax.environments.ros.map_files import GridFrame, OccupancyMap, load_map
 from potlp_jax.environments.ros.places import Places, Point, component_labels, load_places, nearest_free, place_letters
+from potlp_jax.errors import MapError, MapWarning
 from potlp_jax.world.grid import World, make_world
 
 PREFIX = "map:"
@@ -98,7 +99,7 @@ class CutOff:
 
 NARROW_DOORS: Mapping[str, Any] = MappingProxyType({"decision": {"frontiers": {"min_size": 1}}})
 """Settings of trials: after resampling, a door of a real building may be as narrow as one cell, and a frontier is to be
-dropped only where it is smaller than any passage (MODEL.md section 6)."""
+dropped only where it is smaller than any passage (docs/model.md section 6)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,85 @@
+"""What goes wrong with inputs and files, under one base class: one handler in the command line catches them all.
+
+A message names what is wrong, where, and what to do. Anything that is not a ``PotlpError`` is a fault of the program.
+"""
+
+from pathlib import Path
+
+
+class PotlpError(ValueError):
+    """Base of all errors about what was given: a task, a map, a file, a setting."""
+
+
+class PotlpWarning(UserWarning):
+    """Base of all remarks on what was given: it can be used, and something about it should be known."""
+
+
+class TaskError(PotlpError):
+    """What is wrong with a task: its formula, its automaton or its propositions."""
+
+
+class WorldError(PotlpError):
+    """A world, or the configuration of a world, is not valid; the message says what and where."""
+
+
+class MapError(PotlpError):
+    """A map, or what is placed in it, cannot be used: names the file, the field, and what to do."""
+
+    def __init__(self, file: Path | str, field: str, message: str) -> None:
+        super().__init__(f"{file}: {field}: {message}" if field else f"{file}: {message}")
+
+
+class MapWarning(PotlpWarning):
+    """A map can be used but probably does not mean what it says."""
+
+
+class ProblemError(PotlpError):
+    """A planning problem holds a value that the model does not allow; the message names field, index and value."""
+
+
+class ProblemTooLargeError(PotlpError):
+    """The problem has more states than the exact solver was allowed to look at."""
+
+
+class NetworkError(PotlpError):
+    """A network's configuration does not fit together, or does not fit what it is asked."""
+
+
+class DatasetError(PotlpError):
+    """A dataset cannot be read, or not be continued; the message says which file and what to do."""
+
+
+class TrainingError(PotlpError):
+    """The data cannot be trained on, or training has diverged; the message says what to do."""
+
+
+class CheckpointError(PotlpError):
+    """A checkpoint or an estimator cannot be read or is not of this training; the message names what differs."""
+
+
+class EvaluationError(PotlpError):
+    """An estimator cannot be evaluated on a data set; the message names what does not fit."""
+
+
+class RecordError(PotlpError):
+    """A file is not a trial record of this version; the message names the file and what is wrong."""
+
+
+class BatchError(PotlpError):
+    """Trials do not fit into one batch; the message says which and why."""
+
+
+class SpecificationError(PotlpError):
+    """A specification cannot be used: names the file, the entry and what to do."""
+
+
+class StoreError(PotlpError):
+    """A store cannot be used: names the file, what is wrong, and what to do."""
+
+
+class LogError(PotlpError):
+    """A log cannot be used: names the file or topic, what is wrong, and what to do."""
+
+
+class PictureError(PotlpError):
+    """A picture cannot be written as asked; the message names the file and what to do."""
