@@ -36,7 +36,7 @@ def _json(result):
 def recorded(tmp_path_factory) -> Path:
     """A trial of the toy environment with everything that `potlp run` writes."""
     folder = tmp_path_factory.mktemp("run")
-    result = _potlp("run", "toy", "-t", "2", "--policy", "oracle", "--seed", "3", "--out", folder, *FAST)
+    result = _potlp("run", "toy", "-t", "2", "--policy", "oracle", "--world", "3", "--out", folder, *FAST)
     assert result.exit_code == 0, result.output
     return folder
 
@@ -104,7 +104,7 @@ def test_max_positive_literals_reaches_the_task():
         (("run", "toy", "--task", "F dragon"), "dragon"),
         (("run", "toy", "--policy", "clever"), "known-map, baseline"),
         (("run", "toy", "--split", "holiday"), "validation"),
-        (("run", "toy", "--seed", "999999999999"), "--seed"),
+        (("run", "toy", "--world", "999999999999"), "--world"),
         (("compare", "toy", "--policies", "oracle,clever"), "clever"),
         (("run", "toy", "--policy", "potlp"), "no estimator is shipped for the propositions goal"),
         (("run", "firefighting", "--estimator", "nowhere.npz"), "nowhere.npz"),
@@ -121,7 +121,7 @@ def test_bad_input_is_one_message_and_exit_code_2(arguments, message):
 
 
 def test_bad_options_have_exit_code_2():
-    assert _potlp("run", "toy", "--seed", "-1").exit_code == 2
+    assert _potlp("run", "toy", "--world", "-1").exit_code == 2
     assert _potlp("compare", "toy", "--trials", "0").exit_code == 2
     assert _potlp("run").exit_code == 2
     assert _potlp("dance").exit_code == 2
@@ -141,23 +141,22 @@ def test_run_writes_record_picture_and_animation(recorded):
         assert animation.n_frames == len(trial.decisions) + 1
 
 
-@pytest.mark.parametrize("command", ["run", "compare"])
-def test_trials_have_the_key_of_their_world_in_a_sweep(monkeypatch, command):
+def test_a_trial_has_the_key_of_its_world_in_a_sweep(monkeypatch):
     keys = []
 
     def run_trial(world, task, policy, key, *rest, **named):
         keys.append(key)
         raise WorldError("seen")
 
-    monkeypatch.setattr(f"potlp_jax.cli.{command}.run_trial", run_trial)
-    _potlp(command, "toy", "--policies" if command == "compare" else "--policy", "baseline", "--seed", "3")
+    monkeypatch.setattr("potlp_jax.trials.loop.run_trial", run_trial)
+    _potlp("run", "toy", "--policy", "baseline", "--world", "3")
     assert (keys[0] == jax.random.fold_in(jax.random.key(0), 3)).all()
 
 
 def test_run_as_json_is_the_summary(recorded, tmp_path):
     data = _json(
         _potlp(
-            *("run", "toy", "-t", "2", "--policy", "oracle", "--seed", "3", "--out", tmp_path / "new"),
+            *("run", "toy", "-t", "2", "--policy", "oracle", "--world", "3", "--out", tmp_path / "new"),
             *("--no-animation", "--json", *FAST),
         )
     )
@@ -238,18 +237,41 @@ def test_compare_reports_pairs_and_writes_its_files(tmp_path):
     )
     data = _json(result)
     assert data == json.loads((tmp_path / "compare.json").read_text())
-    assert (data["worlds"], data["seeds"], data["redrawn"]) == (3, [0, 1, 2], 0)
-    assert [row["policy"] for row in data["satisfied"]["rows"]] == ["known-map", "baseline", "oracle"]
+    (cell,) = data["cells"]
+    assert (cell["worlds"], cell["world_numbers"], cell["redrawn"]) == (3, [0, 1, 2], 0)
+    assert [row["policy"] for row in cell["satisfied"]["rows"]] == ["known-map", "baseline", "oracle"]
     with (tmp_path / "trials.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 9
     oracle = [float(row["cost"]) for row in rows if row["policy"] == "oracle"]
-    assert data["charged"]["rows"][2]["mean_cost"] == pytest.approx(sum(oracle) / 3)
+    assert cell["charged"]["rows"][2]["mean_cost"] == pytest.approx(sum(oracle) / 3)
     # 20 (H + W) on the toy's 9 by 15 cells.
     assert {float(row["budget"]) for row in rows} == {480.0}
-    assert "how trials ended" in (tmp_path / "table.txt").read_text()
+    assert "3 of 3" in (tmp_path / "table.txt").read_text()
     assert Image.open(tmp_path / "scatter.png").size[0] > 400
-    assert "world 2" in result.stderr
+    assert "9 of 9 trials" in result.stderr
+
+
+def test_a_comparison_is_a_sweep_that_the_other_commands_show(tmp_path):
+    command = (
+        "compare",
+        "toy",
+        "-t",
+        "2",
+        "--policies",
+        "baseline",
+        "--trials",
+        "2",
+        "--world",
+        "4",
+        "--out",
+        tmp_path,
+    )
+    compared = _json(_potlp(*command, "--json"))
+    assert _json(_potlp("sweep", "show", tmp_path, "--json")) == compared
+    assert compared["cells"][0]["world_numbers"] == [4, 5]
+    longer = _json(_potlp(*command, "--json", "--trials", "3"))
+    assert longer["cells"][0]["world_numbers"] == [4, 5, 6]
 
 
 def test_impossible_worlds_are_redrawn(monkeypatch):
@@ -266,13 +288,13 @@ def test_impossible_worlds_are_redrawn(monkeypatch):
     monkeypatch.setattr(Toy, "generate", generate)
     assert ToyConfig().height == 9
     data = _json(_potlp("compare", "toy", "-t", "2", "--policies", "baseline", "--trials", "2", "--json"))
-    assert (data["seeds"], data["redrawn"]) == ([2, 3], 2)
+    assert (data["cells"][0]["world_numbers"], data["cells"][0]["redrawn"]) == ([2, 3], 2)
 
 
 def test_task_that_is_never_possible_fails(monkeypatch):
-    monkeypatch.setattr("potlp_jax.cli.compare.IMPOSSIBLE_IN_A_ROW", 3)
+    monkeypatch.setattr("potlp_jax.sweep.runner.IMPOSSIBLE_IN_A_ROW", 3)
     result = _potlp("compare", "toy", "--task", "!hazard U (goal & hazard)", "--policies", "baseline")
-    assert result.exit_code == 1
+    assert result.exit_code == 2
     assert "impossible in 3 worlds in a row" in result.stderr
 
 
@@ -306,10 +328,10 @@ def test_exit_codes_of_the_process():
 def test_interrupt_has_exit_code_130():
     interrupted = _process(
         "import signal, os, sys\n"
-        "import potlp_jax.cli.task as command\n"
+        "import potlp_jax.environments.tasks as tasks\n"
         # A process started in the background inherits that interrupts are ignored.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "command.show_task = lambda *args: os.kill(os.getpid(), signal.SIGINT)\n"
+        "tasks.read_task = lambda *args: os.kill(os.getpid(), signal.SIGINT)\n"
         "sys.argv = ['potlp', 'task', 'F a']\n"
         "from potlp_jax.cli import main\n"
         "main()\n"
