@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from potlp_jax.world.camera import CameraConfig, Disturbance, bearing, disturb, roll_to
 from potlp_jax.world.equirectangular import from_equirectangular
 from potlp_jax.world.grid import Appearance, World, make_world, pad_world
-from potlp_jax.world.panorama import CameraConfig, Disturbance, bearing, disturb, render, roll_to
+from potlp_jax.world.renderer import render
 from tests.reference import panorama as reference
 
 SMALL = CameraConfig(height=36, width=64, horizon=13.0, fold=4.5)
