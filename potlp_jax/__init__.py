@@ -4,7 +4,6 @@
 imported on first use, so that ``import potlp_jax`` itself takes milliseconds and loads no JAX.
 """
 
-import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
