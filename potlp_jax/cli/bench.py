@@ -66,7 +66,7 @@ def run_bench(
     from potlp_jax.bench.problems import FAMILIES
     from potlp_jax.bench.timing import environment as describe_environment
     from potlp_jax.cli.inputs import trial_config
-    from potlp_jax.environments import make
+    from potlp_jax.environments.registry import make
     from potlp_jax.environments.tasks import environment_task
     from potlp_jax.learning.estimator import estimator_for
 

@@ -61,7 +61,7 @@ def compare_policies(
 ) -> None:
     """Compare policies in the same worlds, with the share of attainable savings and its uncertainty."""
     from potlp_jax.cli.inputs import default_policy, read_names, read_split
-    from potlp_jax.environments import make
+    from potlp_jax.environments.registry import make
     from potlp_jax.sweep.specification import specification_from_dict
 
     generator = make(environment)

@@ -1,5 +1,6 @@
 """``potlp estimator``: what an estimator is, and how good it is."""
 
+import dataclasses
 import importlib.util
 import logging
 import math
@@ -61,6 +62,7 @@ def evaluate_estimator(
     """Measure an estimator on worlds it has not seen: skill, calibration, errors of costs."""
     if importlib.util.find_spec("pyarrow") is None:
         fail("data sets are Parquet files, and pyarrow is not installed: pip install 'potlp-jax[train]'", FAILED)
+    from potlp_jax.codec import finite_or_null
     from potlp_jax.learning.dataset import read_dataset
     from potlp_jax.learning.metrics import INTACT, check_fit, evaluate, prior_of
     from potlp_jax.learning.network import EstimatorNetwork
@@ -75,7 +77,7 @@ def evaluate_estimator(
     predictions = _predict(EstimatorNetwork(config), params, samples, variants)
     prior = prior_of(metadata, samples)
     reports = {name: evaluate(samples, entry, prior) for name, entry in predictions.items()}
-    found = finite(
+    found = finite_or_null(
         {
             "estimator": str(checkpoint),
             "dataset": str(dataset),
@@ -190,6 +192,7 @@ def _write(
 )
 def show_estimator(checkpoint: EstimatorArgument, json: Json = False) -> None:
     """Show what an estimator knows, how large it is and how it was trained."""
+    from potlp_jax.codec import finite_or_null
     from potlp_jax.learning.network import operation_counts, parameter_count
     from potlp_jax.learning.serialization import load_estimator
 
@@ -201,11 +204,11 @@ def show_estimator(checkpoint: EstimatorArgument, json: Json = False) -> None:
         "parameters": parameter_count(params),
         "operations_per_panorama": per_panorama,
         "operations_per_answer": per_answer,
-        "network": config.to_json(),
+        "network": dataclasses.asdict(config),
         "metadata": metadata,
     }
     if json:
-        print_json(finite(description))
+        print_json(finite_or_null(description))
         return
     out = console()
     out.print(str(checkpoint), markup=False, style="bold")
@@ -269,12 +272,3 @@ def _rows(description: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _list(values: list[int]) -> str:
     return ", ".join(map(str, values))
-
-
-def finite(value: Any) -> Any:
-    """JSON-able values with None for numbers that are not finite."""
-    if isinstance(value, dict):
-        return {name: finite(entry) for name, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

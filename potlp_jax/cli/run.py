@@ -62,7 +62,7 @@ def run_one(
         read_trained_estimator,
         trial_config,
     )
-    from potlp_jax.environments import make
+    from potlp_jax.environments.registry import make
     from potlp_jax.environments.tasks import environment_task
     from potlp_jax.trials.loop import run_trial, trial_key
     from potlp_jax.trials.record import Outcome

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import jax
 
-from potlp_jax.environments import Generator, make
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, world_key
 from potlp_jax.environments.tasks import environment_task
 from potlp_jax.errors import WorldError
@@ -212,7 +212,7 @@ class Sweep:
         return None if path is None else read_estimator(path)
 
     def _trained(self, environment: str) -> TrainedEstimator:
-        return estimator_for(_generator(environment).propositions, self._estimator)
+        return estimator_for(self._generator(environment).propositions, self._estimator)
 
     def _estimator_identity(self) -> str | None:
         """Of the network, so that a store never mixes two. Raises CheckpointError where there is none for a task."""
