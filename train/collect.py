@@ -10,7 +10,6 @@ what is recorded depends on the seed, the split and the index of the world alone
 
 import argparse
 import dataclasses
-import json
 import multiprocessing
 import os
 import threading
@@ -29,6 +28,7 @@ from jaxtyping import Array, Int32, UInt8
 from tqdm import tqdm
 
 from potlp_jax.cache import enable_compilation_cache
+from potlp_jax.codec import json_copy, with_settings
 from potlp_jax.environments import Generator, make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import DatasetError
@@ -44,7 +44,7 @@ from potlp_jax.learning.dataset import (
 from potlp_jax.learning.mistake_costs import WeightBounds
 from potlp_jax.learning.questions import HELD_OUT, TaskDistribution
 from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views
-from potlp_jax.trials.config import TrialConfig, with_settings
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import versions
 from potlp_jax.world.grid import World
 from potlp_jax.world.panorama import CameraConfig, Disturbance, disturb, render
@@ -159,14 +159,14 @@ def collect(
 def dataset_metadata(generator: Generator, environment: str, split: Split, config: CollectConfig) -> DatasetMetadata:
     """What the shards of a collection share."""
     world = generator.generate(world_key(split, 0, generator.name))
-    settings = json.loads(json.dumps(dataclasses.asdict(config)))
+    settings = json_copy(dataclasses.asdict(config))
     camera, disturbance = settings.pop("camera"), settings.pop("disturbance")
     encoding = {"format": settings.pop("image_format"), "quality": settings.pop("quality")}
     resolution = float(world.resolution)
     return DatasetMetadata(
         propositions=generator.propositions,
         environment=environment,
-        generator=json.loads(json.dumps(dataclasses.asdict(generator.config), default=str)),
+        generator=json_copy(dataclasses.asdict(generator.config)),
         split=split.value,
         camera=camera,
         disturbance=disturbance,

@@ -5,12 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from potlp_jax.cli.output import fail, note
+from potlp_jax.codec import with_settings
 from potlp_jax.environments import Generator
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split, default_split, world_key
 from potlp_jax.learning.estimator import TrainedEstimator, read_estimator, shipped_estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task, shipped_tasks
-from potlp_jax.trials.config import TrialConfig, with_settings
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.world.grid import World
 
 
