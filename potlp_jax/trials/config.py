@@ -3,7 +3,7 @@
 import dataclasses
 
 from potlp_jax.planning.policies import DecisionConfig
-from potlp_jax.world.panorama import CameraConfig, Disturbance
+from potlp_jax.world.camera import CameraConfig, Disturbance
 from potlp_jax.world.sensing import SensorConfig
 
 
