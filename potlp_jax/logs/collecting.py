@@ -1,7 +1,6 @@
 """Rows for training the estimator from robots' logs: the same files as ``train.collect`` writes."""
 
 import dataclasses
-import json
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -10,6 +9,7 @@ import cv2
 import numpy as np
 import pyarrow
 
+from potlp_jax.codec import json_copy
 from potlp_jax.environments.ros.places import Places
 from potlp_jax.errors import DatasetError, LogError
 from potlp_jax.learning.dataset import DatasetMetadata, finished_shards, write_shard
@@ -85,7 +85,7 @@ def collect_drives(
 def _metadata(
     drives: Sequence[Drive], places: Places, environment: str, split: str, config: LogCollectConfig
 ) -> DatasetMetadata:
-    settings = json.loads(json.dumps(dataclasses.asdict(config)))
+    settings = json_copy(dataclasses.asdict(config))
     camera = settings.pop("camera")
     encoding = {"format": settings.pop("image_format"), "quality": settings.pop("quality")}
     resolution = float(drives[0].world.resolution)
