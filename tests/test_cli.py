@@ -12,11 +12,12 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from potlp_jax.cli import app
-from potlp_jax.environments.families import FAMILIES
+from potlp_jax.cli import app, completion
+from potlp_jax.environments.families import FAMILIES, NAMED
 from potlp_jax.environments.registry import make
-from potlp_jax.environments.splits import world_key
-from potlp_jax.errors import WorldError
+from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.errors import PotlpError, WorldError
+from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
 from potlp_jax.trials.record import Outcome, load_trial
 
@@ -300,7 +301,7 @@ def test_task_that_is_never_possible_fails(monkeypatch):
 
 
 def test_unknown_environment_lists_the_known_ones():
-    with pytest.raises(WorldError, match="toy, firefighting, delivery, parcels, rooms"):
+    with pytest.raises(PotlpError, match="toy, firefighting, delivery, parcels, rooms"):
         make("castle")
 
 
@@ -341,11 +342,80 @@ def test_interrupt_has_exit_code_130():
     assert "Traceback" not in interrupted.stderr
 
 
-def test_help_loads_neither_pictures_nor_spot():
+LIGHT = """
+import sys
+slow = {'jax', 'numpy', 'scipy', 'matplotlib', 'spot', 'cv2', 'yaml'} & set(sys.modules)
+sys.exit(', '.join(slow) or 0)
+"""
+
+
+def test_importing_the_commands_loads_nothing_of_the_library():
+    # Every command's file, so that help and completion of each are quick.
     result = _process(
-        "import sys\n"
-        "import potlp_jax.cli\n"
-        "slow = {'matplotlib', 'spot', 'cv2'} & set(sys.modules)\n"
-        "sys.exit(', '.join(slow) or 0)\n"
+        "import importlib\n"
+        "from potlp_jax.cli.group import COMMANDS\n"
+        "for module in COMMANDS.values(): importlib.import_module(module)\n"
+        + LIGHT
+        + "sys.exit(', '.join(slow) or 0)\n"
     )
     assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("potlp ru", ["run"]),
+        ("potlp run fire", ["firefighting"]),
+        ("potlp run firefighting --task ", ["1", "2", "3", "4"]),
+        ("potlp run toy --policy o", ["optimistic", "oracle"]),
+        ("potlp run toy --split t", ["training", "test"]),
+        ("potlp compare toy --policies oracle,p", ["oracle,potlp"]),
+        ("potlp bench --environment del", ["delivery"]),
+        ("potlp sweep ex", ["export"]),
+    ],
+)
+def test_the_shell_is_told_what_may_follow(line, expected):
+    result = CliRunner().invoke(
+        app,
+        env={
+            "_POTLP_COMPLETE": "complete_bash",
+            "COMP_WORDS": line,
+            "COMP_CWORD": str(len(line.split(" ")) - 1),
+        },
+        prog_name="potlp",
+    )
+    assert result.stdout.split() == expected
+
+
+def test_completion_loads_nothing_of_the_library():
+    result = _process(
+        "import os\n"
+        "os.environ |= {'_POTLP_COMPLETE': 'complete_bash', 'COMP_WORDS': 'potlp run fire', 'COMP_CWORD': '2'}\n"
+        "from potlp_jax.cli import app\n"
+        "try: app(prog_name='potlp')\n"
+        "except SystemExit: pass\n" + LIGHT
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.split() == ["firefighting"]
+
+
+def test_completed_names_are_those_of_the_library():
+    assert tuple(Policy) == completion.POLICIES
+    assert tuple(Split) == completion.SPLITS
+    assert {name: tuple(make(name).tasks) for name in NAMED} == dict(completion.TASKS)
+
+
+@pytest.mark.parametrize("flag", ["--quiet", "--verbose"])
+def test_quiet_and_verbose_govern_what_is_said_on_stderr(flag):
+    result = _potlp(flag, "run", "toy", "-t", "2")
+    assert result.exit_code == 0
+    assert "satisfied" in result.stdout
+    if flag == "--quiet":
+        assert result.stderr == ""
+    else:
+        assert "no estimator is shipped for toy" in result.stderr
+        assert "decision 0" in result.stderr
+
+
+def test_quiet_still_tells_errors():
+    assert "castle" in _potlp("--quiet", "run", "castle").stderr

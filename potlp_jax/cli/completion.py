@@ -1,12 +1,15 @@
-"""What the shell proposes for a word of a command line. Nothing here imports the library: TAB answers at once.
+"""What the shell proposes for a word of a command line. Nothing here imports jax: TAB answers at once.
 
-The names repeat what `environments`, `planning.policies` and `environments.splits` define; ``tests/test_cli.py``
-compares them.
+Tasks, policies and splits repeat what `environments`, `planning.policies` and `environments.splits` define, because
+those import jax; ``tests/test_cli.py`` compares them.
 """
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
+
+from potlp_jax.environments.families import GROUP, NAMED, PREFIXED
+from potlp_jax.plugins import entry_points
 
 TASKS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -14,21 +17,18 @@ TASKS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "firefighting": ("1", "2", "3", "4"),
         "delivery": ("1",),
         "parcels": ("1", "2"),
-        "rooms": ("1",),
+        "rooms": ("1", "2"),
     }
 )
-"""Tasks by number of the environments that need no file."""
-
-FILE_ENVIRONMENTS = ("map:", "parcels:", "floorplan:")
-"""How the names of environments that are made from a file begin."""
+"""Numbers of the tasks of the environments that need no file."""
 
 POLICIES = ("known-map", "baseline", "optimistic", "oracle", "potlp")
 SPLITS = ("calibration", "training", "validation", "test")
 
 
 def complete_environment(incomplete: str) -> list[str]:
-    """Names of environments."""
-    return _starting([*TASKS, *FILE_ENVIRONMENTS], incomplete)
+    """Names of environments, those that other installed packages declare among them."""
+    return _starting([*NAMED, *PREFIXED, *entry_points(GROUP)], incomplete)
 
 
 def complete_task(ctx: Any, incomplete: str) -> list[str]:

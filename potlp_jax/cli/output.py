@@ -1,20 +1,23 @@
-"""What the commands share: consoles, messages and progress on stderr, JSON on stdout, errors as one line."""
+"""What the commands share: consoles, messages and progress on stderr, JSON on stdout, errors as one line.
 
-import importlib.metadata
+What only some commands need is imported where it is used: help and completion load this file too.
+"""
+
 import json
 import logging
 import warnings
-import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn, TextIO
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from potlp_jax.errors import PotlpError, PotlpWarning
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 logger = logging.getLogger(__name__)
 
@@ -35,6 +38,8 @@ def error_console() -> Console:
 
 def package_version() -> str:
     """The version of the installed package."""
+    import importlib.metadata
+
     return importlib.metadata.version("potlp-jax")
 
 
@@ -102,8 +107,10 @@ def _show_warning(
         logger.warning(warnings.formatwarning(message, category, filename, lineno))
 
 
-def progress_bar() -> Progress:
+def progress_bar() -> "Progress":
     """A progress display on stderr that leaves nothing behind; silent with --quiet and where stderr is no terminal."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
     terminal = error_console()
     return Progress(
         SpinnerColumn(),
@@ -127,5 +134,7 @@ def make_folder(folder: Path) -> Path:
 
 def open_page(page: Path) -> None:
     """Open a page in the browser, if there is one."""
+    import webbrowser
+
     if not webbrowser.open(page.resolve().as_uri()):
         logger.warning("there is no browser to open it with")
