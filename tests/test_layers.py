@@ -22,6 +22,7 @@ ORDER = (
     "trials",
     "verify",
     "sweep",
+    "recipes",
     "logs",
     "bench",
     "view",
