@@ -389,6 +389,20 @@ def move_to(
     intention: Intention | None = None,
     status: UInt32[Array, ""] | None = None,
 ) -> Move:
+    """The move of a given kind to a product state of known space; where the kind is NONE, the robot stays.
+
+    Args:
+        situation: known space, assessed from the robot's product state.
+        config: ``path_horizon`` is what matters here.
+        kind: one of ``MoveKind``.
+        target_cell, target_state: where the path leads.
+        value: the expected cost, for the record.
+        action, search, intention: what a searching policy adds.
+        status: bits to add to those of the subgoals.
+
+    Returns:
+        The move; its path has length 0 where the target is out of reach.
+    """
     goes = kind != MoveKind.NONE
     cell = jnp.where(goes, target_cell, situation.cell).astype(jnp.int32)
     state = jnp.where(goes, target_state, situation.state).astype(jnp.int32)

@@ -194,9 +194,7 @@ class TaskEnv:
 
     def _assessed(self, scene: Scene, progress: Progress) -> EnvState:
         """The state with known space assessed; where no action is left the task is infeasible."""
-        situation = assess(
-            progress.belief, progress.cell, progress.state, scene.task, self.config.decision.frontiers
-        )
+        situation = assess(progress.belief, progress.cell, progress.state, scene.task, self.config.decision.frontiers)
         nowhere = progress.running & ~jnp.any(self._action_mask(situation))
         outcome = jnp.where(nowhere, jnp.int8(_INFEASIBLE), progress.outcome)
         return EnvState(scene=scene, progress=dataclasses.replace(progress, outcome=outcome), situation=situation)
@@ -213,7 +211,7 @@ class TaskEnv:
 
     def _action_mask(self, situation: Situation) -> Bool[Array, " A"]:
         task = situation.task
-        reached = jnp.isfinite(self._distances(situation)[:, task.edges[:, 0]]) & task.edge_mask
+        reached = jnp.isfinite(self._distances(situation)[:, task.edges[:, 0]]) & task.edge_mask[None, :]
         finishes = jnp.isfinite(situation.finish_cost)
         explores = direct_move(situation, Policy.BASELINE, self.config.decision).kind != MoveKind.NONE
         return jnp.concatenate([reached.reshape(-1), jnp.stack([finishes, explores])])
