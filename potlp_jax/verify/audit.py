@@ -21,7 +21,7 @@ from tests.reference.dijkstra import grid_moves
 
 
 def problems_of(trial: Trial, task: Task) -> list[str]:
-    """What is wrong with a trial; empty if nothing. Not ending satisfied is wrong where docs/model.md section 7 promises it."""
+    """What is wrong with a trial; empty if nothing. Not ending satisfied is wrong where section 7 of docs/model.md promises it."""
     found = [*_moves(trial), *_observation(trial), *_word(trial, task)]
     if trial.outcome is not Outcome.SATISFIED and satisfaction_is_promised(trial, task):
         found.append(f"ended {trial.outcome} although acceptance stays within reach of every state")
