@@ -1,4 +1,4 @@
-"""The rows of a sweep in little space: what a table needs of them, without the paths that the sweep's command makes again.
+"""The rows of a sweep in little space: what a table needs of them, without the paths.
 
 potlp sweep export out/table1 --out out/rows.csv
 python -m eval.compact_rows out/rows.csv docs/results/table1/rows.csv.gz
@@ -10,19 +10,22 @@ import gzip
 from pathlib import Path
 
 COLUMNS = ("task", "policy", "world", "outcome", "cost", "steps", "decisions", "fallbacks", "status", "seconds")
-"""Left out: what is the same in every row of the sweep (its JSON has it), and paths, which are nine tenths of the file."""
+"""Left out: what is the same in every row (the sweep's JSON has it), and paths, which are nine tenths of the file."""
 DECIMALS = {"cost": 3, "seconds": 2}
 
 
 def compact(source: Path, target: Path) -> None:
     """Write the rows of ``source``, a CSV of ``potlp sweep export``, to ``target`` with fewer columns and digits."""
     # No file name and no time in the header, so that equal rows give equal bytes and git sees no change.
-    with source.open(newline="") as file, target.open("wb") as raw:
-        with gzip.GzipFile(filename="", fileobj=raw, mode="wb", mtime=0) as packed:
-            packed.write((",".join(COLUMNS) + "\n").encode())
-            for row in csv.DictReader(file):
-                values = [_short(row[name], DECIMALS.get(name)) for name in COLUMNS]
-                packed.write((",".join(values) + "\n").encode())
+    with (
+        source.open(newline="") as file,
+        target.open("wb") as raw,
+        gzip.GzipFile(filename="", fileobj=raw, mode="wb", mtime=0) as packed,
+    ):
+        packed.write((",".join(COLUMNS) + "\n").encode())
+        for row in csv.DictReader(file):
+            values = [_short(row[name], DECIMALS.get(name)) for name in COLUMNS]
+            packed.write((",".join(values) + "\n").encode())
 
 
 def _short(value: str, decimals: int | None) -> str:

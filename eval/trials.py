@@ -9,8 +9,8 @@ Suites:
     python -m eval.trials firefighting rooms maps revealed --processes 2
     python -m eval.trials --report docs/results/trials
 
-Results are appended as JSON lines; the same command again continues where it stopped. ``--report`` also reads JSON lines
-that were packed with ``gzip``.
+Results are appended as JSON lines; the same command again continues where it stopped. ``--report`` also reads
+JSON lines that were packed with ``gzip``.
 """
 
 import argparse
@@ -182,9 +182,9 @@ def rows_of(out: Path, suite: str) -> list[dict[str, Any]]:
     """Rows written so far; a line cut off by a kill is dropped, its item runs again."""
     path = out / f"{suite}.jsonl"
     packed = path.with_suffix(".jsonl.gz")  # as docs/results keeps them
-    text = (
-        path.read_text() if path.exists() else gzip.decompress(packed.read_bytes()).decode() if packed.exists() else ""
-    )
+    text = path.read_text() if path.exists() else ""
+    if packed.exists():
+        text = gzip.decompress(packed.read_bytes()).decode() + text
     rows = []
     for line in text.splitlines():
         try:
