@@ -46,8 +46,9 @@ from potlp_jax.learning.questions import HELD_OUT, TaskDistribution
 from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views
 from potlp_jax.trials.config import TrialConfig, with_settings
 from potlp_jax.trials.loop import versions
+from potlp_jax.world.camera import CameraConfig, Disturbance, disturb
 from potlp_jax.world.grid import World
-from potlp_jax.world.panorama import CameraConfig, Disturbance, disturb, render
+from potlp_jax.world.renderer import render
 from train.explorer import Explorer, ExplorerConfig
 
 
@@ -238,7 +239,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--classes", type=int, default=defaults.classes)
     parser.add_argument("--format", choices=("jpeg", "png"), default=defaults.image_format)
     parser.add_argument("--quality", type=int, default=defaults.quality, help="of JPEG")
-    parser.add_argument("--noise", type=float, default=0.0, help="disturbances of the image, see world/panorama.py")
+    parser.add_argument("--noise", type=float, default=0.0, help="disturbances of the image, see world/camera.py")
     parser.add_argument("--exposure", type=float, default=0.0)
     parser.add_argument("--colour", type=float, default=0.0)
     options = parser.parse_args(arguments)

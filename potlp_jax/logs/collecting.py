@@ -19,7 +19,7 @@ from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_view
 from potlp_jax.logs.drive import Drive, Eyes
 from potlp_jax.trials.loop import versions
 from potlp_jax.trials.robot import DIAGONAL
-from potlp_jax.world.panorama import CameraConfig, Disturbance
+from potlp_jax.world.camera import CameraConfig, Disturbance
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
-from potlp_jax.planning.commitment import Intention, intention_of, keep_on
+from potlp_jax.planning.commitment import Intention, apply_commitment, intention_of
 from potlp_jax.planning.distances.paths import KnownPath, shortest_path
 from potlp_jax.planning.distances.product import (
     distance_table,
@@ -288,7 +288,7 @@ def planned_move(
     """The move that carries out the plan of a situation's problem, or keeps to what the robot is on its way to."""
     task, subgoals = situation.task, situation.subgoals
     search = Search(problem=problem, plan=plan, terms=action_terms(problem, initial_history(problem)))
-    plan = keep_on(plan, intention, situation.state, subgoals, task, jnp.float32(config.commitment))
+    plan = apply_commitment(plan, intention, situation.state, subgoals, task, jnp.float32(config.commitment))
 
     frontier_cell, frontier_state, frontier_cost = _nearest_frontier(situation)
     finishes = plan.action == subgoals.mask.shape[0] * task.edge_mask.shape[0]

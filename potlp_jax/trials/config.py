@@ -6,8 +6,8 @@ from typing import Any
 
 from potlp_jax.planning.policies import DecisionConfig
 from potlp_jax.planning.search.graph import SearchConfig, SearchMode
+from potlp_jax.world.camera import CameraConfig, Disturbance
 from potlp_jax.world.frontiers import FrontierConfig
-from potlp_jax.world.panorama import CameraConfig, Disturbance
 from potlp_jax.world.sensing import SensorConfig
 
 

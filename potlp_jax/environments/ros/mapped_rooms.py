@@ -31,8 +31,8 @@ from potlp_jax.environments.ros.places import Region, load_regions
 from potlp_jax.environments.ros.ros_map import NARROW_DOORS, CleanMap, clean_map
 from potlp_jax.environments.splits import PARCELS_PREFIX
 from potlp_jax.errors import MapError, MapWarning
+from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.grid import World
-from potlp_jax.world.panorama import CameraConfig
 
 PERSON_RADIUS = 0.5
 """Metres around a person's cell, along rows and columns, on which the person is met."""
