@@ -18,8 +18,8 @@ from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views
 from potlp_jax.logs.drive import Drive, Eyes
 from potlp_jax.trials.loop import versions
-from potlp_jax.trials.robot import DIAGONAL
 from potlp_jax.world.camera import CameraConfig, Disturbance
+from potlp_jax.world.moves import step_lengths
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -34,13 +34,10 @@ class LogCollectConfig(ViewConfig):
 
 def poses_of(drive: Drive) -> Iterator[Pose]:
     """The poses of a drive at which there is a picture."""
-    travelled = 0.0
+    travelled = np.cumsum([0.0, *step_lengths(drive.path)]).tolist()
     for step, cell in enumerate(drive.path):
-        if step:
-            before = drive.path[step - 1]
-            travelled += DIAGONAL if before[0] != cell[0] and before[1] != cell[1] else 1.0
         if step in drive.pictures:
-            yield Pose(belief=drive.belief_at(step), cell=cell, step=step, travelled=travelled)
+            yield Pose(belief=drive.belief_at(step), cell=cell, step=step, travelled=travelled[step])
 
 
 def collect_drives(

@@ -16,10 +16,10 @@ from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
 from potlp_jax.types import NO_SUBGOAL, UNREACHABLE, Status, status_if
 from potlp_jax.world.grid import BeliefMap
+from potlp_jax.world.moves import NEIGHBOURS, beside
 
 _BLOCK = 512
 _NEVER = np.iinfo(np.int32).max
-_NEIGHBOURS = tuple((row, column) for row in (-1, 0, 1) for column in (-1, 0, 1) if (row, column) != (0, 0))
 
 Carry = TypeVar("Carry")
 
@@ -80,10 +80,7 @@ def frontier_cells(belief: BeliefMap, reachable: Bool[Array, "H W"]) -> Bool[Arr
 
     What lies outside of the array counts as not observed.
     """
-    height, width = reachable.shape
-    unknown = jnp.pad(belief.unknown, 1, constant_values=True)
-    beside = unknown[:height, 1:-1] | unknown[2:, 1:-1] | unknown[1:-1, :width] | unknown[1:-1, 2:]
-    return belief.free & reachable & beside
+    return belief.free & reachable & beside(belief.unknown, beyond=True)
 
 
 def find_subgoals(
@@ -159,7 +156,7 @@ def _label(grid: _Grid, width: int) -> _Grid:
     Each round hooks every tree, at its root, below the least tree that touches it, and halves the paths to the roots:
     logarithmically many rounds, where passing labels from cell to cell alone would take as many as a component is long.
     """
-    offsets = jnp.asarray([row * (width + 2) + column for row, column in _NEIGHBOURS], dtype=jnp.int32)
+    offsets = jnp.asarray([row * (width + 2) + column for row, column in NEIGHBOURS], dtype=jnp.int32)
     dummy = grid.parent.shape[0] - 1
 
     def hook(cells: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
