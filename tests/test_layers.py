@@ -20,6 +20,7 @@ ORDER = (
     "export",
     "learning",
     "trials",
+    "rl",
     "verify",
     "sweep",
     "logs",
