@@ -23,6 +23,7 @@ ORDER = (
     "rl",
     "verify",
     "sweep",
+    "recipes",
     "logs",
     "bench",
     "view",
