@@ -54,12 +54,12 @@ class GymTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self.action_space = spaces.Discrete(self.env.num_actions)
         self.observation_space = self._spaces()
 
-    def _spaces(self) -> spaces.Dict:
+    def _spaces(self) -> Any:
         height, width = self.env.worlds.shape
         subgoals, states = self.env.config.decision.frontiers.max_subgoals, self.env.task.dfa.num_states
         longest = max(height, width) - 1
 
-        def box(low: float, high: float, *shape: int, dtype: Any = np.int32) -> spaces.Box:
+        def box(low: float | int, high: float | int, *shape: int, dtype: Any = np.int32) -> spaces.Box:
             return spaces.Box(low, high, shape, dtype)
 
         return spaces.Dict(
