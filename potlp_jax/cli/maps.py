@@ -14,6 +14,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from potlp_jax.cli.output import console, fail, print_json
+from potlp_jax.environments.ros.cleaning import CleanMap, clean_map
 from potlp_jax.environments.ros.map_files import OccupancyMap, load_map
 from potlp_jax.environments.ros.map_writer import save_map
 from potlp_jax.environments.ros.places import (
@@ -27,7 +28,7 @@ from potlp_jax.environments.ros.places import (
     place_letters,
     save_places,
 )
-from potlp_jax.environments.ros.ros_map import CleanMap, RosMap, RosMapConfig, clean_map
+from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig
 from potlp_jax.environments.ros.survey import MapSurvey, Passage, survey_map
 from potlp_jax.errors import MapWarning
 from potlp_jax.task.formula import check_propositions

@@ -54,7 +54,7 @@ class GymTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self.action_space = spaces.Discrete(self.env.num_actions)
         self.observation_space = self._spaces()
 
-    def _spaces(self) -> Any:
+    def _spaces(self) -> gymnasium.Space[Any]:
         height, width = self.env.worlds.shape
         subgoals, states = self.env.config.decision.frontiers.max_subgoals, self.env.task.dfa.num_states
         longest = max(height, width) - 1
