@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from train.collect import CollectConfig, collect, main, summary
+from train.explorer import Explorer, ExplorerConfig
 
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.splits import Split, world_key
@@ -27,8 +29,6 @@ from potlp_jax.world.renderer import render
 from potlp_jax.world.sensing import SensorConfig
 from tests.reference.dijkstra import dijkstra, grid_moves
 from tests.reference.sensing import visible
-from train.collect import CollectConfig, collect, main, summary
-from train.explorer import Explorer, ExplorerConfig
 
 GENERATOR = Firefighting.toy()
 CONFIG = CollectConfig(
