@@ -179,7 +179,7 @@ def measure_distances(scene: Scene, sources: int, repeats: int) -> DistanceRow:
     )
 
 
-def _spread(mask: Bool[np.ndarray, "H W"], first: Int32[np.ndarray, "2"], count: int) -> Int32[np.ndarray, "count 2"]:
+def _spread(mask: Bool[np.ndarray, "H W"], first: Int32[np.ndarray, "2"], count: int) -> Int32[np.ndarray, "N 2"]:
     """``first`` and cells drawn evenly, always the same, from those where the mask is True."""
     cells = np.argwhere(mask)
     drawn = np.random.default_rng(0).integers(len(cells), size=count - 1)
