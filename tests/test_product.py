@@ -20,9 +20,10 @@ from potlp_jax.planning.distances.product import (
     product_transitions,
     reachable_cells,
 )
-from potlp_jax.planning.distances.sweeping import DIAGONAL, Wildcard
+from potlp_jax.planning.distances.sweeping import Wildcard
 from potlp_jax.task.task import TaskSizes
 from potlp_jax.types import NO_STATE
+from potlp_jax.world.moves import DIAGONAL
 from tests.reference import dijkstra
 
 FORMULAS = {

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from eval.savings import decisions_of
 from potlp_jax.cli import app
-from potlp_jax.environments import make
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.errors import SpecificationError, StoreError
 from potlp_jax.planning.policies import Policy
@@ -89,8 +89,8 @@ def test_settings_reach_every_depth():
         ({"settings": {"replan": 3}}, "settings: unknown field 'replan'"),
         ({"settings": {"decision": {"search": {"simulations": "many"}}}}, "settings.decision.search.simulations"),
         ({"settings": {"decision": {"frontiers": {"max_subgoals": 0}}}}, "settings.decision.frontiers: .*at least 1"),
-        ({"settings": {"revealed": 1}}, "settings.revealed: give a bool"),
-        ({"settings": {"decision": {"search": {"mode": "guess"}}}}, "settings.decision.search.mode: choose from"),
+        ({"settings": {"revealed": 1}}, "settings.revealed: give true or false, found 1"),
+        ({"settings": {"decision": {"search": {"mode": "guess"}}}}, "settings.decision.search.mode: give '"),
     ],
 )
 def test_wrong_entries_are_named(changes, message):

@@ -1,5 +1,6 @@
 """``potlp estimator``: what an estimator is, and how good it is."""
 
+import dataclasses
 import importlib.util
 import math
 from pathlib import Path
@@ -9,6 +10,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from potlp_jax.cli.output import FAILED, console, fail, print_json
+from potlp_jax.codec import finite_or_null
 from potlp_jax.errors import CheckpointError
 from potlp_jax.learning.fovea import ABOVE, BAND, BELOW
 from potlp_jax.learning.network import operation_counts, parameter_count
@@ -28,11 +30,11 @@ def show_estimator(path: Path, json: bool) -> None:
         "parameters": parameter_count(params),
         "operations_per_panorama": first,
         "operations_per_answer": second,
-        "network": config.to_json(),
+        "network": dataclasses.asdict(config),
         "metadata": metadata,
     }
     if json:
-        print_json(finite(description))
+        print_json(finite_or_null(description))
         return
     out = console()
     out.print(str(path), markup=False, style="bold")
@@ -103,12 +105,3 @@ def _rows(description: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _list(values: list[int]) -> str:
     return ", ".join(map(str, values))
-
-
-def finite(value: Any) -> Any:
-    """JSON-able values with None for numbers that are not finite."""
-    if isinstance(value, dict):
-        return {name: finite(entry) for name, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

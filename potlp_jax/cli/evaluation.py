@@ -6,8 +6,8 @@ from typing import Any
 
 from rich.console import Console
 
-from potlp_jax.cli.estimator import finite
 from potlp_jax.cli.output import console, fail, note, output_folder, print_json, progress_bar, to_json
+from potlp_jax.codec import finite_or_null
 from potlp_jax.environments.splits import Split
 from potlp_jax.errors import CheckpointError, DatasetError, EvaluationError, NetworkError, TrainingError
 from potlp_jax.learning.dataset import Samples, read_dataset
@@ -57,7 +57,7 @@ def run_evaluation(path: Path, dataset: Path, out: Path | None, ablate: str, jso
         fail(str(error))
     prior = prior_of(metadata, samples)
     reports = {name: evaluate(samples, entry, prior) for name, entry in predictions.items()}
-    found = finite(
+    found = finite_or_null(
         {
             "estimator": str(path),
             "dataset": str(dataset),

@@ -22,6 +22,7 @@ from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_STATE
 from potlp_jax.world.frontiers import Subgoals, frontier_cells
 from potlp_jax.world.grid import BeliefMap, World
+from potlp_jax.world.moves import dilate
 
 PORCH, HIDDEN, SEEN = range(3)
 
@@ -96,7 +97,7 @@ def _labels_of_lanes(
     staying = jnp.moveaxis(stays[:, world.letters][state], 0, -1) & free[:, :, None]
     hidden = belief.unknown[:, :, None]
     own = subgoals.component[:, :, None] == subgoal[None, None, :]
-    porch = _with_neighbours(own) & ~hidden
+    porch = dilate(own) & ~hidden
     # Also a frontier that known space does not reach: a goal may have been seen across a gap, or through a fire.
     way_back = frontier_cells(belief, jnp.ones_like(free))[:, :, None] & ~own
 
@@ -127,11 +128,3 @@ def _labels_of_lanes(
     explored = hidden & jnp.isfinite(cost[HIDDEN])
     failure_cost = jnp.max(jnp.where(explored, cost[HIDDEN], 0.0), axis=(0, 1))
     return jax.lax.map(cheapest, task.class_go).T, failure_cost
-
-
-def _with_neighbours(cells: Bool[Array, "H W lanes"]) -> Bool[Array, "H W lanes"]:
-    """The cells and their eight neighbours."""
-    height, width = cells.shape[:2]
-    padded = jnp.pad(cells, ((1, 1), (1, 1), (0, 0)))
-    shifted = [padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]
-    return jnp.any(jnp.stack(shifted), axis=0)

@@ -275,7 +275,7 @@ def training_identity(
         return {"views": len(samples.images), "samples": len(samples.success), "split": samples.metadata.split}
 
     return {
-        "network": network.config.to_json(),
+        "network": dataclasses.asdict(network.config),
         "training": dataclasses.asdict(config),
         "training_data": data(training),
         "validation_data": data(validation),

@@ -1,7 +1,6 @@
 """Rows for training the estimator from robots' logs: the same files as ``train.collect`` writes."""
 
 import dataclasses
-import json
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -10,6 +9,7 @@ import cv2
 import numpy as np
 import pyarrow
 
+from potlp_jax.codec import json_copy
 from potlp_jax.environments.ros.places import Places
 from potlp_jax.errors import DatasetError, LogError
 from potlp_jax.learning.dataset import DatasetMetadata, finished_shards, write_shard
@@ -18,8 +18,8 @@ from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views
 from potlp_jax.logs.drive import Drive, Eyes
 from potlp_jax.trials.loop import versions
-from potlp_jax.trials.robot import DIAGONAL
 from potlp_jax.world.camera import CameraConfig, Disturbance
+from potlp_jax.world.moves import step_lengths
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -34,13 +34,10 @@ class LogCollectConfig(ViewConfig):
 
 def poses_of(drive: Drive) -> Iterator[Pose]:
     """The poses of a drive at which there is a picture."""
-    travelled = 0.0
+    travelled = np.cumsum([0.0, *step_lengths(drive.path)]).tolist()
     for step, cell in enumerate(drive.path):
-        if step:
-            before = drive.path[step - 1]
-            travelled += DIAGONAL if before[0] != cell[0] and before[1] != cell[1] else 1.0
         if step in drive.pictures:
-            yield Pose(belief=drive.belief_at(step), cell=cell, step=step, travelled=travelled)
+            yield Pose(belief=drive.belief_at(step), cell=cell, step=step, travelled=travelled[step])
 
 
 def collect_drives(
@@ -88,7 +85,7 @@ def collect_drives(
 def _metadata(
     drives: Sequence[Drive], places: Places, environment: str, split: str, config: LogCollectConfig
 ) -> DatasetMetadata:
-    settings = json.loads(json.dumps(dataclasses.asdict(config)))
+    settings = json_copy(dataclasses.asdict(config))
     camera = settings.pop("camera")
     encoding = {"format": settings.pop("image_format"), "quality": settings.pop("quality")}
     resolution = float(drives[0].world.resolution)

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.stats import DegenerateDataWarning, bootstrap
 
+from potlp_jax.codec import finite_or_null
 from potlp_jax.types import Status
 
 BASELINE = "baseline"
@@ -124,7 +125,7 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able values; undefined figures become None."""
-        return _defined(dataclasses.asdict(self))
+        return finite_or_null(dataclasses.asdict(self))
 
 
 def attainable_share(
@@ -259,13 +260,3 @@ def _count(names: Sequence[str]) -> dict[str, int]:
 def _count_losses(trials: Sequence[TrialResult]) -> dict[str, int]:
     bits = [bit for trial in trials for bit in Status(trial.status & LOSSES)]
     return _count([str(bit.name).lower() for bit in bits])
-
-
-def _defined(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {key: _defined(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_defined(entry) for entry in value]
-    return value

@@ -20,12 +20,12 @@ from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
 from potlp_jax.types import NO_SUBGOAL, UNREACHABLE, Status, status_if
 from potlp_jax.world.grid import BeliefMap
+from potlp_jax.world.moves import NEIGHBOURS, beside
 
 _BLOCK = 512
 """Cells of the frontier that are handled at once. A frontier has some hundreds of cells, so one or two blocks do."""
 _NONE = np.iinfo(np.int32).max
 """A cell's number where there is no cell; larger than any, so that a minimum passes it over."""
-_NEIGHBOURS = tuple((row, column) for row in (-1, 0, 1) for column in (-1, 0, 1) if (row, column) != (0, 0))
 
 Carry = TypeVar("Carry")
 
@@ -95,11 +95,8 @@ def frontier_cells(belief: BeliefMap, reachable: Bool[Array, "H W"]) -> Bool[Arr
 
     What lies outside of the array counts as not observed.
     """
-    height, width = reachable.shape
     # Sides suffice: a diagonal move needs the two cells beside it free, and these touch its target with a side.
-    unknown = jnp.pad(belief.unknown, 1, constant_values=True)
-    beside = unknown[:height, 1:-1] | unknown[2:, 1:-1] | unknown[1:-1, :width] | unknown[1:-1, 2:]
-    return belief.free & reachable & beside
+    return belief.free & reachable & beside(belief.unknown, beyond=True)
 
 
 def find_subgoals(
@@ -194,7 +191,7 @@ def _label(grid: _Grid, width: int) -> _Grid:
     Parents only ever decrease and stay within the component, so the rounds end; when nothing changes, neighbours have
     equal parents, and every tree is a component with its first cell as root.
     """
-    offsets = jnp.asarray([row * (width + 2) + column for row, column in _NEIGHBOURS], dtype=jnp.int32)
+    offsets = jnp.asarray([row * (width + 2) + column for row, column in NEIGHBOURS], dtype=jnp.int32)
     dummy = grid.parent.shape[0] - 1
 
     def hook(cells: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:

@@ -27,6 +27,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, Int32, UInt8
 
 from potlp_jax.world.grid import BeliefMap, World
+from potlp_jax.world.moves import dilate
 
 _OCCUPIED_BIT = 1
 """Bit of a cell's code that says obstacle."""
@@ -118,7 +119,7 @@ def visible(occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], config: Senso
     near = (jnp.abs(jnp.arange(height) - cell[0]) <= 1)[:, None] & (jnp.abs(jnp.arange(width) - cell[1]) <= 1)[None, :]
     # Obstacles are seen from the free cells in front of them, not by lines (see the definition).
     free_seen = (seen | near) & ~occupied
-    return near | free_seen | (occupied & _dilate(free_seen))
+    return near | free_seen | (occupied & dilate(free_seen))
 
 
 def _reach(occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], lines: _Lines) -> Int32[Array, " lines"]:
@@ -183,15 +184,6 @@ def _at_offsets(
 ) -> Int32[Array, "H W"]:
     """Entries of a table over offsets for all cells of the grid, seen from the robot's cell."""
     return jax.lax.dynamic_slice(jnp.asarray(table), corner, (height, width))
-
-
-def _dilate(mask: Bool[Array, "H W"]) -> Bool[Array, "H W"]:
-    """The mask and its eight neighbours."""
-    height, width = mask.shape
-    tall = jnp.pad(mask, ((1, 1), (0, 0)))
-    tall = tall[:height] | tall[1 : height + 1] | tall[2:]
-    wide = jnp.pad(tall, ((0, 0), (1, 1)))
-    return wide[:, :width] | wide[:, 1 : width + 1] | wide[:, 2:]
 
 
 @functools.lru_cache(maxsize=32)

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 
-from potlp_jax.planning.distances.sweeping import DIAGONAL, NEIGHBOURS, Wildcard
+from potlp_jax.planning.distances.sweeping import Wildcard
+from potlp_jax.world.moves import LENGTHS, NEIGHBOURS, sides_free
 
 
 @struct.dataclass(kw_only=True)
@@ -104,8 +105,7 @@ class _Predecessor:
         self.transitions = transitions
         self.wildcard = wildcard
         self.offsets = jnp.asarray(NEIGHBOURS, jnp.int32)
-        lengths = [1.0 if 0 in offset else DIAGONAL for offset in NEIGHBOURS]
-        self.steps = jnp.asarray(lengths, jnp.float32) * resolution
+        self.steps = jnp.asarray(LENGTHS, jnp.float32) * resolution
 
     def __call__(self, cell: Int32[Array, "2"], state: Int32[Array, ""]) -> tuple[Int32[Array, "2"], Int32[Array, ""]]:
         states = self.transitions.shape[2]
@@ -115,10 +115,8 @@ class _Predecessor:
             chosen = self.wildcard.successors[:, state] | (jnp.arange(states) == state)
             leads = leads | (self.wildcard.cells[cell[0], cell[1]] & chosen)
         neighbours = cell[None, :] + self.offsets + 1
-        # No corner is cut. For a straight move one of the two cells is the neighbour, the other the cell itself.
-        beside = self.free[neighbours[:, 0], cell[1] + 1] & self.free[cell[0] + 1, neighbours[:, 1]]
         cost = self.distances[neighbours[:, 0], neighbours[:, 1]] + self.steps[:, None]
-        cost = jnp.where(beside[:, None] & leads[None, :], cost, jnp.inf)
+        cost = jnp.where(sides_free(self.free, cell)[:, None] & leads[None, :], cost, jnp.inf)
         # The first of equal minima: neighbours in their order, then states.
         best = jnp.argmin(cost.reshape(-1)).astype(jnp.int32)
         return neighbours[best // states] - 1, best % states

@@ -19,21 +19,13 @@ References:
     place, until nothing changes); here on the graph of grid moves, not on a differential equation.
 """
 
-import math
-
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 
 from potlp_jax.types import NO_STATE
-
-DIAGONAL: float = math.sqrt(2.0)
-"""Length of a diagonal move in cells."""
-
-
-NEIGHBOURS: tuple[tuple[int, int], ...] = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
-"""The eight moves as (row, column) offsets; paths break ties in this order."""
+from potlp_jax.world.moves import DIAGONAL, NEIGHBOURS, cut_corners, shift
 
 
 @struct.dataclass(kw_only=True)
@@ -208,9 +200,7 @@ class Links:
     """
 
     def __init__(self, free: Bool[Array, "H W"]) -> None:
-        blocked = ~free
-        self.falling = _link(_shift(blocked, 1, 0, True) | _shift(blocked, 0, 1, True))
-        self.rising = _link(_shift(blocked, 1, 1, True) | blocked)
+        self.falling, self.rising = (_link(cut) for cut in cut_corners(free))
         # Lengths of the moves into each cell from its neighbours, in their order.
         self.steps = jnp.stack([self._step(*offset) for offset in NEIGHBOURS])
 
@@ -218,7 +208,7 @@ class Links:
         """Cost of standing on each cell's best neighbour plus the move into the cell, in cells."""
         best = jnp.full(layer.shape, jnp.inf, jnp.float32)
         for step, (rows, columns) in zip(self.steps, NEIGHBOURS, strict=True):
-            best = _smaller(_shift(layer, -rows, -columns, jnp.inf) + step[:, :, None], best)
+            best = _smaller(shift(layer, -rows, -columns, jnp.inf) + step[:, :, None], best)
         return best
 
     def arrival_in_row(self, layer: Float32[Array, "H2 W2 Q"], row: Int32[Array, ""]) -> Float32[Array, "W Q"]:
@@ -242,7 +232,7 @@ class Links:
             return jnp.ones(self.falling.shape, jnp.float32)
         # The square between a cell and its neighbour has its lower right cell at the lower row and the right column.
         link = self.falling if rows == columns else self.rising
-        return _shift(link, -max(rows, 0), -max(columns, 0), jnp.inf)
+        return shift(link, -max(rows, 0), -max(columns, 0), jnp.inf)
 
 
 def _extent(entered: Bool[Array, "Z lines"]) -> Int32[Array, "Z 2"]:
@@ -255,14 +245,6 @@ def _extent(entered: Bool[Array, "Z lines"]) -> Int32[Array, "Z 2"]:
 def _link(blocked: Bool[Array, "H W"]) -> Float32[Array, "H W"]:
     """Lengths of diagonal moves; ``blocked`` is True where one would cut a corner."""
     return jnp.where(blocked, jnp.inf, DIAGONAL).astype(jnp.float32)
-
-
-def _shift(array: Array, rows: int, columns: int, fill: float | bool) -> Array:
-    """``result[i, j] = array[i - rows, j - columns]``, ``fill`` where that lies outside; |rows|, |columns| <= 1."""
-    height, width = array.shape[:2]
-    margins = ((1, 1), (1, 1)) + ((0, 0),) * (array.ndim - 2)
-    padded = jnp.pad(array, margins, constant_values=fill)
-    return padded[1 - rows : 1 - rows + height, 1 - columns : 1 - columns + width]
 
 
 class _Lines:
@@ -283,8 +265,8 @@ class _Lines:
         self.extent = extent
         # Diagonals into a line from the line above it, seen from the left and from the right; and from the line below,
         # where the same links belong to the squares of that line.
-        self.above = (falling[:, :, None], _shift(rising, 0, -1, jnp.inf)[:, :, None])
-        self.below = (_shift(rising, -1, 0, jnp.inf)[:, :, None], _shift(falling, -1, -1, jnp.inf)[:, :, None])
+        self.above = (falling[:, :, None], shift(rising, 0, -1, jnp.inf)[:, :, None])
+        self.below = (shift(rising, -1, 0, jnp.inf)[:, :, None], shift(falling, -1, -1, jnp.inf)[:, :, None])
 
     def sweep(self, cost: Float32[Array, "H2 W2 Q"]) -> Float32[Array, "H2 W2 Q"]:
         """Once downwards, once upwards, in place; ``cost`` has a margin of one cell."""

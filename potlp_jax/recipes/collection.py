@@ -10,7 +10,6 @@ what is recorded depends on the seed, the split and the index of the world alone
 
 import argparse
 import dataclasses
-import json
 import multiprocessing
 import os
 import threading
@@ -27,9 +26,12 @@ import numpy as np
 import pyarrow
 from jaxtyping import Array, Int32, UInt8
 from tqdm import tqdm
+from train.explorer import Explorer, ExplorerConfig
 
 from potlp_jax.cache import enable_compilation_cache
-from potlp_jax.environments import Generator, make
+from potlp_jax.codec import json_copy
+from potlp_jax.environments.base import Generator
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import DatasetError
 from potlp_jax.learning.dataset import (
@@ -44,12 +46,11 @@ from potlp_jax.learning.dataset import (
 from potlp_jax.learning.mistake_costs import WeightBounds
 from potlp_jax.learning.questions import HELD_OUT, TaskDistribution
 from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views
-from potlp_jax.trials.config import TrialConfig, with_settings
+from potlp_jax.trials.config import trial_config_for
 from potlp_jax.trials.loop import versions
 from potlp_jax.world.camera import CameraConfig, Disturbance, disturb
 from potlp_jax.world.grid import World
 from potlp_jax.world.renderer import render
-from train.explorer import Explorer, ExplorerConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -160,14 +161,14 @@ def collect(
 def dataset_metadata(generator: Generator, environment: str, split: Split, config: CollectConfig) -> DatasetMetadata:
     """What the shards of a collection share."""
     world = generator.generate(world_key(split, 0, generator.name))
-    settings = json.loads(json.dumps(dataclasses.asdict(config)))
+    settings = json_copy(dataclasses.asdict(config))
     camera, disturbance = settings.pop("camera"), settings.pop("disturbance")
     encoding = {"format": settings.pop("image_format"), "quality": settings.pop("quality")}
     resolution = float(world.resolution)
     return DatasetMetadata(
         propositions=generator.propositions,
         environment=environment,
-        generator=json.loads(json.dumps(dataclasses.asdict(generator.config), default=str)),
+        generator=json_copy(dataclasses.asdict(generator.config)),
         split=split.value,
         camera=camera,
         disturbance=disturbance,
@@ -245,7 +246,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     enable_compilation_cache()
     generator = make(options.environment)
-    frontiers = with_settings(TrialConfig(), generator.settings).decision.frontiers
+    frontiers = trial_config_for(generator).decision.frontiers
     config = CollectConfig(
         frontiers=frontiers,
         explorer=ExplorerConfig(frontiers=frontiers),

@@ -233,7 +233,7 @@ def fit(training: Samples, validation: Samples, out: Path, arguments: argparse.N
         journal.close()
     metadata = {
         "training": dataclasses.asdict(config),
-        "data": json.loads(training.metadata.to_json()),
+        "data": dataclasses.asdict(training.metadata),
         "validation_split": validation.metadata.split,
         "panoramas": len(training.images),
         "samples": len(training.success),
