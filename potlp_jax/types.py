@@ -2,7 +2,7 @@
 
 Glossary of the dimension names in jaxtyping annotations. ``tests/test_types.py`` compares it with the package: every
 name that is used stands here, and no other. A name with a ``1`` at its end has one entry more than the name without
-(``S1`` is ``S + 1``); names behind a star (``*batch``) stand for any number of axes, also none.
+(``S1`` is ``S + 1``). Names behind a star, such as ``*batch``, are not listed: they stand for any number of axes.
 
 =============================  ======================================================================================
 Grid
@@ -29,7 +29,7 @@ S, S1                          subgoals; location ``S`` of a planning problem is
 A                              actions, ``S * E + 1``: ``s * E + e``, and last the finish action
 N                              nodes of a search graph, or any number of things of one kind
 NZ                             nodes times states
-B, batch                       batch
+B                              rows of a batch
 D                              depth: actions of one simulation
 R, L1                          rows of a table of guesses; lengths of a chain of failures, 0 among them
 V                              words of a bit set over product states; in learning, panoramas in memory
@@ -43,7 +43,6 @@ horizon1                       product states of a path: its moves and the sourc
 
 Pictures and estimators
 rows, columns                  of a panorama; a column is a bearing
-shape                          any shape, the same for arguments and result
 G                              views of a training batch
 F                              features of a place in a panorama
 feature_rows, feature_columns  rows and columns of a panorama's features

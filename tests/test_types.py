@@ -27,8 +27,8 @@ def glossary() -> list[str]:
 
 
 def names_of(shape: str) -> set[str]:
-    """Dimension names in a shape of jaxtyping: no sizes, anonymous axes, stars or sums such as ``Z + 1``."""
-    return {token.lstrip("*#?") for token in shape.split() if re.fullmatch(r"[*#?]*[A-Za-z]\w*", token)}
+    """Names of single dimensions in a shape of jaxtyping: no sizes, no anonymous axes, nothing behind a star."""
+    return {token.lstrip("#?") for token in shape.split() if re.fullmatch(r"[#?]*[A-Za-z]\w*", token)}
 
 
 def annotations() -> dict[str, set[str]]:
@@ -55,7 +55,7 @@ def test_the_glossary_explains_every_dimension_name_and_no_other():
 
 
 def test_names_are_read_from_shapes():
-    assert names_of("*batch H W 3") == {"batch", "H", "W"}
+    assert names_of("*batch H W 3") == {"H", "W"}
     assert names_of(" Z") == {"Z"}
     assert names_of("_ #n ... 2") == {"n"}
     assert {"H", "W", "Z"} <= set(annotations())

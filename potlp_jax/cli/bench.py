@@ -6,7 +6,7 @@ from typing import Any
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from potlp_jax.bench.perception import measure_looking
+from potlp_jax.bench.perception import measure_perception
 from potlp_jax.bench.planner import (
     DistanceRow,
     PhaseRow,
@@ -27,7 +27,7 @@ from potlp_jax.environments.registry import make
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for
 from potlp_jax.planning.policies import DecisionConfig
 
-PARTS = ("search", "distances", "decision", "looking")
+PARTS = ("search", "distances", "decision", "perception")
 
 
 def run_bench(
@@ -62,7 +62,7 @@ def run_bench(
             generator = make(environment)
             task = read_environment_task(generator, task_name)
             # First of all, so that a missing one is told before anything long.
-            trained = estimator_for(task.propositions) if "looking" in chosen else None
+            trained = estimator_for(task.propositions) if "perception" in chosen else None
             scene = make_scene(make_world(environment, size, world), task)
             progress.update(bar, description="compiling and measuring")
             rows |= _measure_scene(scene, trained, chosen, decision, sources, repeats)
@@ -87,7 +87,7 @@ def _measure_scene(
     if "decision" in chosen:
         rows["decision"] = measure_decision(scene, decision, repeats)
     if trained is not None:
-        rows["looking"] = measure_looking(scene, trained, decision, repeats)
+        rows["perception"] = measure_perception(scene, trained, decision, repeats)
     return rows
 
 
@@ -135,8 +135,8 @@ def _print(rows: dict[str, list[Any]], where: dict[str, Any]) -> None:
         out.print(_distance_table(rows["distances"]))
     if "decision" in rows:
         out.print(_phase_table("one decision, by phase", rows["decision"]))
-    if "looking" in rows:
-        out.print(_phase_table("looking, and one decision with the trained network, by phase", rows["looking"]))
+    if "perception" in rows:
+        out.print(_phase_table("perception, and one decision with the trained network, by phase", rows["perception"]))
     out.print("medians; compile is what XLA took, run is one call after a warm-up", style="dim")
 
 

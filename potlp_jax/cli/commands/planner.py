@@ -62,7 +62,7 @@ def export_command(
 
 [cyan]potlp bench --parts decision --environment firefighting --json[/cyan]
 
-[cyan]potlp bench --parts looking --environment firefighting --world 1[/cyan] - what the camera and the network add
+[cyan]potlp bench --parts perception --environment firefighting --world 1[/cyan] - what the camera and the network add
 
 [dim]Compiled anew for every measurement: the cache of compiled programs is left out.[/dim]
 """,
@@ -70,7 +70,7 @@ def export_command(
 @clear_errors
 def bench_command(
     parts: Annotated[
-        str, typer.Option("--parts", help="search, distances, decision, looking; joined by commas.")
+        str, typer.Option("--parts", help="search, distances, decision, perception; joined by commas.")
     ] = "search,distances,decision",
     family: Annotated[str, typer.Option(help="Family of benchmark problems for the search.")] = "three-single",
     subgoals: Annotated[int, typer.Option(min=1, help="Subgoals of the problems for the search.")] = 8,
