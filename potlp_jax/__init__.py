@@ -4,6 +4,7 @@
 imported on first use, so that ``import potlp_jax`` itself takes milliseconds and loads no JAX.
 """
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -150,10 +151,10 @@ def __getattr__(name: str) -> Any:
     """Import a public name when it is first asked for (PEP 562)."""
     if name == "__version__":
         # Imported here because it takes 25 ms, which nobody should pay who does not ask.
-        import importlib.metadata
+        from importlib.metadata import version
 
         # From the installed package, so that the version is written in pyproject.toml alone.
-        value = importlib.metadata.version("potlp-jax")
+        value = version("potlp-jax")
     elif name in _HOME:
         value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
     else:
