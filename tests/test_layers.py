@@ -19,6 +19,7 @@ ORDER = (
     "export",
     "learning",
     "trials",
+    "recipes",
     "logs",
     "sweep",
     "verify",
