@@ -19,9 +19,9 @@ from potlp_jax.cli.output import console, fail, print_json
 from potlp_jax.errors import MapWarning
 
 if TYPE_CHECKING:
+    from potlp_jax.environments.ros.cleaning import CleanMap
     from potlp_jax.environments.ros.map_files import OccupancyMap
     from potlp_jax.environments.ros.places import Disc, Places, Point, Polygon, Region
-    from potlp_jax.environments.ros.ros_map import CleanMap
     from potlp_jax.environments.ros.survey import MapSurvey, Passage
 
 PLACE_RADIUS: float = 0.5
@@ -61,8 +61,8 @@ def inspect_map(
     file: MapFile, resolution: Resolution = 0.2, radius: Radius = 0.1, start: Start = None, json: Json = False
 ) -> None:
     """Show what a map holds, its narrowest passages, what is wrong with it, and what cleaning would do."""
+    from potlp_jax.environments.ros.cleaning import clean_map
     from potlp_jax.environments.ros.map_files import load_map
-    from potlp_jax.environments.ros.ros_map import clean_map
     from potlp_jax.environments.ros.survey import survey_map
 
     with _caught_warnings() as remarks:
@@ -107,9 +107,9 @@ def write_clean_map(
     json: Json = False,
 ) -> None:
     """Write the grid on which the robot moves, where all else is an obstacle, as a ROS map."""
+    from potlp_jax.environments.ros.cleaning import clean_map
     from potlp_jax.environments.ros.map_files import load_map
     from potlp_jax.environments.ros.map_writer import save_map
-    from potlp_jax.environments.ros.ros_map import clean_map
 
     image_map = load_map(file)
     own = {path.resolve() for path in (image_map.settings.file, image_map.settings.image)}
@@ -172,9 +172,9 @@ def label_map(
     json: Json = False,
 ) -> None:
     """Say in metres where propositions are true, and check that a robot gets there."""
+    from potlp_jax.environments.ros.cleaning import clean_map
     from potlp_jax.environments.ros.map_files import load_map
     from potlp_jax.environments.ros.places import Places, check_points, load_places, place_letters, save_places
-    from potlp_jax.environments.ros.ros_map import clean_map
 
     target = file.with_suffix(".places.yaml") if out is None else out
     if target.exists() and not add:
@@ -225,8 +225,9 @@ def preview_map(
     """Draw a map in metres: what the robot can reach, what is cut off, propositions and start."""
     import jax
 
+    from potlp_jax.environments.ros.cleaning import clean_map
     from potlp_jax.environments.ros.map_files import load_map
-    from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig, clean_map
+    from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig
     from potlp_jax.view.map_preview import draw_map, draw_places
     from potlp_jax.view.style import save_figure
 
