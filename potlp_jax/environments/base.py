@@ -69,6 +69,7 @@ class Generator(abc.ABC):
         Raises:
             TaskError: there is no such task, or the formula is none.
         """
+        # A number that is none of the tasks would be read as a formula, in which 1 and 0 are constants.
         formula = self.tasks.get(str(text), str(text))
         if formula.strip().isdecimal():
             known = ", ".join(f"{number} ({entry})" for number, entry in self.tasks.items()) or "none"
@@ -78,5 +79,6 @@ class Generator(abc.ABC):
 
 def host_generators(key: PRNGKeyArray, count: int) -> tuple[np.random.Generator, ...]:
     """Independent NumPy generators from one typed key, so that, say, new colours never move a wall."""
+    # SeedSequence mixes the words of the key, and its children are independent by construction.
     words = np.asarray(jax.random.key_data(key)).tolist()
     return tuple(np.random.default_rng(child) for child in np.random.SeedSequence(words).spawn(count))

@@ -23,10 +23,12 @@ from jaxtyping import PRNGKeyArray
 
 from potlp_jax.errors import WorldError
 
+# The four highest bits number the split, which leaves space for sixteen.
 _INDEX_BITS = 28
 MAX_INDEX: int = 2**_INDEX_BITS - 1
 """Largest index of a world in a split."""
 
+# Any number would do; another one would make other worlds, and published results would not be comparable.
 _ROOT_SEED = 20210531
 
 
@@ -76,5 +78,7 @@ def world_key(split: Split | str, index: int, family: str) -> PRNGKeyArray:
     number = list(Split).index(Split(split))
     if not 0 <= index <= MAX_INDEX:
         raise ValueError(f"the index of a world must lie in 0..{MAX_INDEX}, found {index}")
+    # The implementation is named, so that no setting of jax changes the worlds; CRC-32, because Python's own hash of a
+    # text differs between processes.
     family_key = jax.random.fold_in(jax.random.key(_ROOT_SEED, impl="threefry2x32"), zlib.crc32(family.encode()))
     return jax.random.fold_in(family_key, number << _INDEX_BITS | index)

@@ -58,6 +58,8 @@ class GymTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         height, width = self.env.worlds.shape
         subgoals, states = self.env.config.decision.frontiers.max_subgoals, self.env.task.dfa.num_states
         longest = max(height, width) - 1
+        # No shortest path visits a product state twice, and no step is longer than a diagonal.
+        farthest = 1.5 * height * width * states * float(self.env.worlds.resolution[0])
 
         def box(low: float | int, high: float | int, *shape: int, dtype: Any = np.int32) -> spaces.Box:
             return spaces.Box(low, high, shape, dtype)
@@ -70,8 +72,8 @@ class GymTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
                 "state": box(0, states - 1),
                 "subgoals": box(0, longest, subgoals, 2),
                 "subgoal_mask": spaces.MultiBinary(subgoals),
-                "distances": box(0.0, np.inf, subgoals, states, dtype=np.float32),
-                "finish_distance": box(0.0, np.inf, dtype=np.float32),
+                "distances": box(0.0, farthest, subgoals, states, dtype=np.float32),
+                "finish_distance": box(0.0, farthest, dtype=np.float32),
                 "action_mask": spaces.MultiBinary(self.env.num_actions),
             }
         )
