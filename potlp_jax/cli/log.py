@@ -243,10 +243,10 @@ def replay_log(
     import jax
 
     from potlp_jax.cli.inputs import RECORD, read_policy, read_trained_estimator, trial_config
-    from potlp_jax.environments.tasks import read_task
     from potlp_jax.logs.log import LogConfig
     from potlp_jax.logs.replaying import replay
     from potlp_jax.logs.working_grid import GridConfig
+    from potlp_jax.task.reading import read_task
     from potlp_jax.view.maps import draw_trial
     from potlp_jax.view.replay_page import replay_page
     from potlp_jax.view.style import save_figure

@@ -63,7 +63,6 @@ def run_one(
         trial_config,
     )
     from potlp_jax.environments.registry import make
-    from potlp_jax.environments.tasks import environment_task
     from potlp_jax.trials.loop import run_trial, trial_key
     from potlp_jax.trials.record import Outcome
 
@@ -71,7 +70,7 @@ def run_one(
     chosen_split = read_split(split, generator)
     chosen_policy = default_policy(generator) if policy is None else read_policy(policy)
     trained = read_trained_estimator(estimator)
-    asked = environment_task(generator, task)
+    asked = generator.task(task)
     made = make_world(generator, chosen_split, world)
     folder = None if out is None else make_folder(out)
     with progress_bar() as progress:

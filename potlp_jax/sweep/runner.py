@@ -19,7 +19,6 @@ import jax
 
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, world_key
-from potlp_jax.environments.tasks import environment_task
 from potlp_jax.errors import WorldError
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, read_estimator
 from potlp_jax.planning.policies import Policy
@@ -198,7 +197,7 @@ class Sweep:
     def _tasks(self) -> dict[tuple[str, str], tuple[Task, TaskArrays]]:
         """Tasks by environment and formula, padded per environment to one size: one compilation serves all."""
         tasks = {
-            (cell.environment, cell.task): environment_task(self._generator(cell.environment), cell.task)
+            (cell.environment, cell.task): self._generator(cell.environment).task(cell.task)
             for cell in self.specification.cells
         }
         sizes: dict[str, TaskSizes] = {}

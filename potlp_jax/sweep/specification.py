@@ -26,7 +26,6 @@ import yaml
 from potlp_jax.codec import config_from_dict, json_copy, with_settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
-from potlp_jax.environments.tasks import environment_task
 from potlp_jax.errors import SpecificationError, TaskError, WorldError
 from potlp_jax.planning.policies import Policy
 from potlp_jax.trials.config import TrialConfig, trial_config_for
@@ -197,7 +196,7 @@ def _formula(environment: str, task: Any, where: str) -> str:
     """A task by number as its formula, any other (a formula, a ``.hoa`` file) as it is. Raises for what is no task."""
     generator = make(environment)
     try:
-        environment_task(generator, str(task))
+        generator.task(task)
     except TaskError as error:
         raise SpecificationError(f"{where}: tasks: {error}") from error
     return generator.tasks.get(str(task), str(task))
