@@ -50,6 +50,7 @@ PARCELS_PREFIX = "parcels:"
 
 def usable_splits(family: str) -> tuple[Split, ...]:
     """The splits from which worlds of a family may be drawn."""
+    # By name, because a family says so itself nowhere else that a command line could look up before it reads a map.
     return (Split.TEST,) if family.startswith((FLOOR_PLAN_PREFIX, PARCELS_PREFIX)) else tuple(Split)
 
 
@@ -68,7 +69,15 @@ def check_split(split: Split, family: str) -> None:
 
 
 def world_key(split: Split | str, index: int, family: str) -> PRNGKeyArray:
-    """The typed key of world ``index`` of a split of a family of worlds.
+    """The key of a world.
+
+    Args:
+        split: what the world may be used for.
+        index: number of the world in the split.
+        family: name of the family (``Generator.name``).
+
+    Returns:
+        A typed key, of which ``Generator.generate`` makes the world.
 
     Raises:
         ValueError: where the index is negative or above ``MAX_INDEX``, or the split has no such name.

@@ -127,10 +127,12 @@ class TaskEnv:
             task: over the worlds' propositions.
             config: default: what the worlds call for.
         """
+        # Their static parts (propositions, settings) must agree, which jax.tree.map checks.
         self.worlds: World = jax.tree.map(lambda *leaves: jnp.stack(leaves), *worlds)
         self.task = task
         self.config: TrialConfig = trial_config_for(worlds[0]) if config is None else config
         self._edges = len(task.edges)
+        # What the planner calls A - 1: all pairs of a subgoal and an edge come first.
         self._finish = self.config.decision.frontiers.max_subgoals * self._edges
         self._rules = Rules(policy=Policy.BASELINE, config=self.config, network=None)
 
@@ -149,7 +151,11 @@ class TaskEnv:
             task: number of the family's task, a formula over its propositions, or a task.
             worlds: their numbers. All are made now and kept on the device.
             split: from which they are taken.
+
+        Returns:
+            The environment, with the settings that the family calls for.
         """
+        # Worlds are made on the host; what is compiled only picks one of them.
         made = [generator.world(index, split) for index in worlds]
         return cls(made, task if isinstance(task, Task) else generator.task(task))
 
@@ -185,6 +191,7 @@ class TaskEnv:
         progress = advance(self._rules, before, state.scene, self._move(state.situation, action))
         after = self._assessed(state.scene, progress)
         resolution = state.scene.world.resolution
+        # From counts of moves, so that the sum over an episode does not depend on how it was cut into legs.
         reward = -(after.progress.travelled - before.travelled) * resolution
         failed = before.running & ~after.progress.running & (after.progress.outcome != _SATISFIED)
         reward = reward - jnp.where(failed, self._dead_end_cost(state.scene), 0.0)
@@ -194,6 +201,7 @@ class TaskEnv:
     def _assessed(self, scene: Scene, progress: Progress) -> EnvState:
         """The state with known space assessed; where no action is left the task is infeasible."""
         situation = assess(progress.belief, progress.cell, progress.state, scene.task, self.config.decision.frontiers)
+        # Assessed once, for this observation and for the next move: distances are most of a step's work.
         nowhere = progress.running & ~jnp.any(self._action_mask(situation))
         outcome = jnp.where(nowhere, jnp.int8(_INFEASIBLE), progress.outcome)
         return EnvState(scene=scene, progress=dataclasses.replace(progress, outcome=outcome), situation=situation)
@@ -235,6 +243,7 @@ class TaskEnv:
 
     def _time_step(self, state: EnvState, step_type: Int8[Array, ""], reward: Float32[Array, ""]) -> TimeStep:
         progress = state.progress
+        # A budget is no part of the task: what could still have been earned is not 0 (gymnasium calls it truncation).
         goes_on = progress.running | (progress.outcome == _BUDGET)
         cost = progress.travelled * state.scene.world.resolution
         return TimeStep(
@@ -255,6 +264,7 @@ class TaskEnv:
             state=progress.state,
             subgoals=situation.subgoals.cells,
             subgoal_mask=situation.subgoals.mask,
+            # Networks do not take infinities; the mask says which entries mean something.
             distances=jnp.where(jnp.isfinite(distances), distances, 0.0),
             finish_distance=jnp.where(jnp.isfinite(finish), finish, 0.0),
             # After the end there is nothing to choose.

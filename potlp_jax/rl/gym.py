@@ -49,6 +49,7 @@ class GymTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self._worlds, self._split = worlds, split
         asked = task if isinstance(task, Task) else self._generator.task(task)
         self.env = TaskEnv([self._generator.world(0, split)], asked)
+        # All worlds of a family have one shape, so that both are compiled once.
         self._reset, self._step = jax.jit(self.env.reset_in), jax.jit(self.env.step)
         self._state: EnvState | None = None
         self.action_space = spaces.Discrete(self.env.num_actions)
@@ -91,6 +92,7 @@ class GymTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             The first observation and ``info``.
         """
         super().reset(seed=seed)
+        # Drawn in any case, so that asking for a world does not shift what comes after.
         drawn = int(self.np_random.integers(self._worlds))
         index = drawn if options is None else int(options.get("world", drawn))
         self._state, time_step = self._reset(self._generator.world(index, self._split))
