@@ -22,7 +22,8 @@ from potlp_jax.learning.dataset import decode, finished_shards, read_dataset, re
 from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.recording import survey
 from potlp_jax.task.task import Task
-from potlp_jax.world.panorama import CameraConfig, render
+from potlp_jax.world.camera import CameraConfig
+from potlp_jax.world.renderer import render
 from potlp_jax.world.sensing import SensorConfig
 from tests.reference.dijkstra import dijkstra, grid_moves
 from tests.reference.sensing import visible

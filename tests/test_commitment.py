@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from potlp_jax.planning.commitment import SAME_WITHIN, Intention, intention_of, keep_on
+from potlp_jax.planning.commitment import SAME_WITHIN, Intention, apply_commitment, intention_of
 from potlp_jax.planning.policies import DecisionConfig
 from potlp_jax.planning.search.api import Plan
 from potlp_jax.task.task import Task
@@ -58,7 +58,7 @@ def _intention(cell=(10, 40), edge=1, state=STATE):
 
 def _kept(plan, intention, commitment=0.2, state=STATE, subgoals=None):
     subgoals = _subgoals() if subgoals is None else subgoals
-    return jax.jit(keep_on)(plan, intention, jnp.int32(state), subgoals, TASK, jnp.float32(commitment))
+    return jax.jit(apply_commitment)(plan, intention, jnp.int32(state), subgoals, TASK, jnp.float32(commitment))
 
 
 @pytest.mark.parametrize(("commitment", "subgoal"), [(0.0, 0), (0.14, 0), (0.16, 1), (0.2, 1)])

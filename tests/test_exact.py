@@ -77,7 +77,7 @@ def test_two_subgoals_by_hand():
 
 
 def test_two_things_behind_one_subgoal():
-    """Having found one thing, the robot looks for the other without leaving: D is 0 and nothing is owed."""
+    """Having found one thing, the robot looks for the other without leaving: D is 0 and nothing is pending."""
     task = task_of("F a & F b")
     fields = random_fields(task, 1, 0)
     travel = np.full((2, 4, 1, 4), np.inf)

@@ -67,15 +67,15 @@ def check_knowledge(problem, history, position, reference, events):
         known = reference.knowledge(events, s)
         assert {m for m in range(conditions) if holds[s, m]} == {m for m, truth in known.items() if truth}
         assert {m for m in range(conditions) if fails[s, m]} == {m for m, truth in known.items() if not truth}
-        settled = position.knowledge[s]
-        assert settled.holds == sum(1 << m for m in range(conditions) if holds[s, m])
-        assert settled.fails == sum(1 << m for m in range(conditions) if fails[s, m])
+        known = position.knowledge[s]
+        assert known.holds == sum(1 << m for m in range(conditions) if holds[s, m])
+        assert known.fails == sum(1 << m for m in range(conditions) if fails[s, m])
 
 
 def check_terms(terms, history, reference, rollouts, position, events, actions):
-    place, state, owed = reference.situation(events)
-    assert (int(history.place), int(history.state)) == (place, state) == (position.place, position.state)
-    np.testing.assert_allclose(history.owed, owed, rtol=1e-5)
+    location, state, pending_cost = reference.situation(events)
+    assert (int(history.location), int(history.state)) == (location, state) == (position.location, position.state)
+    np.testing.assert_allclose(history.pending_cost, pending_cost, rtol=1e-5)
     for index, action in actions.items():
         values = [terms.success_probability, terms.success_cost, terms.failure_cost]
         expected = reference.estimate(events, action)
@@ -100,9 +100,9 @@ def test_more_conditions_than_brute_force_can_take(formula):
             assert available.tolist() == list(rollouts.available(position))
             holds, fails = (np.asarray(flags) for flags in unpacked(history, conditions))
             assert not np.any(holds & fails)
-            for s, settled in enumerate(position.knowledge):
-                assert settled.holds == sum(1 << int(m) for m in np.flatnonzero(holds[s]))
-                assert settled.fails == sum(1 << int(m) for m in np.flatnonzero(fails[s]))
+            for s, known in enumerate(position.knowledge):
+                assert known.holds == sum(1 << int(m) for m in np.flatnonzero(holds[s]))
+                assert known.fails == sum(1 << int(m) for m in np.flatnonzero(fails[s]))
             available = available[available < problem.action_count - 1]
             if not len(available):
                 break
@@ -120,9 +120,9 @@ def test_several_cubes_leave_the_last_one():
     problem = problem_of(task, fields)
     rollouts = Rollouts(problem)
     closure = rollouts.closure
-    settled = closure.settle(rollouts.root().knowledge[0], 2, True)
-    assert settled.holds == 0b100
-    assert closure.settle(settled, 0, False) == (0b110, 0b001)
+    known = closure.add_outcome(rollouts.root().knowledge[0], 2, True)
+    assert known.holds == 0b100
+    assert closure.add_outcome(known, 0, False) == (0b110, 0b001)
 
 
 def test_success_is_certain_the_second_time_and_owes_the_way_back():
@@ -135,9 +135,9 @@ def test_success_is_certain_the_second_time_and_owes_the_way_back():
     assert float(start.success_probability[first]) == 0.5
     assert float(start.distance[first]) == float(problem.travel[SUBGOALS, 0, 0, 0])
     history = step_jit(problem, initial_history(problem), jnp.int32(first), jnp.asarray(True))
-    assert (int(history.place), int(history.state)) == (0, 1)
+    assert (int(history.location), int(history.state)) == (0, 1)
     cost_of_a = float(problem.success_cost[0, int(task.arrays.edge_condition[first])])
-    assert float(history.owed) == cost_of_a
+    assert float(history.pending_cost) == cost_of_a
     terms = terms_jit(problem, history)
     inside, outside = edge_of(task, 1, 3), edge_of(task, 1, 3) + problem.edge_count
     assert float(terms.distance[inside]) == 0.0

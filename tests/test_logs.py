@@ -35,8 +35,8 @@ from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import NEVER_SEEN, Outcome, belief_seen_by, load_trial
 from potlp_jax.trials.replay import panorama_at
 from potlp_jax.trials.robot import Robot, Stop
+from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.grid import BeliefMap, make_world
-from potlp_jax.world.panorama import CameraConfig
 from tests.reference.tour import (
     CAMERA,
     FORMATS,

@@ -86,7 +86,7 @@ def test_converges_to_the_exact_solution(problems, solutions):
 
 
 def test_finish_beyond_the_last_subgoal_in_the_last_state():
-    """There the finish action must not be taken for an attempt on the spot, which would pay no way back."""
+    """There the finish action must not be taken for an attempt where the robot is, which would pay no way back."""
     formula = "F(a & F(b & F a))"
     assert not task_of(formula).dfa.accepting[-1]
     config = SearchConfig(simulations=2000, optimism=1.0)
@@ -213,7 +213,8 @@ def test_orders_of_the_same_events_share_a_node():
     reached = reached[reached != Tree.UNVISITED]
     assert set(reached) == set(range(1, size))
     what = [
-        (int(tree.place[n]), int(tree.state[n]), tree.holds[n].tobytes(), tree.fails[n].tobytes()) for n in range(size)
+        (int(tree.location[n]), int(tree.state[n]), tree.holds[n].tobytes(), tree.fails[n].tobytes())
+        for n in range(size)
     ]
     assert len(set(what)) == size
 

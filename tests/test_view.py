@@ -352,7 +352,7 @@ def test_a_decision_that_keeps_on_says_what_was_better(trial):
 
 def _tree_node(actions=(), value=7.0, **others):
     flags = {"accepting": False, "dead_end": False} | others
-    return {"place": None, "state": 0, "value": value, "visits": 100, "actions": list(actions), **flags}
+    return {"location": None, "state": 0, "value": value, "visits": 100, "actions": list(actions), **flags}
 
 
 def _tree_action(subgoal, q_value, visits, success=None, failure=None):

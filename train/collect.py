@@ -29,7 +29,8 @@ from jaxtyping import Array, Int32, UInt8
 from tqdm import tqdm
 
 from potlp_jax.cache import enable_compilation_cache
-from potlp_jax.environments import Generator, make
+from potlp_jax.environments.base import Generator
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import DatasetError
 from potlp_jax.learning.dataset import (
@@ -44,10 +45,11 @@ from potlp_jax.learning.dataset import (
 from potlp_jax.learning.mistake_costs import WeightBounds
 from potlp_jax.learning.questions import HELD_OUT, TaskDistribution
 from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views
-from potlp_jax.trials.config import TrialConfig, with_settings
+from potlp_jax.trials.config import trial_config_for
 from potlp_jax.trials.loop import versions
+from potlp_jax.world.camera import CameraConfig, Disturbance, disturb
 from potlp_jax.world.grid import World
-from potlp_jax.world.panorama import CameraConfig, Disturbance, disturb, render
+from potlp_jax.world.renderer import render
 from train.explorer import Explorer, ExplorerConfig
 
 
@@ -238,13 +240,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--classes", type=int, default=defaults.classes)
     parser.add_argument("--format", choices=("jpeg", "png"), default=defaults.image_format)
     parser.add_argument("--quality", type=int, default=defaults.quality, help="of JPEG")
-    parser.add_argument("--noise", type=float, default=0.0, help="disturbances of the image, see world/panorama.py")
+    parser.add_argument("--noise", type=float, default=0.0, help="disturbances of the image, see world/camera.py")
     parser.add_argument("--exposure", type=float, default=0.0)
     parser.add_argument("--colour", type=float, default=0.0)
     options = parser.parse_args(arguments)
     enable_compilation_cache()
     generator = make(options.environment)
-    frontiers = with_settings(TrialConfig(), generator.settings).decision.frontiers
+    frontiers = trial_config_for(generator).decision.frontiers
     config = CollectConfig(
         frontiers=frontiers,
         explorer=ExplorerConfig(frontiers=frontiers),

@@ -97,15 +97,15 @@ def goals_task(goals: int) -> Task:
 
 
 def goals_problem(goals: int, subgoals: int, seed: int) -> PlanningProblem:
-    """A random map on which nothing is in known space: straight ways between subgoals, every one reachable."""
+    """A random map on which nothing is in known space: straight paths between subgoals, every one reachable."""
     task, rng = goals_task(goals), np.random.default_rng((goals, subgoals, seed))
     states, classes = task.sizes.states, task.sizes.classes
     places = rng.uniform(0.0, 100.0, (subgoals + 1, 2))
-    ways = 1.0 + np.linalg.norm(places[:, None] - places[None, :-1], axis=-1)
+    path_costs = 1.0 + np.linalg.norm(places[:, None] - places[None, :-1], axis=-1)
     stays = np.eye(states, dtype=bool)[None, :, None, :]
     return PlanningProblem.from_arrays(
         task.arrays,
-        travel=np.where(stays, ways[:, None, :, None], np.inf),
+        travel=np.where(stays, path_costs[:, None, :, None], np.inf),
         finish=np.full((subgoals + 1, states), np.inf),
         success_probability=rng.uniform(0.05, 0.6, (subgoals, classes)),
         success_cost=rng.uniform(5.0, 60.0, (subgoals, classes)),

@@ -10,7 +10,7 @@ from potlp_jax.learning.memory import remember
 from potlp_jax.learning.network import EstimatorNetwork
 from potlp_jax.planning.policies import DecisionConfig, Policy, assess
 from potlp_jax.trials.robot import photograph
-from potlp_jax.world.panorama import CameraConfig, Disturbance
+from potlp_jax.world.camera import CameraConfig, Disturbance
 
 
 def measure_looking(

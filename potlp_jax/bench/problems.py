@@ -1,8 +1,8 @@
 """Benchmark problems for planners: eight families of tasks on random maps, as many instances as wanted.
 
-An instance is a map about 100 cells on a side, with the robot, S subgoals and sometimes a few labelled spots on it.
-Places are joined by ways of octile length times a random detour, closed under shortest paths, so travel is a metric.
-Travel and finish costs are shortest paths in the product of the places and the task's automaton: the way between two
+An instance is a map about 100 cells on a side, with the robot, S subgoals and sometimes a few labelled cells on it.
+Places are joined by paths of octile length times a random detour, closed under shortest paths, so travel is a metric.
+Travel and finish costs are shortest paths in the product of the places and the task's automaton: the path between two
 places reads empty letters, arriving reads the place's own letter, which is empty at most subgoals. Estimates look like
 those of a trained estimator: a share of them, which differs from map to map, is confident, mostly of failure.
 
@@ -34,8 +34,8 @@ DEAD_END_COST: float = 500.0
 
 _SIDE = 100.0
 _LARGEST_DETOUR = 1.8
-_MOST_SPOTS = 2
-_FARTHEST_SPOT = 100.0
+_MOST_LABELLED = 2
+_FARTHEST_LABELLED = 100.0
 
 _SEVERAL_CUBES = (
     "F(a & (b | c))",
@@ -182,7 +182,7 @@ def family_problem(family: str, subgoals: int, split: Split, index: int) -> Plan
 
 
 def random_metric(places: int, rng: np.random.Generator) -> Float64[np.ndarray, "N N"]:
-    """Shortest ways between random places of the map: symmetric, 0 on the diagonal only, triangle inequality."""
+    """Shortest paths between random places of the map: symmetric, 0 on the diagonal only, triangle inequality."""
     points = rng.uniform(0.0, _SIDE, (places, 2))
     offset = np.abs(points[:, None] - points[None])
     octile = offset.max(axis=-1) + (DIAGONAL - 1.0) * offset.min(axis=-1)
@@ -204,7 +204,7 @@ def _start_state(task: Task, rng: np.random.Generator) -> int:
 
 
 def _after_empty_letters(task: Task) -> Int32[np.ndarray, " Z"]:
-    """State after as many empty letters as there are states: a way through free space is longer than that."""
+    """State after as many empty letters as there are states: a path through free space is longer than that."""
     state = np.arange(task.dfa.num_states, dtype=np.int32)
     for _ in range(task.dfa.num_states):
         state = task.dfa.transitions[state, 0]
@@ -214,20 +214,21 @@ def _after_empty_letters(task: Task) -> Int32[np.ndarray, " Z"]:
 def _geometry(task: Task, sizes: TaskSizes, subgoals: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """``travel`` and ``finish``: shortest paths in the product of places and automaton.
 
-    Nodes are subgoals, robot, labelled spots. A spot lies off the map's middle, at the end of a way of its own.
+    Nodes are subgoals, robot, labelled cells. Labelled cells lie off the map's middle, each at the end of a path of its
+    own.
     """
     dfa, states, robot = task.dfa, task.dfa.num_states, subgoals
-    spots = int(rng.integers(1, _MOST_SPOTS + 1)) if rng.random() < 0.3 else 0
-    way = random_metric(subgoals + 1 + spots, rng)
-    aside = np.concatenate([np.zeros(subgoals + 1), rng.uniform(0.0, _FARTHEST_SPOT, spots)])
-    way = np.where(np.eye(len(way), dtype=bool), 0.0, way + aside[:, None] + aside[None, :])
-    letters = _place_letters(task, subgoals, spots, rng)
+    labelled = int(rng.integers(1, _MOST_LABELLED + 1)) if rng.random() < 0.3 else 0
+    path_cost = random_metric(subgoals + 1 + labelled, rng)
+    aside = np.concatenate([np.zeros(subgoals + 1), rng.uniform(0.0, _FARTHEST_LABELLED, labelled)])
+    path_cost = np.where(np.eye(len(path_cost), dtype=bool), 0.0, path_cost + aside[:, None] + aside[None, :])
+    letters = _place_letters(task, subgoals, labelled, rng)
     arrive = dfa.transitions[_after_empty_letters(task)][:, letters].T
-    cost = _shortest(_product_moves(way, arrive, dfa.trap))
+    cost = _shortest(_product_moves(path_cost, arrive, dfa.trap))
 
     entered = dfa.transitions[:, letters].T
-    start = np.where(np.arange(len(way))[:, None] == robot, np.arange(states)[None, :], entered)[: subgoals + 1]
-    begins = cost.reshape(len(way), states, len(way), states)[np.arange(subgoals + 1)[:, None], start]
+    start = np.where(np.arange(len(path_cost))[:, None] == robot, np.arange(states)[None, :], entered)[: subgoals + 1]
+    begins = cost.reshape(len(path_cost), states, len(path_cost), states)[np.arange(subgoals + 1)[:, None], start]
     begins[dfa.trap[start]] = np.inf
     travel = np.full((subgoals + 1, sizes.states, subgoals, sizes.states), np.inf)
     travel[:, :states, :, :states] = begins[:, :, :subgoals]
@@ -236,9 +237,10 @@ def _geometry(task: Task, sizes: TaskSizes, subgoals: int, rng: np.random.Genera
     return {"travel": travel, "finish": finish}
 
 
-def _place_letters(task: Task, subgoals: int, spots: int, rng: np.random.Generator) -> Int32[np.ndarray, " N"]:
-    """One proposition at each spot; in every fourth problem one at a subgoal, unless that alone satisfies the task."""
-    letters = 1 << rng.integers(0, len(task.propositions), subgoals + 1 + spots, dtype=np.int32)
+def _place_letters(task: Task, subgoals: int, labels: int, rng: np.random.Generator) -> Int32[np.ndarray, " N"]:
+    """One proposition at each labelled cell; in every fourth problem one at a subgoal, unless that alone satisfies
+    the task."""
+    letters = 1 << rng.integers(0, len(task.propositions), subgoals + 1 + labels, dtype=np.int32)
     chosen = int(rng.integers(0, subgoals)) if rng.random() < 0.25 else subgoals
     satisfies = task.dfa.accepting[task.dfa.transitions[:, letters[chosen]]] & ~task.dfa.accepting
     place = np.arange(len(letters))
@@ -247,15 +249,15 @@ def _place_letters(task: Task, subgoals: int, spots: int, rng: np.random.Generat
 
 
 def _product_moves(
-    way: Float64[np.ndarray, "N N"], arrive: Int32[np.ndarray, "N Z"], trap: np.ndarray
+    path_cost: Float64[np.ndarray, "N N"], arrive: Int32[np.ndarray, "N Z"], trap: np.ndarray
 ) -> Float64[np.ndarray, "NZ NZ"]:
     """Cost of going straight from one (place, state) to another; ``arrive[v, z]`` is the state in which v is reached
-    from state z. No way leads into a trap."""
+    from state z. No path leads into a trap."""
     places, states = arrive.shape
     moves = np.full((places, states, places, states), np.inf)
     for to, state in np.ndindex(places, states):
         if not trap[state] and not trap[arrive[to, state]]:
-            moves[:, state, to, arrive[to, state]] = np.where(np.arange(places) == to, np.inf, way[:, to])
+            moves[:, state, to, arrive[to, state]] = np.where(np.arange(places) == to, np.inf, path_cost[:, to])
     return moves.reshape(places * states, places * states)
 
 

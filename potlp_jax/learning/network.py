@@ -36,7 +36,7 @@ from jaxtyping import Array, Float32, Int8, PRNGKeyArray, UInt8
 
 from potlp_jax.errors import NetworkError
 from potlp_jax.learning.fovea import ABOVE, BAND, BELOW, bands_of, packed, patch, unpacked
-from potlp_jax.world.panorama import CameraConfig, floor_rows
+from potlp_jax.world.camera import CameraConfig, floor_rows
 
 Params = Any
 """Parameters of the network: nested dictionaries of float32 arrays, ``{"first": ..., "second": ...}``."""

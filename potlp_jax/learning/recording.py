@@ -24,9 +24,9 @@ from potlp_jax.learning.questions import Question, draw_questions, question_shee
 from potlp_jax.planning.distances.product import grid_distances
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.task.task import Task, TaskArrays
+from potlp_jax.world.camera import bearing
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
 from potlp_jax.world.grid import BeliefMap, World
-from potlp_jax.world.panorama import bearing
 from potlp_jax.world.sensing import SensorConfig, visible
 
 

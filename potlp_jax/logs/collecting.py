@@ -18,8 +18,8 @@ from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views
 from potlp_jax.logs.drive import Drive, Eyes
 from potlp_jax.trials.loop import versions
+from potlp_jax.world.camera import CameraConfig, Disturbance
 from potlp_jax.world.moves import step_lengths
-from potlp_jax.world.panorama import CameraConfig, Disturbance
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -23,11 +23,11 @@ from potlp_jax.logs.pictures import match_pictures, vertical_field
 from potlp_jax.logs.poses import drive_path, read_poses
 from potlp_jax.logs.working_grid import NEVER, GridConfig, WorkingGrid
 from potlp_jax.trials.record import NEVER_SEEN, belief_seen_by
+from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.equirectangular import from_equirectangular
 from potlp_jax.world.frontiers import FrontierConfig, frontier_cells
 from potlp_jax.world.grid import BeliefMap, World, make_world
 from potlp_jax.world.moves import Cell
-from potlp_jax.world.panorama import CameraConfig
 
 CORRECTED_SHARE = 0.02
 """Share of a map's known pixels that are otherwise in the final map, above which it is worth a note."""

@@ -25,10 +25,10 @@ from potlp_jax.logs.transforms import Quaternion, quaternion_of
 from potlp_jax.trials.config import trial_config_from_dict
 from potlp_jax.trials.record import Trial, belief_seen_by
 from potlp_jax.trials.robot import photograph
+from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.equirectangular import to_equirectangular
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.moves import step_lengths
-from potlp_jax.world.panorama import CameraConfig
 
 SECONDS_A_CELL = 0.4
 START = 1_600_000_000 * SECOND

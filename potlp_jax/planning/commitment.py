@@ -38,7 +38,7 @@ class Intention:
         return Intention(cell=jnp.zeros(2, jnp.int32), edge=jnp.int32(0), state=jnp.int32(NO_STATE))
 
 
-def keep_on(
+def apply_commitment(
     plan: Plan,
     intention: Intention,
     state: Int32[Array, ""],

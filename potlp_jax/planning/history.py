@@ -1,6 +1,6 @@
 """What a rollout knows, what follows from it, and what can still be done: the paper's b_h (section III-B).
 
-Knowledge is three-valued - unknown, holds, fails - per subgoal and condition. Attempting an action settles its
+Knowledge is three-valued - unknown, holds, fails - per subgoal and condition. Attempting an action closes its
 condition at its subgoal; what follows is added at once:
 
 * a condition implies every weaker one, so ``holds`` travels forward along the task's implications and ``fails``
@@ -35,9 +35,9 @@ class History:
     """Summary of a rollout: all that later costs and choices depend on.
 
     Attributes:
-      place: node of the problem: the subgoal beyond which the robot is, or S for the robot's own cell.
+      location: node of the problem: the subgoal beyond which the robot is, or S for the robot's own cell.
       state: automaton state.
-      owed: way back out of the unknown region, R_S or R_F of the last action by its outcome; 0 at the robot.
+      pending_cost: way back out of the unknown region, R_S or R_F of the last action by its outcome; 0 at the robot.
       holds: per subgoal, bit mask over conditions known to hold there.
       fails: per subgoal, bit mask over conditions known to fail there.
       visited: per node, bit mask over the states in which the rollout has been there since it last learnt something.
@@ -46,9 +46,9 @@ class History:
     ``pack_bits`` and ``unpack_bits``.
     """
 
-    place: Int32[Array, "*B"]
+    location: Int32[Array, "*B"]
     state: Int32[Array, "*B"]
-    owed: Float32[Array, "*B"]
+    pending_cost: Float32[Array, "*B"]
     holds: UInt32[Array, "*B S W"]
     fails: UInt32[Array, "*B S W"]
     visited: UInt32[Array, "*B S1 V"]
@@ -58,7 +58,7 @@ class History:
 class ActionTerms:
     """The terms of Eq. 3 for every action of one history; the last action is finish (P_S = 1, R_S = R_F = 0).
 
-    ``distance`` is D, the way back that is owed included; inf where the action is not real or out of reach.
+    ``distance`` is D, the pending cost included; inf where the action is not real or out of reach.
     ``certain`` is True where the action's condition is known to hold. Only where ``available`` are the others of use.
     """
 
@@ -99,9 +99,9 @@ class ActionRow:
 class ActionTables:
     """A problem, rearranged by action for search.
 
-    ``actions`` has the leading axis A. ``distance[u, z, a]`` is the way of action ``a`` from node ``u`` in state ``z``,
-    inf where the action is not real. ``backward`` lists for each condition those that imply it; ``cubes`` the classes
-    of each of the Q conditions of several cubes, which are the last Q of the M.
+    ``actions`` has the leading axis A. ``distance[u, z, a]`` is the path cost of action ``a`` from node ``u`` in state
+    ``z``, inf where the action is not real. ``backward`` lists for each condition those that imply it; ``cubes`` the
+    classes of each of the Q conditions of several cubes, which are the last Q of the M.
     """
 
     actions: ActionRow
@@ -129,15 +129,15 @@ def unpack_bits(words: UInt32[Array, "*N w"], count: int) -> Bool[Array, "*N n"]
 
 
 def initial_history(problem: PlanningProblem) -> History:
-    """At the robot, nothing known, nothing owed."""
+    """At the robot, nothing known, nothing pending."""
     subgoals, states = problem.subgoal_count, problem.task.state_mask.shape[-1]
     words = max(1, -(-problem.task.condition_mask.shape[-1] // WORD_BITS))
     unknown = jnp.zeros((subgoals, words), jnp.uint32)
     at_robot = jnp.arange(subgoals + 1)[:, None] == subgoals
     return History(
-        place=jnp.int32(subgoals),
+        location=jnp.int32(subgoals),
         state=problem.dfa_state,
-        owed=jnp.float32(0.0),
+        pending_cost=jnp.float32(0.0),
         holds=unknown,
         fails=unknown,
         visited=pack_bits(at_robot & (jnp.arange(states) == problem.dfa_state)[None, :]),
@@ -190,7 +190,7 @@ def terms_of_all(tables: ActionTables, history: History) -> ActionTerms:
         _per_action(words, rows.subgoal.shape[0]) for words in (history.holds, history.fails, history.visited[:-1])
     )
     probability, success_cost, certain = knowledge_terms(rows, holds, fails)
-    distance = distance_of(rows, history, tables.distance[history.place, history.state])
+    distance = distance_of(rows, history, tables.distance[history.location, history.state])
     leads_back = certain & _overlaps(visited, rows.end_bits)
     live = ~tables.accepting[history.state]
     return ActionTerms(
@@ -203,10 +203,10 @@ def terms_of_all(tables: ActionTables, history: History) -> ActionTerms:
     )
 
 
-def distance_of(rows: ActionRow, history: History, way: Float32[Array, "*A"]) -> Float32[Array, "*A"]:
-    """D (docs/model.md section 5): the way and what is owed; nothing for going on beyond the same subgoal and state."""
-    inside = (rows.subgoal == history.place) & (rows.from_state == history.state)
-    return jnp.where(inside, 0.0, way + history.owed)
+def distance_of(rows: ActionRow, history: History, path_cost: Float32[Array, "*A"]) -> Float32[Array, "*A"]:
+    """D (docs/model.md section 5): path cost and pending cost; 0 for going on beyond the same subgoal and state."""
+    inside = (rows.subgoal == history.location) & (rows.from_state == history.state)
+    return jnp.where(inside, 0.0, path_cost + history.pending_cost)
 
 
 def knowledge_terms(
@@ -248,21 +248,21 @@ def step_row(tables: ActionTables, row: ActionRow, history: History, success: Bo
     here = jnp.arange(subgoals, dtype=jnp.int32)[:, None] == row.subgoal
     holds, fails = knowledge_of(row.subgoal, history)
     _, success_cost, certain = knowledge_terms(row, holds, fails)
-    holds, fails = settle(tables, row, holds, fails, success)
+    holds, fails = add_outcome(tables, row, holds, fails, success)
     state = jnp.where(success, row.to_state, row.from_state)
     nodes = jnp.arange(subgoals + 1, dtype=jnp.int32)[:, None]
     arrived = jnp.where(nodes == row.subgoal, _single_bit(state, history.visited.shape[-1])[None, :], jnp.uint32(0))
     return History(
-        place=row.subgoal,
+        location=row.subgoal,
         state=state,
-        owed=jnp.where(success, success_cost, row.failure_cost),
+        pending_cost=jnp.where(success, success_cost, row.failure_cost),
         holds=jnp.where(here, holds[None, :], history.holds),
         fails=jnp.where(here, fails[None, :], history.fails),
         visited=jnp.where(certain, history.visited | arrived, arrived),
     )
 
 
-def settle(
+def add_outcome(
     tables: ActionTables,
     row: ActionRow,
     holds: UInt32[Array, "W"],

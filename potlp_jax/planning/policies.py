@@ -13,13 +13,14 @@ References:
 
 import dataclasses
 from enum import StrEnum
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
-from potlp_jax.planning.commitment import Intention, intention_of, keep_on
+from potlp_jax.planning.commitment import Intention, apply_commitment, intention_of
 from potlp_jax.planning.distances.paths import KnownPath, shortest_path
 from potlp_jax.planning.distances.product import (
     distance_table,
@@ -177,26 +178,80 @@ def decide(
     key: PRNGKeyArray,
     intention: Intention | None = None,
     *,
-    policy: Policy,
+    policy: "Policy | PolicyFunction",
     config: DecisionConfig,
 ) -> Move:
-    """The next move of ``policy``: pure, for jit and vmap (``policy`` and ``config`` static).
+    """The next move of ``policy``: pure, for jit and vmap.
 
-    ``estimator`` answers P_S, R_S and R_F for the policies that search and is None for the others. ``intention`` is
-    that of the move before; without one the robot chooses afresh.
+    Args:
+        belief: what is known of the map.
+        cell: the robot's cell.
+        state: the automaton's state, the letter of the robot's cell read.
+        task: arrays of the task.
+        estimator: answers P_S, R_S and R_F for the policies that ask; None for the others.
+        key: drives the search.
+        intention: that of the move before; without one the robot chooses afresh.
+        policy: one of the library's or a function of the user's; static.
+        config: settings; static.
+
+    Returns:
+        The move.
+
+    Raises:
+        ValueError: the policy searches and there is no estimator.
     """
     situation = assess(belief, cell, state, task, config.frontiers)
-    if not policy.searches:
-        return direct_move(situation, policy, config)
-    if estimator is None:
-        raise ValueError(f"policy {policy.value!r} needs an estimator")
-    estimates = ask(estimator, belief, situation.subgoals, task, state)
-    return search_move(situation, estimates, key, config, intention)
+    estimates = None if estimator is None else ask(estimator, belief, situation.subgoals, task, state)
+    intention = Intention.none() if intention is None else intention
+    return policy_function(policy)(situation, estimates, key, config, intention)
 
 
-def direct_move(situation: Situation, policy: Policy, config: DecisionConfig) -> Move:
-    """The move of a policy that does not search."""
-    return _optimistic(situation, config) if policy is Policy.OPTIMISTIC else _finish_or_frontier(situation, config)
+class PolicyFunction(Protocol):
+    """What a policy is: from a situation to a move. Any function of this signature can be given to ``run_trial``,
+    ``run_robot`` and ``run_batch`` in place of a ``Policy``.
+
+    It is traced by jit, and by vmap in batches: pure, without Python branches on array values. It is a static argument,
+    so that a function that is made anew for every trial is compiled anew for every trial.
+
+    Args:
+        situation: belief, task, robot's cell and automaton state, subgoals, distances in known space and the nearest
+            end of the task in it.
+        estimates: P_S, R_S and R_F of the subgoals in ``situation.subgoals``; None where the trial has no estimator.
+        key: of this decision; for whatever the policy draws.
+        config: settings.
+        intention: ``Move.intention`` of the decision before.
+
+    Returns:
+        The move; ``move_to`` makes one from a target.
+    """
+
+    def __call__(
+        self,
+        situation: Situation,
+        estimates: Estimates | None,
+        key: PRNGKeyArray,
+        config: DecisionConfig,
+        intention: Intention,
+        /,
+    ) -> Move: ...
+
+
+def policy_function(policy: Policy | PolicyFunction) -> PolicyFunction:
+    """The function of a policy: that of the name, or the function itself."""
+    if not isinstance(policy, Policy):
+        return policy
+    if policy.searches:
+        return search_move
+    direct = _optimistic if policy is Policy.OPTIMISTIC else _finish_or_frontier
+    return lambda situation, _estimates, _key, config, _intention: direct(situation, config)
+
+
+def policy_name(policy: Policy | PolicyFunction) -> str:
+    """What a policy is called in records: its name, or ``module:attribute`` of a function."""
+    if isinstance(policy, Policy):
+        return policy.value
+    named = policy if hasattr(policy, "__qualname__") else type(policy)
+    return f"{named.__module__}:{named.__qualname__}"
 
 
 def planning_problem(situation: Situation, estimates: Estimates, config: DecisionConfig) -> PlanningProblem:
@@ -263,12 +318,12 @@ def _finish_or_frontier(situation: Situation, config: DecisionConfig) -> Move:
     kind = jnp.where(finishes, MoveKind.FINISH, jnp.where(jnp.isfinite(value), MoveKind.FRONTIER, MoveKind.NONE))
     target_cell = jnp.where(finishes, situation.finish_cell, frontier_cell)
     target_state = jnp.where(finishes, situation.finish_state, frontier_state)
-    return _move(situation, config, kind, target_cell, target_state, value)
+    return move_to(situation, config, kind, target_cell, target_state, value)
 
 
 def search_move(
     situation: Situation,
-    estimates: Estimates,
+    estimates: Estimates | None,
     key: PRNGKeyArray,
     config: DecisionConfig,
     intention: Intention | None = None,
@@ -277,6 +332,8 @@ def search_move(
 
     ``estimates`` are those of the situation's subgoals. Where no action is available: the nearest frontier.
     """
+    if estimates is None:
+        raise ValueError("a policy that searches needs an estimator")
     problem = planning_problem(situation, estimates, config)
     plan = plan_actions(problem, key, config.search)
     return planned_move(situation, problem, plan, Intention.none() if intention is None else intention, config)
@@ -288,7 +345,7 @@ def planned_move(
     """The move that carries out the plan of a situation's problem, or keeps to what the robot is on its way to."""
     task, subgoals = situation.task, situation.subgoals
     search = Search(problem=problem, plan=plan, terms=action_terms(problem, initial_history(problem)))
-    plan = keep_on(plan, intention, situation.state, subgoals, task, jnp.float32(config.commitment))
+    plan = apply_commitment(plan, intention, situation.state, subgoals, task, jnp.float32(config.commitment))
 
     frontier_cell, frontier_state, frontier_cost = _nearest_frontier(situation)
     finishes = plan.action == subgoals.mask.shape[0] * task.edge_mask.shape[0]
@@ -301,7 +358,7 @@ def planned_move(
     target_state = jnp.where(acts, plan.from_state, frontier_state)
     target_state = jnp.where(finishes, situation.finish_state, target_state)
     status = plan.status | status_if(falls_back, Status.FALLBACK)
-    return _move(
+    return move_to(
         situation,
         config,
         kind,
@@ -377,7 +434,7 @@ def _nearest_frontier(situation: Situation) -> tuple[Int32[Array, "2"], Int32[Ar
     return cell, state, jnp.min(cost)
 
 
-def _move(
+def move_to(
     situation: Situation,
     config: DecisionConfig,
     kind: Int32[Array, ""],
@@ -389,6 +446,23 @@ def _move(
     intention: Intention | None = None,
     status: UInt32[Array, ""] | None = None,
 ) -> Move:
+    """The move to a product state in known space: the shortest path there, and what goes into the record.
+
+    Args:
+        situation: of the decision.
+        config: settings; ``config.path_horizon`` limits the path.
+        kind: one of ``MoveKind``; NONE stays where the robot is.
+        target_cell: where to go; a known free cell.
+        target_state: the automaton's state in which to arrive there, such that ``situation.distances`` is finite.
+        value: what the policy expects the task to cost from here; for the record.
+        action: index of the chosen action, where the policy searches.
+        search: what it considered, where it searches.
+        intention: for the next decision.
+        status: bits to report beside those of the subgoals.
+
+    Returns:
+        The move.
+    """
     goes = kind != MoveKind.NONE
     cell = jnp.where(goes, target_cell, situation.cell).astype(jnp.int32)
     state = jnp.where(goes, target_state, situation.state).astype(jnp.int32)

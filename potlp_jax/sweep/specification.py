@@ -26,12 +26,12 @@ from typing import Any
 
 import yaml
 
-from potlp_jax.environments import make
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
 from potlp_jax.errors import SpecificationError, WorldError
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
-from potlp_jax.trials.config import TrialConfig, trial_config_from_dict, with_settings
+from potlp_jax.trials.config import TrialConfig, trial_config_for, trial_config_from_dict
 
 
 @dataclasses.dataclass(frozen=True)
@@ -208,7 +208,7 @@ def _formula(environment: str, task: Any, where: str) -> str:
 
 def _common_config(environments: Sequence[str], where: str) -> TrialConfig:
     """What all environments call for."""
-    configs = {name: with_settings(TrialConfig(), make(name).settings) for name in environments}
+    configs = {name: trial_config_for(make(name)) for name in environments}
     first = configs[environments[0]]
     for name, config in configs.items():
         if config != first:

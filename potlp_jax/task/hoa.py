@@ -16,8 +16,8 @@ from jaxtyping import Bool, Int
 
 from potlp_jax.errors import TaskError
 from potlp_jax.task.automaton import Dfa
-from potlp_jax.task.cubes import Phi, minimal_cover
 from potlp_jax.task.formula import MAX_PROPOSITIONS
+from potlp_jax.task.guards import Phi, minimal_cover
 
 _TOKEN = re.compile(
     r"""(?P<skip>\s+|/\*.*?\*/)

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Int32
 
 from potlp_jax.errors import TaskError
 from potlp_jax.task.automaton import Dfa
-from potlp_jax.task.cubes import Phi, cube_letters, hull, minimal_cover
+from potlp_jax.task.guards import Phi, cube_letters, hull, minimal_cover
 
 MAX_CLASSES: int = 4096
 """Outcome classes of a task, at most: each is asked of an estimator, and stored with its letters."""

@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Int8, Int32
 
 from potlp_jax.errors import TaskError
 from potlp_jax.task.automaton import Dfa, canonical_dfa, translate
-from potlp_jax.task.cubes import Phi, minimal_cover
 from potlp_jax.task.formula import MAX_PROPOSITIONS, check_propositions, parse_formula
+from potlp_jax.task.guards import Phi, minimal_cover
 from potlp_jax.task.hoa import HoaAutomaton, read_hoa, write_hoa
 from potlp_jax.task.outcomes import Condition, OutcomeClass, Outcomes, find_outcomes
 from potlp_jax.types import NO_CLASS

@@ -4,10 +4,12 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+from potlp_jax.environments.base import Generator
 from potlp_jax.planning.policies import DecisionConfig
 from potlp_jax.planning.search.graph import SearchConfig, SearchMode
+from potlp_jax.world.camera import CameraConfig, Disturbance
 from potlp_jax.world.frontiers import FrontierConfig
-from potlp_jax.world.panorama import CameraConfig, Disturbance
+from potlp_jax.world.grid import World
 from potlp_jax.world.sensing import SensorConfig
 
 
@@ -38,6 +40,11 @@ def with_settings(config: Any, settings: Mapping[str, Any]) -> Any:
         for name, value in settings.items()
     }
     return dataclasses.replace(config, **changes)
+
+
+def trial_config_for(source: World | Generator) -> TrialConfig:
+    """What trials in a world, or in the worlds of a family, call for."""
+    return with_settings(TrialConfig(), source.settings)
 
 
 def trial_config_from_dict(data: Mapping[str, Any]) -> TrialConfig:

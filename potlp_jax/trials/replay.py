@@ -18,8 +18,8 @@ from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials.config import TrialConfig, trial_config_from_dict
 from potlp_jax.trials.record import LOG_PREFIX, Decision, Trial
 from potlp_jax.trials.robot import photograph
+from potlp_jax.world.camera import Disturbance
 from potlp_jax.world.grid import BeliefMap
-from potlp_jax.world.panorama import Disturbance
 
 
 def replay_decision(

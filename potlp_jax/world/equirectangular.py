@@ -1,4 +1,4 @@
-"""Pictures of real cameras, mapped to the geometry of ``panorama``, and back."""
+"""Pictures of real cameras, mapped to the geometry of ``camera``, and back."""
 
 import math
 
@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from potlp_jax.world.panorama import CameraConfig, column_bearings, finer, row_slopes, rows_at_slopes
+from potlp_jax.world.camera import CameraConfig, column_bearings, finer, row_slopes, rows_at_slopes
 
 _MOST_SAMPLES = 8
 

@@ -20,6 +20,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float32, Int, Int8, Int32, Num, Shaped, UInt8
 
 from potlp_jax.errors import WorldError
+from potlp_jax.world.settings import NO_SETTINGS, Settings
 
 MAX_LETTER: int = 2**16 - 1
 """Largest letter: sixteen propositions."""
@@ -77,6 +78,8 @@ class World:
         resolution: the length of a cell's side in the unit of cost (1: costs are in cells).
         extent: rows and columns of the map without padding; budgets and dead-end costs refer to it.
         appearance: what a camera sees.
+        propositions: bit ``i`` of a letter is ``propositions[i]``; None where nobody said. Static under jit.
+        settings: what trials in this world need to be different from the defaults. Static under jit.
     """
 
     occupied: Bool[Array, "*batch H W"]
@@ -85,6 +88,8 @@ class World:
     resolution: Float32[Array, "*batch"]
     extent: Int32[Array, "*batch 2"]
     appearance: Appearance
+    propositions: tuple[str, ...] | None = struct.field(pytree_node=False, default=None)
+    settings: Settings = struct.field(pytree_node=False, default=NO_SETTINGS)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -233,6 +238,8 @@ def world_to_dict(world: World) -> dict[str, Any]:
         "start": np.asarray(world.start).tolist(),
         "resolution": float(world.resolution),
         "extent": np.asarray(world.extent).tolist(),
+        "propositions": None if world.propositions is None else list(world.propositions),
+        "settings": world.settings.to_dict(),
         "appearance": {name: pack_array(np.asarray(getattr(look, name))) for name in look.__dataclass_fields__},
     }
 
@@ -243,6 +250,8 @@ def world_from_dict(data: Mapping[str, Any]) -> World:
         look = {name: jnp.asarray(unpack_array(values)) for name, values in data["appearance"].items()}
         row, column = (int(entry) for entry in data["start"])
         rows, columns = (int(size) for size in data["extent"])
+        propositions = None if data["propositions"] is None else tuple(data["propositions"])
+        settings = Settings(data["settings"])
         world = make_world(
             unpack_array(data["occupied"]),
             unpack_array(data["letters"]),
@@ -256,7 +265,8 @@ def world_from_dict(data: Mapping[str, Any]) -> World:
         raise WorldError(f"not the values of a world: {error!r}") from error
     if not (0 < rows <= world.shape[0] and 0 < columns <= world.shape[1]):
         raise WorldError(f"the extent {rows}x{columns} does not fit the {world.shape[0]}x{world.shape[1]} grid")
-    return dataclasses.replace(world, extent=jnp.asarray(np.array([rows, columns], np.int32)))
+    extent = jnp.asarray(np.array([rows, columns], np.int32))
+    return dataclasses.replace(world, extent=extent, propositions=propositions, settings=settings)
 
 
 def pack_array(array: Shaped[np.ndarray, "..."]) -> dict[str, Any]:

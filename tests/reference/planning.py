@@ -95,12 +95,12 @@ class ReferenceProblem:
         return p_success, r_s, max(self.r_f[s, c] for c in cubes)
 
     def end(self, action, outcome):
-        """Place and state after an action."""
+        """Location and state after an action."""
         s, e = action
         return s, (self.edges[e][1] if outcome else self.edges[e][0])
 
     def situation(self, history):
-        """Place, state and what is owed after the history."""
+        """Location, state and the pending cost after the history."""
         if not history:
             return self.robot, self.start, 0.0
         action, outcome = history[-1]
@@ -108,7 +108,7 @@ class ReferenceProblem:
         return *self.end(action, outcome), (r_s if outcome else r_f)
 
     def visited(self, history):
-        """(Place, state) pairs since the history last learnt something."""
+        """(Location, state) pairs since the history last learnt something."""
         pairs = [(self.robot, self.start)]
         for i, (action, outcome) in enumerate(history):
             if self.edges[action[1]][2] not in self.knowledge(history[:i], action[0]):
@@ -117,15 +117,15 @@ class ReferenceProblem:
         return pairs
 
     def distance(self, history, action):
-        """D: what is owed and the way; nothing for going on beyond the same subgoal in the same state."""
-        place, state, owed = self.situation(history)
+        """D: the pending cost and the path cost; nothing for going on beyond the same subgoal in the same state."""
+        location, state, pending_cost = self.situation(history)
         if action == FINISH:
-            return owed + self.finish[place, state]
+            return pending_cost + self.finish[location, state]
         s, e = action
         source = self.edges[e][0]
-        if (place, state) == (s, source):
+        if (location, state) == (s, source):
             return 0.0
-        return owed + self.travel[place, state, s, source]
+        return pending_cost + self.travel[location, state, s, source]
 
     def actions(self, history):
         """A(b_h), in the order of their indices."""
@@ -152,7 +152,7 @@ class ReferenceProblem:
 
 class Recursion:
     """Eq. 3 as it is written. With ``remember``, the value of a history is looked up if it was worked out before for
-    one with the same outcomes, place, state, debt and visits, in whatever order it got there."""
+    one with the same outcomes, location, state, pending cost and visits, in whatever order it got there."""
 
     def __init__(self, problem, remember=True):
         self.problem, self.memo = problem, ({} if remember else None)
@@ -171,13 +171,13 @@ class Recursion:
     def value(self, history=()):
         """Least Q after a history; 0 where the task is satisfied, the dead-end cost where nothing is left to do."""
         history, problem = list(history), self.problem
-        place, state, owed = problem.situation(history)
+        location, state, pending_cost = problem.situation(history)
         if state in problem.accepting:
             return 0.0
         if self.memo is None:
             return self._least(history)
         facts = frozenset((a[0], problem.edges[a[1]][2], outcome) for a, outcome in history)
-        key = (place, state, owed, facts, frozenset(problem.visited(history)))
+        key = (location, state, pending_cost, facts, frozenset(problem.visited(history)))
         if key not in self.memo:
             self.memo[key] = self._least(history)
         return self.memo[key]
@@ -215,9 +215,12 @@ def dictionary_pouct(problem, simulations, exploration, seed=0):
             p, r_s, r_f = problem.estimate(history, action)
             outcome = rng.random() < p
             values[(*key, (action, outcome))] = simulate([*history, (action, outcome)])
-            won, lost = values.get((*key, (action, True))), values.get((*key, (action, False)))
-            won, lost = (lost if won is None else won), (won if lost is None else lost)
-            q[action] = problem.distance(history, action) + p * (r_s + won) + (1 - p) * (r_f + lost)
+            success_value, failure_value = values.get((*key, (action, True))), values.get((*key, (action, False)))
+            success_value, failure_value = (
+                (failure_value if success_value is None else success_value),
+                (success_value if failure_value is None else failure_value),
+            )
+            q[action] = problem.distance(history, action) + p * (r_s + success_value) + (1 - p) * (r_f + failure_value)
         n[action] += 1
         return min(q.values())
 

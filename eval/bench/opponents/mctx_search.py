@@ -165,7 +165,7 @@ def _terms_of_one(
     """P_S, D, R_S, R_F of one action; D is 0 where it cannot be reached (such an action is never counted)."""
     row = jax.tree.map(lambda leaf: leaf[action], tables.actions)
     probability, success_cost, _ = knowledge_terms(row, *knowledge_of(row.subgoal, history))
-    distance = distance_of(row, history, tables.distance[history.place, history.state, action])
+    distance = distance_of(row, history, tables.distance[history.location, history.state, action])
     return probability, jnp.where(jnp.isfinite(distance), distance, 0.0), success_cost, row.failure_cost
 
 

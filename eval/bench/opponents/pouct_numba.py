@@ -46,7 +46,7 @@ FINISH = -1
 # Columns of Model.options.
 SUBGOAL, SOURCE, TARGET, CONDITION, INDEX, ACCEPTS = range(6)
 # Columns of Tree.where.
-PLACE, STATE, VISITS, FIRST, COUNT = range(5)
+LOCATION, STATE, VISITS, FIRST, COUNT = range(5)
 # Columns of Tree.links; children are at FAILED + outcome.
 OPTION, TRIED, FAILED, SUCCEEDED = range(4)
 # Columns of Tree.terms.
@@ -61,9 +61,9 @@ class Model(NamedTuple):
 
     Attributes:
       options: ``[n, 6]``.
-      candidates: options that can be reached from a place and state, those of one pair side by side.
-      ways: their D without what is owed; -1 where the robot is inside already, so that nothing is paid or owed.
-      ranges: ``[S+1, Z, 2]``, the first candidate of a place and state, and their number; none in accepting states.
+      candidates: options that can be reached from a location and state, those of one pair side by side.
+      path_costs: their D without the pending cost; -1 where the robot is inside already, so that nothing is paid.
+      ranges: ``[S+1, Z, 2]``, the first candidate of a location and state, and their number; none in accepting states.
       cubes: ``[n, K]``, classes of the option's condition in order of R_S, then ``NO_CLASS``.
       cube_terms: ``[n, K, 2]``, their P_S and R_S.
       failure_cost: ``[n]``, R_F.
@@ -75,7 +75,7 @@ class Model(NamedTuple):
 
     options: np.ndarray
     candidates: np.ndarray
-    ways: np.ndarray
+    path_costs: np.ndarray
     ranges: np.ndarray
     cubes: np.ndarray
     cube_terms: np.ndarray
@@ -90,8 +90,8 @@ class Tree(NamedTuple):
     """Nodes and the actions they have listed; those of one node side by side.
 
     Attributes:
-      where: ``[N, 5]``, columns ``PLACE``, ``STATE``, ``VISITS``, ``FIRST`` (of its actions), ``COUNT``.
-      owed: ``[N]``, the way back.
+      where: ``[N, 5]``, columns ``LOCATION``, ``STATE``, ``VISITS``, ``FIRST`` (of its actions), ``COUNT``.
+      pending_cost: ``[N]``, paid by the next action that leaves the unknown region.
       masks: ``[N, 3S+1]``, what holds and what fails at each subgoal, and the states visited at each node.
       links: ``[P, 4]``, columns ``OPTION``, ``TRIED`` (visits), ``FAILED``, ``SUCCEEDED`` (children).
       terms: ``[P, 5]``, columns ``TOTAL`` (sum of sampled costs), ``PROBABILITY``, ``DISTANCE``, ``FAILURE_COST``,
@@ -101,7 +101,7 @@ class Tree(NamedTuple):
     """
 
     where: np.ndarray
-    owed: np.ndarray
+    pending_cost: np.ndarray
     masks: np.ndarray
     links: np.ndarray
     terms: np.ndarray
@@ -129,14 +129,14 @@ def model_of(problem: PlanningProblem) -> Model:
             f"{MASK_BITS} of each at most"
         )
     options = _options(problem)
-    candidates, ways, ranges = _candidates(problem, options)
+    candidates, path_costs, ranges = _candidates(problem, options)
     cubes, cube_terms, failure_cost = _estimates(problem, options)
     implies = np.asarray(task.implies)
     compounds = np.flatnonzero(((classes != NO_CLASS).sum(axis=1) > 1) & np.asarray(task.condition_mask))
     return Model(
         options=options,
         candidates=candidates,
-        ways=ways,
+        path_costs=path_costs,
         ranges=ranges,
         cubes=cubes,
         cube_terms=cube_terms,
@@ -163,15 +163,17 @@ def _options(problem: PlanningProblem) -> np.ndarray:
 def _candidates(problem: PlanningProblem, options: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     travel, finish = np.asarray(problem.travel, np.float64), np.asarray(problem.finish, np.float64)
     accepting = np.asarray(problem.task.accepting) & np.asarray(problem.task.state_mask)
-    candidates, ways, ranges = [], [], np.zeros((*finish.shape, 2), np.int32)
-    for place, state in np.ndindex(*finish.shape):
-        way = np.append(travel[place, state, options[:-1, SUBGOAL], options[:-1, SOURCE]], finish[place, state])
-        way[(options[:, SUBGOAL] == place) & (options[:, SOURCE] == state)] = -1.0
-        own = np.flatnonzero(np.isfinite(way)) if not accepting[state] else np.zeros(0, np.int64)
-        ranges[place, state] = len(candidates), len(own)
+    candidates, path_costs, ranges = [], [], np.zeros((*finish.shape, 2), np.int32)
+    for location, state in np.ndindex(*finish.shape):
+        path_cost = np.append(
+            travel[location, state, options[:-1, SUBGOAL], options[:-1, SOURCE]], finish[location, state]
+        )
+        path_cost[(options[:, SUBGOAL] == location) & (options[:, SOURCE] == state)] = -1.0
+        own = np.flatnonzero(np.isfinite(path_cost)) if not accepting[state] else np.zeros(0, np.int64)
+        ranges[location, state] = len(candidates), len(own)
         candidates.extend(own)
-        ways.extend(way[own])
-    return np.array(candidates, np.int32), np.array(ways, np.float64), ranges
+        path_costs.extend(path_cost[own])
+    return np.array(candidates, np.int32), np.array(path_costs, np.float64), ranges
 
 
 def _estimates(problem: PlanningProblem, options: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -247,13 +249,13 @@ def list_actions(
     most: int,
     options: np.ndarray,
     candidates: np.ndarray,
-    ways: np.ndarray,
+    path_costs: np.ndarray,
     ranges: np.ndarray,
     cubes: np.ndarray,
     cube_terms: np.ndarray,
     failure_cost: np.ndarray,
     where: np.ndarray,
-    owed: np.ndarray,
+    pending_cost: np.ndarray,
     masks: np.ndarray,
     links: np.ndarray,
     terms: np.ndarray,
@@ -264,11 +266,11 @@ def list_actions(
 
     ``most = 1`` asks whether there is any, and leaves one behind that is to be overwritten.
     """
-    place, state = where[node, PLACE], where[node, STATE]
+    location, state = where[node, LOCATION], where[node, STATE]
     subgoals = ranges.shape[0] - 1
-    begin = ranges[place, state, 0]
+    begin = ranges[location, state, 0]
     count = 0
-    for i in range(begin, begin + ranges[place, state, 1]):
+    for i in range(begin, begin + ranges[location, state, 1]):
         option = candidates[i]
         condition = options[option, CONDITION]
         probability, success_cost = 1.0, 0.0
@@ -289,7 +291,7 @@ def list_actions(
         links[at, SUCCEEDED] = ACCEPTED if options[option, ACCEPTS] else UNVISITED
         terms[at, TOTAL] = 0.0
         terms[at, PROBABILITY] = probability
-        terms[at, DISTANCE] = 0.0 if ways[i] < 0.0 else ways[i] + owed[node]
+        terms[at, DISTANCE] = 0.0 if path_costs[i] < 0.0 else path_costs[i] + pending_cost[node]
         terms[at, FAILURE_COST] = failure_cost[option]
         terms[at, SUCCESS_COST] = success_cost
         means[at] = -math.inf
@@ -312,7 +314,7 @@ def add_node(
     compounds: np.ndarray,
     compound_cubes: np.ndarray,
     where: np.ndarray,
-    owed: np.ndarray,
+    pending_cost: np.ndarray,
     masks: np.ndarray,
     links: np.ndarray,
     terms: np.ndarray,
@@ -337,9 +339,9 @@ def add_node(
         for i in range(2 * subgoals, masks.shape[1]):
             masks[node, i] = 0
     masks[node, 2 * subgoals + s] |= _bit(state)
-    where[node, PLACE], where[node, STATE] = s, state
+    where[node, LOCATION], where[node, STATE] = s, state
     where[node, VISITS], where[node, FIRST], where[node, COUNT] = 0, UNVISITED, 0
-    owed[node] = terms[at, SUCCESS_COST] if success else terms[at, FAILURE_COST]
+    pending_cost[node] = terms[at, SUCCESS_COST] if success else terms[at, FAILURE_COST]
 
 
 @_jit_fast
@@ -384,19 +386,19 @@ def _simulate_many(
     ``inverse_root[n] = 1 / sqrt(n)``. ``path`` and ``paid`` keep a simulation's nodes and actions, and what had been
     paid before each. A simulation adds at most one node, lists the actions of at most one and looks at another.
     """
-    options, candidates, ways, ranges, cubes, cube_terms, failure_cost = model[:7]
+    options, candidates, path_costs, ranges, cubes, cube_terms, failure_cost = model[:7]
     forward, backward, compounds, compound_cubes = model[7:]
-    where, owed, masks, links, terms, means, widths = tree
+    where, pending_cost, masks, links, terms, means, widths = tree
     most = len(options)
     for simulation in range(simulations):
-        if counters[0] == len(owed) or counters[1] + 2 * most > len(means):
+        if counters[0] == len(pending_cost) or counters[1] + 2 * most > len(means):
             return simulation
         node, depth, cost = 0, 0, 0.0
         while True:
             if where[node, FIRST] == UNVISITED:
                 count = list_actions(
-                    node, counters[1], most, options, candidates, ways, ranges, cubes, cube_terms, failure_cost,
-                    where, owed, masks, links, terms, means, widths,
+                    node, counters[1], most, options, candidates, path_costs, ranges, cubes, cube_terms, failure_cost,
+                    where, pending_cost, masks, links, terms, means, widths,
                 )  # fmt: skip
                 where[node, FIRST], where[node, COUNT] = counters[1], count
                 counters[1] += count
@@ -418,11 +420,11 @@ def _simulate_many(
                 links[at, FAILED + outcome] = child
                 add_node(
                     child, node, at, success, options, forward, backward, compounds, compound_cubes,
-                    where, owed, masks, links, terms,
+                    where, pending_cost, masks, links, terms,
                 )  # fmt: skip
                 count = list_actions(
-                    child, counters[1], 1, options, candidates, ways, ranges, cubes, cube_terms, failure_cost,
-                    where, owed, masks, links, terms, means, widths,
+                    child, counters[1], 1, options, candidates, path_costs, ranges, cubes, cube_terms, failure_cost,
+                    where, pending_cost, masks, links, terms, means, widths,
                 )  # fmt: skip
                 if count == 0:
                     cost += dead_end_cost
@@ -503,7 +505,7 @@ class Histories:
 
     def _reserve(self, nodes: int, actions: int) -> None:
         """Room for more nodes and actions: twice as much as before where there is not enough."""
-        have_nodes, have_actions = len(self.tree.owed), len(self.tree.means)
+        have_nodes, have_actions = len(self.tree.pending_cost), len(self.tree.means)
         nodes, actions = int(self._counters[0]) + nodes, int(self._counters[1]) + actions
         if nodes > have_nodes or actions > have_actions:
             nodes = have_nodes if nodes <= have_nodes else 2 * nodes
@@ -538,7 +540,7 @@ class NumbaSearch(Histories):
             state = self._counters, self._random_state
             left -= _simulate_many(left, self._dead_end_cost, self.model, self.tree, *state, *tables, path, paid)
             if left > 0:
-                self.tree = _grown(self.tree, len(self.tree.owed), 2 * len(self.tree.means))
+                self.tree = _grown(self.tree, len(self.tree.pending_cost), 2 * len(self.tree.means))
         self._simulations += simulations
 
     def statistics(self) -> RootStatistics:
@@ -561,13 +563,13 @@ class NumbaSearch(Histories):
 
 
 def _new_tree(problem: PlanningProblem, most: int) -> Tree:
-    """The root: at the robot, nothing known, nothing owed."""
+    """The root: at the robot, nothing known, nothing pending."""
     robot, state = problem.subgoal_count, int(problem.dfa_state)
     masks = np.zeros((1, 3 * robot + 1), np.uint64)
     masks[0, 3 * robot] = 1 << state
     return Tree(
         where=np.array([[robot, state, 0, UNVISITED, 0]], np.int32),
-        owed=np.zeros(1),
+        pending_cost=np.zeros(1),
         masks=masks,
         links=np.zeros((2 * most, 4), np.int32),
         terms=np.zeros((2 * most, 5)),
@@ -576,7 +578,7 @@ def _new_tree(problem: PlanningProblem, most: int) -> Tree:
     )
 
 
-_NODE_FIELDS = ("where", "owed", "masks")
+_NODE_FIELDS = ("where", "pending_cost", "masks")
 
 
 def _grown(tree: Tree, nodes: int, actions: int) -> Tree:

@@ -1,7 +1,7 @@
 """Bounds of expanded nodes from those of their children, backed up through the graph of the exact solver.
 
-The way back that is owed is settled here: an action either leaves the unknown region, and pays what is owed whatever it
-is, or goes on inside and pays nothing, so the value of a history is ``min(owed + leave, stay)``.
+The pending cost is accounted for here: an action either leaves the unknown region and pays the pending cost, or goes on
+inside and pays nothing, so the value of a history is ``min(pending_cost + leave, stay)``.
 
 References:
   Bradley et al., Learning and Planning for Temporally Extended Tasks in Unknown Environments, ICRA 2021, Eq. 3.
@@ -14,7 +14,7 @@ from potlp_jax.planning.exact.graph import CHUNK, Graph
 from potlp_jax.planning.exact.knowledge import NOWHERE
 
 FINISH = -1
-"""State in ``best_way`` where the way goes to acceptance."""
+"""State in ``best_path`` where the path goes to acceptance."""
 
 
 class GraphBounds:
@@ -31,7 +31,7 @@ class GraphBounds:
             for start in range(0, len(group), CHUNK):
                 self._back_up_attempts(group[start : start + CHUNK])
             for start in range(0, len(group), CHUNK):
-                self._back_up_ways(group[start : start + CHUNK])
+                self._back_up_paths(group[start : start + CHUNK])
 
     def of_actions(self) -> tuple[np.ndarray, np.ndarray]:
         """Bounds on the Q of every action."""
@@ -39,9 +39,9 @@ class GraphBounds:
         lower = np.full(t.rollouts.finish_action + 1, np.inf)
         lower[-1] = t.finish[-1, z]
         upper = lower.copy()
-        for action, s, k, expansion, way in self._graph.root_actions():
+        for action, s, k, expansion, path_cost in self._graph.root_actions():
             below, above = self.attempts(np.array([expansion]))
-            lower[action], upper[action] = way + below[0, s, k], way + above[0, s, k]
+            lower[action], upper[action] = path_cost + below[0, s, k], path_cost + above[0, s, k]
         return lower, upper
 
     def attempts(self, expansions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -49,23 +49,25 @@ class GraphBounds:
         t, nodes = self._tables, self._expansions["node"][expansions]
         q, state = self._nodes["q"][nodes], self._nodes["state"][nodes]
         here = np.arange(q.shape[1])[None]
-        chance, won = t.probability[here, q], t.success_cost[here, q]
-        lost = t.failure_cost[here, state[:, None]]
+        chance, success_cost = t.probability[here, q], t.success_cost[here, q]
+        failure_cost = t.failure_cost[here, state[:, None]]
         success, failure = self._expansions["success"][expansions], self._expansions["failure"][expansions]
         possible = success != NOWHERE
         bounds = []
         for after_success, after_failure in zip(
-            self._arrive(success, won), self._arrive(failure, np.broadcast_to(lost, success.shape)), strict=True
+            self._arrive(success, success_cost),
+            self._arrive(failure, np.broadcast_to(failure_cost, success.shape)),
+            strict=True,
         ):
-            cost = chance * (won + after_success) + (1.0 - chance) * (lost + after_failure)
+            cost = chance * (success_cost + after_success) + (1.0 - chance) * (failure_cost + after_failure)
             bounds.append(np.where(possible, cost, np.inf))
         return bounds[0], bounds[1]
 
-    def _arrive(self, children: np.ndarray, owed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _arrive(self, children: np.ndarray, pending_cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Bounds on the value of histories ``[N, S, K]`` that end at node ``children`` beyond subgoal s."""
         n, s = np.maximum(children, 0), np.arange(children.shape[1])[None, :, None]
-        lower = np.minimum(owed + self._nodes["leave_lower"][n, s], self._nodes["attempt_lower"][n, s])
-        upper = np.minimum(owed + self._nodes["leave_upper"][n, s], self._nodes["attempt_upper"][n, s])
+        lower = np.minimum(pending_cost + self._nodes["leave_lower"][n, s], self._nodes["attempt_lower"][n, s])
+        upper = np.minimum(pending_cost + self._nodes["leave_upper"][n, s], self._nodes["attempt_upper"][n, s])
         upper = np.minimum(upper, self._nodes["ceiling"][n])
         nothing = np.isinf(lower)
         lower = np.where(nothing | (self._nodes["may_be_dead"][n] & (lower > self._dead_end)), self._dead_end, lower)
@@ -80,28 +82,28 @@ class GraphBounds:
         self._nodes["attempt_lower"][nodes] = lower.min(axis=2)
         self._nodes["attempt_upper"][nodes] = upper.min(axis=2)
 
-    def _back_up_ways(self, expansions: np.ndarray) -> None:
+    def _back_up_paths(self, expansions: np.ndarray) -> None:
         states = self._nodes["state"][self._expansions["node"][expansions]]
         for z in np.unique(states):
-            self._back_up_ways_from(int(z), expansions[states == z])
+            self._back_up_paths_from(int(z), expansions[states == z])
 
-    def _back_up_ways_from(self, z: int, expansions: np.ndarray) -> None:
+    def _back_up_paths_from(self, z: int, expansions: np.ndarray) -> None:
         t, nodes = self._tables, self._expansions["node"][expansions]
         subgoals = len(t.subgoals)
         lower = np.broadcast_to(t.finish[:subgoals, z], (len(nodes), subgoals)).copy()
         upper = lower.copy()
         best = np.full((len(nodes), subgoals, 2), FINISH)
         for other in t.travels_to[z] if subgoals else ():
-            way = t.travel[:subgoals, z, :, other]
+            path_cost = t.travel[:subgoals, z, :, other]
             if other == z:
-                way = np.where(np.eye(subgoals, dtype=bool), np.inf, way)
+                path_cost = np.where(np.eye(subgoals, dtype=bool), np.inf, path_cost)
             link = self._expansions["link"][expansions, other]
-            costs = way[None] + self._nodes["attempt_lower"][link][:, None, :]
+            costs = path_cost[None] + self._nodes["attempt_lower"][link][:, None, :]
             least = costs.min(axis=2)
             better = least < lower
             lower = np.where(better, least, lower)
             choice = np.stack([np.full(least.shape, other), costs.argmin(axis=2)], axis=-1)
             best = np.where(better[..., None], choice, best)
-            upper = np.minimum(upper, (way[None] + self._nodes["attempt_upper"][link][:, None, :]).min(axis=2))
+            upper = np.minimum(upper, (path_cost[None] + self._nodes["attempt_upper"][link][:, None, :]).min(axis=2))
         self._nodes["leave_lower"][nodes], self._nodes["leave_upper"][nodes] = lower, upper
-        self._expansions["best_way"][expansions] = best
+        self._expansions["best_path"][expansions] = best

@@ -1,8 +1,8 @@
 """The graph of what can be known in the course of a rollout: the states of the exact solver.
 
-Neither the place nor the way back that is owed enters a node: what an attempt at a subgoal is worth depends on the
-automaton's state and on what is known of every subgoal, so one node serves all places. Nodes are told apart by 64-bit
-fingerprints: the chance that two of ten million nodes are confused is below 1e-5.
+Neither the location nor the pending cost enters a node: what an attempt at a subgoal is worth depends on the
+automaton's state and on what is known of every subgoal, so one node serves all locations. Nodes are told apart by
+64-bit fingerprints: the chance that two of ten million nodes are confused is below 1e-5.
 
 References:
   Bradley et al., Learning and Planning for Temporally Extended Tasks in Unknown Environments, ICRA 2021, Eq. 3.
@@ -52,12 +52,12 @@ class Graph:
     Attributes:
       tables: what can be known of one subgoal.
       nodes: by node: ``q [S]``, the row of knowledge of every subgoal; ``state``; ``rank``, see ``Knowledge.ranks``;
-        ``expansion``, -1 while open; ``leave_*`` and ``attempt_*`` ``[S]``, bounds on the value from a place beyond the
-        subgoal on, less what is owed, if the robot leaves and if it makes an attempt there first; ``ceiling``, which no
-        policy exceeds; ``may_be_dead``, whether the relaxation leaves a dead end possible.
+        ``expansion``, -1 while open; ``leave_*`` and ``attempt_*`` ``[S]``, bounds on the value from beyond the
+        subgoal, less the pending cost, if the robot leaves and if it makes an attempt there first; ``ceiling``, which
+        no policy exceeds; ``may_be_dead``, whether the relaxation leaves a dead end possible.
       expansions: by expansion: ``node``; ``success`` and ``failure`` ``[S, K]``, children of an attempt (``ACCEPTED``,
-        ``NOWHERE``); ``link [Z]``, the node in each state that ways lead to, else ``NOWHERE``; ``best_edge [S]`` and
-        ``best_way [S, 2]``, the attempt there and the next one elsewhere (state, subgoal) that are best from below.
+        ``NOWHERE``); ``link [Z]``, the node in each state that paths lead to, else ``NOWHERE``; ``best_edge [S]`` and
+        ``best_path [S, 2]``, the attempt there and the next one elsewhere (state, subgoal) that are best from below.
     """
 
     def __init__(self, tables: Knowledge) -> None:
@@ -81,7 +81,7 @@ class Graph:
             failure=((subgoals, width), np.int32),
             link=((states,), np.int32),
             best_edge=((subgoals,), np.int32),
-            best_way=((subgoals, 2), np.int32),
+            best_path=((subgoals, 2), np.int32),
         )
         fingerprints = np.random.default_rng(0).integers(0, 2**63, (subgoals, len(tables.state)), dtype=np.int64)
         self._prints = fingerprints.astype(np.uint64)
@@ -107,7 +107,7 @@ class Graph:
         return np.split(expansions[order], np.flatnonzero(np.diff(rank[order])) + 1)
 
     def root_actions(self) -> Iterator[tuple[int, int, int, int, float]]:
-        """Attempts within reach of the robot: action, s, k, expansion of the node it is made in, length of the way."""
+        """Attempts within reach of the robot: action, s, k, expansion of the node it is made in, path cost."""
         t, z = self.tables, int(self.nodes["state"][0])
         for other in t.travels_to[z]:
             expansion = int(self.nodes["expansion"][self.expansions["link"][0, other]])
@@ -127,17 +127,17 @@ class Graph:
     ) -> np.ndarray:
         """Nodes of fingerprints; ``rows_of`` gives the rows and states of those that are new, by their positions."""
         distinct, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
-        place = np.searchsorted(self._keys, distinct)
+        slot = np.searchsorted(self._keys, distinct)
         known = np.zeros(len(distinct), bool)
-        inner = place < len(self._keys)
-        known[inner] = self._keys[place[inner]] == distinct[inner]
+        inner = slot < len(self._keys)
+        known[inner] = self._keys[slot[inner]] == distinct[inner]
         nodes = np.empty(len(distinct), np.int64)
-        nodes[known] = self._key_nodes[place[known]]
+        nodes[known] = self._key_nodes[slot[known]]
         fresh = np.flatnonzero(~known)
         if len(fresh):
             nodes[fresh] = self.nodes.count + np.arange(len(fresh))
-            self._keys = np.insert(self._keys, place[fresh], distinct[fresh])
-            self._key_nodes = np.insert(self._key_nodes, place[fresh], nodes[fresh])
+            self._keys = np.insert(self._keys, slot[fresh], distinct[fresh])
+            self._key_nodes = np.insert(self._key_nodes, slot[fresh], nodes[fresh])
             self._add(*rows_of(first[fresh]))
         return nodes[inverse]
 
@@ -230,5 +230,5 @@ class Graph:
             failure=failure,
             link=link,
             best_edge=np.zeros((count, subgoals)),
-            best_way=np.zeros((count, subgoals, 2)),
+            best_path=np.zeros((count, subgoals, 2)),
         )

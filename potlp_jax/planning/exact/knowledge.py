@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Int32, Int64
 
 from potlp_jax.errors import ProblemTooLargeError
-from potlp_jax.planning.exact.rollouts import Rollouts, Settled
+from potlp_jax.planning.exact.rollouts import Rollouts, SubgoalKnowledge
 
 ACCEPTED = -2
 NOWHERE = -1
-"""Child index of success in an accepting state; of an attempt or a way that does not exist."""
+"""Child index of success in an accepting state; of an attempt or a path that does not exist."""
 
 _MOST_ROWS = 300_000
 """Rows of knowledge at most."""
@@ -28,7 +28,7 @@ class Knowledge:
     leave the row's state; subgoals are the real ones only.
 
     Attributes:
-      state: ``[q]``; settled, visits: how many conditions are known and how many states visited.
+      state: ``[q]``; known_count, visits: how many conditions are known and how many states visited.
       move: ``[q, z]``, the row once the automaton is in z for other reasons than an attempt here; ``NOWHERE``.
       clear: ``[q]``, without visits.
       success, failure: ``[q, k]``, after an attempt here; ``ACCEPTED``, ``NOWHERE``.
@@ -36,8 +36,8 @@ class Knowledge:
       probability, success_cost: ``[s, q, k]``; failure_cost ``[s, z, k]``; available ``[s, q, k]``.
       entry: ``[q]``, rows in which a success may leave a subgoal, this one or another.
       edges: edge indices by state; target, condition: ``[z, k]``, -1 beyond the last; width: the largest number of k.
-      travel: ``[s', z', s, z]``, finish: ``[s', z']``: lengths of ways, from the robot where s' is -1.
-      travels_to: by state, those that do not accept and that ways lead to; reach: ``[z, z']``, attempts and ways
+      travel: ``[s', z', s, z]``, finish: ``[s', z']``: path costs, from the robot where s' is -1.
+      travels_to: by state, those that do not accept and that paths lead to; reach: ``[z, z']``, attempts and paths
         can lead from z to z'.
       rollouts: the rules; subgoals: index of each s in the problem.
     """
@@ -56,10 +56,10 @@ class Knowledge:
         for z, edges in enumerate(self.edges):
             for k, e in enumerate(edges):
                 _, self.target[z, k], self.condition[z, k] = rollouts.edges[e]
-        ways = np.asarray(np.isfinite(self.travel).any(axis=(0, 2)))
+        paths = np.asarray(np.isfinite(self.travel).any(axis=(0, 2)))
         live = ~np.asarray(rollouts.accepting)
-        self.travels_to = [np.flatnonzero(ways[z] & live).tolist() for z in range(count)]
-        self.reach = _reachable(ways, list(rollouts.edges.values()))
+        self.travels_to = [np.flatnonzero(paths[z] & live).tolist() for z in range(count)]
+        self.reach = _reachable(paths, list(rollouts.edges.values()))
         self._number: dict[tuple[int, int, int, int], int] = {}
         self._enumerate()
         self._tabulate_terms()
@@ -67,50 +67,50 @@ class Knowledge:
     def _enumerate(self) -> None:
         """All rows that can come about, breadth first."""
         rows, entries = [], set()
-        root = self._row(self.rollouts.root().state, Settled(0, 0), 0, rows)
+        root = self._row(self.rollouts.root().state, SubgoalKnowledge(0, 0), 0, rows)
         moves, clears, successes, failures, certains = [], [], [], [], []
         done = root
         while done < len(rows):
             state, holds, fails, visited = rows[done]
-            settled = Settled(holds, fails)
+            known = SubgoalKnowledge(holds, fails)
             move, success, failure = {}, [NOWHERE] * self.width, [NOWHERE] * self.width
             certain = [False] * self.width
             for z in self.travels_to[state]:
-                move[z] = self._row(z, settled, visited, rows)
+                move[z] = self._row(z, known, visited, rows)
             for k, edge in enumerate(self.edges[state]):
                 _, target, condition = self.rollouts.edges[edge]
                 accepts = self.rollouts.accepting[target]
                 if not accepts:
-                    move[target] = self._row(target, settled, visited, rows)
+                    move[target] = self._row(target, known, visited, rows)
                     entries.add(move[target])
                 certain[k] = bool(holds >> condition & 1)
                 if fails >> condition & 1:
                     continue
-                after, seen = settled, visited | 1 << target
+                after, seen = known, visited | 1 << target
                 if not certain[k]:
-                    failed = self.rollouts.closure.settle(settled, condition, False)
+                    failed = self.rollouts.closure.add_outcome(known, condition, False)
                     failure[k] = self._row(state, failed, 1 << state, rows)
-                    after, seen = self.rollouts.closure.settle(settled, condition, True), 1 << target
+                    after, seen = self.rollouts.closure.add_outcome(known, condition, True), 1 << target
                 success[k] = ACCEPTED if accepts else self._row(target, after, seen, rows)
                 entries.add(success[k])
-            clears.append(self._row(state, settled, 0, rows))
+            clears.append(self._row(state, known, 0, rows))
             moves.append([move.get(z, NOWHERE) for z in range(self.rollouts.states)])
             successes.append(success)
             failures.append(failure)
             certains.append(certain)
             done += 1
         self.state = np.array([row[0] for row in rows], np.int32)
-        self.settled = np.array([(row[1] | row[2]).bit_count() for row in rows])
+        self.known_count = np.array([(row[1] | row[2]).bit_count() for row in rows])
         self.visits = np.array([row[3].bit_count() for row in rows])
         self._rows = rows
         self.move, self.clear = np.array(moves), np.array(clears)
         self.success, self.failure, self.certain = np.array(successes), np.array(failures), np.array(certains)
         self.entry = np.isin(np.arange(len(rows)), list(entries))
 
-    def _row(self, state: int, settled: Settled, visited: int, rows: list[tuple[int, int, int, int]]) -> int:
+    def _row(self, state: int, known: SubgoalKnowledge, visited: int, rows: list[tuple[int, int, int, int]]) -> int:
         """Number of a row, less what can matter no more: conditions of edges out of reach (unless conditions of several
         cubes tie them to others), and visits that no attempt whose condition is known to hold could repeat."""
-        holds, fails, repeatable, relevant = settled.holds, settled.fails, 0, 0
+        holds, fails, repeatable, relevant = known.holds, known.fails, 0, 0
         for source, target, condition in self.rollouts.edges.values():
             if self.reach[state, source]:
                 relevant |= 1 << condition
@@ -136,24 +136,24 @@ class Knowledge:
             for q, (state, holds, fails, visited) in enumerate(self._rows):
                 for k, edge in enumerate(self.edges[state]):
                     _, target, condition = self.rollouts.edges[edge]
-                    terms = self.rollouts.combined(subgoal, condition, Settled(holds, fails))
+                    terms = self.rollouts.combined(subgoal, condition, SubgoalKnowledge(holds, fails))
                     self.probability[i, q, k], self.success_cost[i, q, k] = terms.probability, terms.success_cost
                     self.failure_cost[i, state, k] = terms.failure_cost
                     leads_back = terms.certain and visited >> target & 1
                     self.available[i, q, k] = terms.probability > 0 and not leads_back
 
     def ranks(self, q: Int32[np.ndarray, "N S"], state: Int32[np.ndarray, " N"]) -> Int64[np.ndarray, " N"]:
-        """Larger after every attempt, and never smaller after a way: components of the automaton come in order, each
-        attempt settles something or, where it settles nothing, visits something new."""
+        """Larger after every attempt, and never smaller after a path: components of the automaton come in order, each
+        attempt closes a condition or, where it closes none, visits something new."""
         depth = (self.reach & ~self.reach.T).sum(axis=0)
-        settled, visits = self.settled[q].sum(axis=1), self.visits[q].sum(axis=1)
-        return (depth[state].astype(np.int64) << 40) + (settled.astype(np.int64) << 20) + visits
+        known, visits = self.known_count[q].sum(axis=1), self.visits[q].sum(axis=1)
+        return (depth[state].astype(np.int64) << 40) + (known.astype(np.int64) << 20) + visits
 
 
-def _reachable(ways: np.ndarray, edges: list[tuple[int, int, int]]) -> np.ndarray:
-    """``[z, z']``: ways and attempts can lead from z to z'."""
-    count = len(ways)
-    reach = np.eye(count, dtype=bool) | ways
+def _reachable(paths: np.ndarray, edges: list[tuple[int, int, int]]) -> np.ndarray:
+    """``[z, z']``: paths and attempts can lead from z to z'."""
+    count = len(paths)
+    reach = np.eye(count, dtype=bool) | paths
     for source, target, _ in edges:
         reach[source, target] = True
     for via in range(count):

@@ -16,13 +16,13 @@ from potlp_jax.planning.exact.knowledge import Knowledge
 class Relaxation:
     """Bounds on open nodes.
 
-    Below: in one state of the automaton (or those that ways lead to from it) every attempt can be made once at most;
-    it costs no less than the cheapest way to its subgoal, shared by the attempts there, and succeeds with the largest
+    Below: in one state of the automaton (or those that paths lead to from it) every attempt can be made once at most;
+    it costs no less than the cheapest path to its subgoal, shared by the attempts there, and succeeds with the largest
     probability that later knowledge may give it. With the order of attempts free, the best one is by ratio of cost to
-    probability, and the way ends when success leads on, the robot finishes, or nothing is left. Attempts that are
+    probability, and the rollout ends when success leads on, the robot finishes, or nothing is left. Attempts that are
     certain to stay available must be made before a dead end; others may be left out.
 
-    Above: the dead end after as many of the longest steps as there are conditions to settle.
+    Above: the dead end after as many of the longest steps as there are conditions to close.
     """
 
     def __init__(self, tables: Knowledge) -> None:
@@ -38,8 +38,8 @@ class Relaxation:
             self._values = self._success_values()
 
     def _reachable_probabilities(self) -> tuple[np.ndarray, np.ndarray]:
-        """``[s, q, z, k]``: the largest P_S of edge k of state z that failures and ways can lead to from row q, and
-        the least while the edge's own condition is not settled (own state only)."""
+        """``[s, q, z, k]``: the largest P_S of edge k of state z that failures and paths can lead to from row q, and
+        the least while the edge's own condition is not closed (own state only)."""
         t = self._tables
         shape = (*t.probability.shape[:2], t.rollouts.states, t.width)
         largest, least = np.zeros(shape), np.zeros(shape)
@@ -75,15 +75,15 @@ class Relaxation:
             within = more
         zs, subgoals = sorted(within), len(t.subgoals)
         pairs = [(z, k) for z in zs for k in range(len(t.edges[z]))]
-        owed = np.array(
+        pending_cost = np.array(
             [min((t.failure_cost[s, z, k] for z, k in pairs), default=0.0) for s in range(subgoals)], dtype=np.float64
         )
-        ways = t.travel[:subgoals][:, zs][:, :, :, zs]
+        path_costs = t.travel[:subgoals][:, zs][:, :, :, zs]
         enter = np.full(subgoals, np.inf)
         for s in range(subgoals):
-            way = ways[:, :, s] + owed[:, None, None]
-            way[s, range(len(zs)), range(len(zs))] = np.inf
-            enter[s] = way.min() if way.size else np.inf
+            path_cost = path_costs[:, :, s] + pending_cost[:, None, None]
+            path_cost[s, range(len(zs)), range(len(zs))] = np.inf
+            enter[s] = path_cost.min() if path_cost.size else np.inf
         finish = t.finish[:subgoals][:, zs]
         always = np.zeros(subgoals, bool)
         if zs == [state]:
@@ -91,7 +91,7 @@ class Relaxation:
             always = np.asarray(np.isfinite(apart).all(axis=0))
         return _Stage(
             pairs=np.array(pairs, dtype=int).reshape(-1, 2),
-            owed=owed,
+            pending_cost=pending_cost,
             enter=np.where(np.isfinite(enter), enter, 0.0),
             finish=float(finish.min()) if finish.size else math.inf,
             always=always,
@@ -119,7 +119,7 @@ class Relaxation:
                 own = np.flatnonzero(t.state == z)
                 cost = cheapest[:, own, k].min(axis=1, initial=np.inf)
                 if bounds is not None:
-                    leave = np.maximum(bounds[0] - self._stages[target].owed, 0.0) + np.where(
+                    leave = np.maximum(bounds[0] - self._stages[target].pending_cost, 0.0) + np.where(
                         np.isfinite(cost), cost, 0.0
                     )
                     arrival = np.minimum(leave, np.maximum(bounds[0] - self._stages[target].enter, 0.0))
@@ -152,8 +152,8 @@ class Relaxation:
         return total * (1.0 - 1e-9), np.asarray(forced.any(axis=1))
 
     def below(self, state: int, q: Int32[np.ndarray, "N S"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """For nodes of one state: least cost of leaving (less what is owed) and of an attempt beyond each subgoal, both
-        ``[N, S]``, inf where there is nothing to do; and whether it may be a dead end, ``[N]``."""
+        """For nodes of one state: least cost of leaving (less the pending cost) and of an attempt beyond each subgoal,
+        both ``[N, S]``, inf where there is nothing to do; and whether it may be a dead end, ``[N]``."""
         t, stage = self._tables, self._stages[state]
         subgoals = np.arange(len(t.subgoals))[None]
         zs, ks = stage.pairs[:, 0], stage.pairs[:, 1]
@@ -161,7 +161,7 @@ class Relaxation:
         largest, least = self._largest[pick], self._least[pick]
         total, forced = self._total(stage, largest, least)
         nothing = ~(largest > 0).any(axis=(1, 2)) & np.isinf(stage.finish)
-        leave = np.where(nothing[:, None], np.inf, np.maximum(total[:, None] - stage.owed, 0.0))
+        leave = np.where(nothing[:, None], np.inf, np.maximum(total[:, None] - stage.pending_cost, 0.0))
         first = np.where(t.available[subgoals, q], self._first_try(state, q), np.inf).min(axis=2)
         attempt = np.maximum(first, total[:, None] - stage.enter)
         return leave, attempt, ~forced
@@ -175,13 +175,13 @@ class Relaxation:
     def above(self, state: int, q: Int32[np.ndarray, "N S"]) -> Float64[np.ndarray, " N"]:
         """No policy costs more from here on."""
         t = self._tables
-        conditions = int(t.settled.max(initial=0)) if t.rollouts.closure.has_compounds else self._relevant(state)
-        unknown = len(t.subgoals) * conditions - t.settled[q].sum(axis=1)
+        conditions = int(t.known_count.max(initial=0)) if t.rollouts.closure.has_compounds else self._relevant(state)
+        unknown = len(t.subgoals) * conditions - t.known_count[q].sum(axis=1)
         repeats = len(t.subgoals) * t.rollouts.states if t.certain.any() else 0
-        ways = np.concatenate([t.travel.ravel(), t.finish.ravel()])
-        way = float(np.max(ways[np.isfinite(ways)], initial=0.0))
+        path_costs = np.concatenate([t.travel.ravel(), t.finish.ravel()])
+        path_cost = float(np.max(path_costs[np.isfinite(path_costs)], initial=0.0))
         inside = float(max(t.success_cost.max(initial=0.0), t.failure_cost.max(initial=0.0)))
-        return self._dead_end + (unknown + 1) * (1 + repeats) * (way + 2.0 * inside)
+        return self._dead_end + (unknown + 1) * (1 + repeats) * (path_cost + 2.0 * inside)
 
     def _relevant(self, state: int) -> int:
         t = self._tables
@@ -189,14 +189,15 @@ class Relaxation:
 
 
 class _Stage(NamedTuple):
-    """What the relaxation needs to know of a state and those that ways lead to from it.
+    """What the relaxation needs to know of a state and those that paths lead to from it.
 
-    ``pairs``: (z, k) of its edges. ``owed``: least way back by subgoal. ``enter``: least cost of getting to a subgoal,
-    what is owed included. ``finish``: least way to acceptance. ``always``: subgoals within reach from every other.
+    ``pairs``: (z, k) of its edges. ``pending_cost``: least pending cost by subgoal. ``enter``: least cost of getting to
+    a subgoal, the pending cost included. ``finish``: least path cost to acceptance. ``always``: subgoals within reach
+    from every other.
     """
 
     pairs: np.ndarray
-    owed: np.ndarray
+    pending_cost: np.ndarray
     enter: np.ndarray
     finish: float
     always: np.ndarray

@@ -17,7 +17,7 @@ from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.types import NO_CLASS
 
 
-class Settled(NamedTuple):
+class SubgoalKnowledge(NamedTuple):
     """What is known about one subgoal: bit masks over conditions."""
 
     holds: int
@@ -25,11 +25,11 @@ class Settled(NamedTuple):
 
 
 class Position(NamedTuple):
-    """A history without what it owes. ``visited`` is a bit mask, bit ``place * Z + state``."""
+    """A history without its pending cost. ``visited`` is a bit mask, bit ``location * Z + state``."""
 
-    place: int
+    location: int
     state: int
-    knowledge: tuple[Settled, ...]
+    knowledge: tuple[SubgoalKnowledge, ...]
     visited: int
 
 
@@ -51,7 +51,7 @@ class Rollouts:
       finish_action: index of going to acceptance through known space, the last action.
       dead_end_cost: cost of a dead end.
       accepting: ``[Z]``, real accepting states.
-      travel: ``[S + 1][Z][S][Z]``, finish: ``[S + 1][Z]``: lengths of ways, inf where there is none.
+      travel: ``[S + 1][Z][S][Z]``, finish: ``[S + 1][Z]``: path costs, inf where there is none.
       closure: what follows from the outcome of an attempt.
     """
 
@@ -76,11 +76,11 @@ class Rollouts:
         }
         self.closure = Closure(np.asarray(task.implies), np.asarray(task.condition_classes), task.class_mask.shape[0])
         self._classes = [[int(c) for c in row if c != NO_CLASS] for row in np.asarray(task.condition_classes)]
-        self._terms: dict[tuple[int, int, Settled], Terms] = {}
+        self._terms: dict[tuple[int, int, SubgoalKnowledge], Terms] = {}
 
     def root(self) -> Position:
         """At the robot, nothing known."""
-        knowledge = (Settled(0, 0),) * self.subgoals
+        knowledge = (SubgoalKnowledge(0, 0),) * self.subgoals
         visited = 1 << (self.subgoals * self.states + self._initial_state)
         return Position(self.subgoals, self._initial_state, knowledge, visited)
 
@@ -93,10 +93,10 @@ class Rollouts:
         if action == self.finish_action:
             return Terms(1.0, 0.0, 0.0, False)
         subgoal, _, _, condition = self.split(action)
-        settled = position.knowledge[subgoal]
-        key = (subgoal, condition, settled)
+        known = position.knowledge[subgoal]
+        key = (subgoal, condition, known)
         if key not in self._terms:
-            self._terms[key] = self.combined(subgoal, condition, settled)
+            self._terms[key] = self.combined(subgoal, condition, known)
         return self._terms[key]
 
     def stays_inside(self, position: Position, action: int) -> bool:
@@ -104,16 +104,16 @@ class Rollouts:
         if action == self.finish_action:
             return False
         subgoal, source, _, _ = self.split(action)
-        return subgoal == position.place and source == position.state
+        return subgoal == position.location and source == position.state
 
     def distance(self, position: Position, action: int) -> float:
-        """D without what is owed; inf where the action is out of reach."""
+        """D without the pending cost; inf where the action is out of reach."""
         if action == self.finish_action:
-            return self.finish[position.place][position.state]
+            return self.finish[position.location][position.state]
         if self.stays_inside(position, action):
             return 0.0
         subgoal, source, _, _ = self.split(action)
-        return self.travel[position.place][position.state][subgoal][source]
+        return self.travel[position.location][position.state][subgoal][source]
 
     def available(self, position: Position) -> Iterator[int]:
         """Actions by increasing index."""
@@ -128,36 +128,36 @@ class Rollouts:
                 leads_back = terms.certain and position.visited >> (subgoal * self.states + target) & 1
                 if terms.probability > 0 and not leads_back:
                     yield action
-        if math.isfinite(self.finish[position.place][position.state]):
+        if math.isfinite(self.finish[position.location][position.state]):
             yield self.finish_action
 
     def step(self, position: Position, action: int, success: bool) -> Position:
         """The history after an available action other than finish."""
         subgoal, source, target, condition = self.split(action)
-        settled = position.knowledge[subgoal]
+        known = position.knowledge[subgoal]
         state = target if success else source
         here = 1 << (subgoal * self.states + state)
-        if settled.holds >> condition & 1:
-            return position._replace(place=subgoal, state=state, visited=position.visited | here)
-        after = self.closure.settle(settled, condition, success)
+        if known.holds >> condition & 1:
+            return position._replace(location=subgoal, state=state, visited=position.visited | here)
+        after = self.closure.add_outcome(known, condition, success)
         knowledge = (*position.knowledge[:subgoal], after, *position.knowledge[subgoal + 1 :])
         return Position(subgoal, state, knowledge, here)
 
-    def combined(self, subgoal: int, condition: int, settled: Settled) -> Terms:
+    def combined(self, subgoal: int, condition: int, known: SubgoalKnowledge) -> Terms:
         """P_S, R_S, R_F of a condition from its cubes, tried in order of R_S (docs/model.md section 3)."""
         probabilities, success_costs, failure_costs = (values[subgoal] for values in self._estimates)
         classes = self._classes[condition]
-        certain = bool(settled.holds >> condition & 1)
+        certain = bool(known.holds >> condition & 1)
         none_yet, weighted, possible = 1.0, 0.0, []
         for c in sorted(classes, key=lambda c: (success_costs[c], c)):
-            failed, held = settled.fails >> c & 1, settled.holds >> c & 1
+            failed, held = known.fails >> c & 1, known.holds >> c & 1
             chance = 1.0 if held else 0.0 if failed else probabilities[c]
             weighted += none_yet * chance * success_costs[c]
             none_yet *= 1.0 - chance
             possible += [] if failed else [success_costs[c]]
         total = 1.0 - none_yet
         success_cost = weighted / total if total > 0 else min(possible, default=0.0)
-        probability = 1.0 if certain else 0.0 if settled.fails >> condition & 1 else total
+        probability = 1.0 if certain else 0.0 if known.fails >> condition & 1 else total
         return Terms(probability, success_cost, max(failure_costs[c] for c in classes), certain)
 
 
@@ -173,24 +173,24 @@ class Closure:
             for m in range(class_count, count)
             if implies[m, m]
         ]
-        self._known: dict[tuple[Settled, int, bool], Settled] = {}
+        self._known: dict[tuple[SubgoalKnowledge, int, bool], SubgoalKnowledge] = {}
 
     @property
     def has_compounds(self) -> bool:
         """Whether a condition has several cubes."""
         return bool(self._compounds)
 
-    def settle(self, settled: Settled, condition: int, success: bool) -> Settled:
+    def add_outcome(self, known: SubgoalKnowledge, condition: int, success: bool) -> SubgoalKnowledge:
         """What is known once the condition has held or failed."""
-        key = (settled, condition, success)
+        key = (known, condition, success)
         if key not in self._known:
-            holds = settled.holds | (self._forward[condition] if success else 0)
-            fails = settled.fails | (0 if success else self._backward[condition])
+            holds = known.holds | (self._forward[condition] if success else 0)
+            fails = known.fails | (0 if success else self._backward[condition])
             if self._compounds:
                 fails = self._propagate(fails)
                 refuting = (x for x, backward in enumerate(self._backward) if self._propagate(fails | backward) & holds)
                 holds = sum(1 << x for x in refuting)
-            self._known[key] = Settled(holds, fails)
+            self._known[key] = SubgoalKnowledge(holds, fails)
         return self._known[key]
 
     def _propagate(self, fails: int) -> int:

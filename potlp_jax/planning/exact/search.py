@@ -43,7 +43,7 @@ class Search:
         self._nodes, self._expansions = graph.nodes, graph.expansions
 
     def begin(self, max_states: int) -> None:
-        """Expand the root and what ways lead to from it; beyond that breadth first, while there are few nodes."""
+        """Expand the root and what paths lead to from it; beyond that breadth first, while there are few nodes."""
         self._graph.expand(np.array([0]))
         links = self._expansions["link"][0]
         self._graph.expand(self._graph.open(np.unique(links[links > 0])))
@@ -62,7 +62,7 @@ class Search:
         for group in self._graph.groups(np.arange(self._expansions.count)):
             nodes = self._expansions["node"][group]
             i, p = np.nonzero(flow.leaving[nodes])
-            other, s = self._expansions["best_way"][group[i], p].T
+            other, s = self._expansions["best_path"][group[i], p].T
             on = other != FINISH
             link = self._expansions["link"][group[i[on]], other[on]]
             mass = flow.leaving[nodes[i[on]], p[on]]
@@ -102,13 +102,13 @@ class Search:
         q, state = self._nodes["q"][nodes, s], self._nodes["state"][nodes]
         chance = t.probability[s, q, k]
         success, failure = self._expansions["success"][expansions, s, k], self._expansions["failure"][expansions, s, k]
-        for child, owed, share in (
+        for child, pending_cost, share in (
             (success, t.success_cost[s, q, k], chance),
             (failure, t.failure_cost[s, state, k], 1.0 - chance),
         ):
             real = (child >= 0) & (share * mass > 0)
             n, at, amount = child[real], s[real], (share * mass)[real]
-            leave = owed[real] + self._nodes["leave_lower"][n, at]
+            leave = pending_cost[real] + self._nodes["leave_lower"][n, at]
             stay = self._nodes["attempt_lower"][n, at]
             closed = self._nodes["expansion"][n] >= 0
             dead = np.isinf(np.minimum(leave, stay))
@@ -133,7 +133,7 @@ class Search:
         return np.where(self._nodes["expansion"] < 0, mass, 0.0)
 
     def _spread(self, mass: np.ndarray, expansions: np.ndarray) -> None:
-        """Pass the mass of nodes on to their children; to those that ways lead to, half of it besides."""
+        """Pass the mass of nodes on to their children; to those that paths lead to, half of it besides."""
         nodes = self._expansions["node"][expansions]
         lower, _ = self._bounds.attempts(expansions)
         slack = lower - lower.min(axis=(1, 2), keepdims=True, initial=1e300)
@@ -155,7 +155,7 @@ class Search:
         i, s = np.nonzero(mass[nodes])
         leave = self._nodes["leave_lower"][nodes[i], s] < self._nodes["attempt_lower"][nodes[i], s]
         amount = mass[nodes[i], s]
-        other, there = self._expansions["best_way"][fresh[i], s].T
+        other, there = self._expansions["best_path"][fresh[i], s].T
         link = np.where(leave & (other >= 0), self._expansions["link"][fresh[i], other], nodes[i])
         goes = ~leave | (other >= 0)
         at = np.where(leave, there, s)

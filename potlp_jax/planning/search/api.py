@@ -6,8 +6,8 @@ What differs from PO-UCT as published, in the default mode:
   of samples; outcomes not yet seen have a guessed value (``heuristic``).
 * Orders of the same events lead to the same node.
 * Instead of sampling, a descent takes the action that is best if every guess is too high by a fraction ``optimism``,
-  and of its outcomes the one to which this gap is owed. Once no gap is left at the root the search ends: every outcome
-  of every choice that could be best has been seen.
+  and of its outcomes the one that contributes most to this gap. Once no gap is left at the root the search ends: every
+  outcome of every choice that could be best has been seen.
 
 ``SearchMode.AUTHORS_CODE`` searches as the authors' code does. ``jax.vmap`` of the unbatched functions is routed to the
 kernel (``search_kernel``), also nested.

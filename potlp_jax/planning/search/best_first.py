@@ -34,13 +34,13 @@ from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL, Status
 
 @struct.dataclass(kw_only=True)
 class _Descent:
-    """One descent of all rows, at ``node`` with ``owed`` owed there, or about to leave the graph by ``action`` and
-    ``success`` (``expands``), or at an outcome that satisfies the task (``accepted``).
+    """One descent of all rows: at ``node`` with ``pending_cost`` pending, or about to leave the graph by ``action``
+    and ``success`` (``expands``), or at an outcome that satisfies the task (``accepted``).
 
     The rest are records per level: the node's ``values``; after the child's value ``v`` is known,
     ``Q = base + weight * v``, and likewise the bound from ``base_bound``; ``rival`` and ``low_rival`` are the least Q
     and bound of the node's other actions of the same kind (that leave the unknown region, or that stay inside);
-    ``add`` is what to add on the way up: what is owed at the node, in the mode ``AUTHORS_CODE`` the sampled cost of
+    ``add`` is what to add on the way up: the pending cost at the node, in the mode ``AUTHORS_CODE`` the sampled cost of
     the step.
     Levels that a row did not reach hold a node beyond the tree's capacity.
     """
@@ -48,7 +48,7 @@ class _Descent:
     level: Int32[Array, ""]
     active: Bool[Array, "B"]
     node: Int32[Array, "B"]
-    owed: Float32[Array, "B"]
+    pending_cost: Float32[Array, "B"]
     action: Int32[Array, "B"]
     success: Bool[Array, "B"]
     expands: Bool[Array, "B"]
@@ -70,7 +70,7 @@ def is_open(context: Context, tree: Tree, config: SearchConfig) -> Bool[Array, "
     """Whether more simulations can change anything."""
     if config.mode is SearchMode.AUTHORS_CODE:
         return jnp.any(jnp.isfinite(tree.q_values[:, Tree.ROOT]), axis=1)
-    value, bound = arrival(tree.values[:, Tree.ROOT], context.root.owed, context.dead_end_cost)
+    value, bound = arrival(tree.values[:, Tree.ROOT], context.root.pending_cost, context.dead_end_cost)
     return value > bound
 
 
@@ -110,7 +110,7 @@ def choose(context: Context, tree: Tree, config: SearchConfig) -> Choice:
     accepted = jnp.take_along_axis(context.tables.accepting, context.root.state[:, None], axis=1)[:, 0]
     value = jnp.where(available, q_values[batch, action], context.dead_end_cost)
     value = jnp.where(accepted, 0.0, value)
-    _, bound = arrival(tree.values[:, Tree.ROOT], context.root.owed, context.dead_end_cost)
+    _, bound = arrival(tree.values[:, Tree.ROOT], context.root.pending_cost, context.dead_end_cost)
     if config.mode is SearchMode.AUTHORS_CODE:
         bound = jnp.full_like(value, -jnp.inf)
     gap = (value - bound) / jnp.where(value > 0, value, 1.0)
@@ -128,8 +128,8 @@ def choose(context: Context, tree: Tree, config: SearchConfig) -> Choice:
 
 def _descend(context: Context, tree: Tree, config: SearchConfig) -> _Descent:
     """Follow the graph from the root to an outcome not yet expanded, or to the rollout's end. Reads only."""
-    batch, places, actions = tree.q_values.shape
-    rows, capacity = jnp.arange(batch, dtype=jnp.int32), places - 1
+    batch, slots, actions = tree.q_values.shape
+    rows, capacity = jnp.arange(batch, dtype=jnp.int32), slots - 1
     index = jnp.arange(actions, dtype=jnp.int32)[None, :]
     states, depth = context.tables.accepting.shape[1], config.max_depth
     authors = config.mode is SearchMode.AUTHORS_CODE
@@ -146,13 +146,13 @@ def _descend(context: Context, tree: Tree, config: SearchConfig) -> _Descent:
         q_values, bounds, values = jax.lax.optimization_barrier(
             (tree.q_values[rows, node], tree.bounds[rows, node], tree.values[rows, node])
         )
-        inside = context.facts[:, :, 0] == (tree.place[rows, node] * states + tree.state[rows, node])[:, None]
-        debt = jnp.where(inside, 0.0, descent.owed[:, None])
+        inside = context.facts[:, :, 0] == (tree.location[rows, node] * states + tree.state[rows, node])[:, None]
+        pending = jnp.where(inside, 0.0, descent.pending_cost[:, None])
         if authors:
             width = config.exploration * jnp.sqrt(jnp.log(jnp.maximum(values[:, 4] + 1.0, 2.0)))
-            score = q_values + debt - width[:, None] * bounds
+            score = q_values + pending - width[:, None] * bounds
         else:
-            score = bounds + debt
+            score = bounds + pending
         least = least_of_each(score, jnp.inf)
         # Minimum, then the first index that attains it: faster than argmin, and ties go to the lowest index.
         action = least_of_each(jnp.where(score <= least[:, None], index, actions - 1), actions - 1)
@@ -163,22 +163,22 @@ def _descend(context: Context, tree: Tree, config: SearchConfig) -> _Descent:
         others = [least_of_each(jnp.where(rivals, row, jnp.inf), jnp.inf) for row in (q_values, bounds)]
         accepts = context.facts[rows, action, 1] != 0
         children = tree.children[rows, node, action]
-        way = context.tables.distance[rows, tree.place[rows, node], tree.state[rows, node], action]
+        path_cost = context.tables.distance[rows, tree.location[rows, node], tree.state[rows, node], action]
         odds = _Odds(
-            way=jnp.where(goes_inside, 0.0, way),
+            path_cost=jnp.where(goes_inside, 0.0, path_cost),
             chance=tree.chances[rows, node, action],
             success_cost=tree.success_costs[rows, node, action],
             failure_cost=context.tables.actions.failure_cost[rows, action],
-            lost=tree.lost[rows, node, action],
-            won=tree.won[rows, node, action],
+            failure_value=tree.failure_value[rows, node, action],
+            success_value=tree.success_value[rows, node, action],
         )
         if authors:
             success = uniform(context.seeds, tree.simulations, level) < odds.chance
             step = _sampled_step(odds, success, q_values[rows, action], bounds[rows, action])
-            step = dataclasses.replace(step, add=step.add + jnp.where(goes_inside, 0.0, descent.owed))
+            step = dataclasses.replace(step, add=step.add + jnp.where(goes_inside, 0.0, descent.pending_cost))
         else:
             step = _expected_step(context, tree, odds, children, accepts)
-            step = dataclasses.replace(step, add=descent.owed)
+            step = dataclasses.replace(step, add=descent.pending_cost)
         outcome = step.success.astype(jnp.int32)
         child = children[rows, outcome]
         finished = moves & step.success & accepts
@@ -188,7 +188,7 @@ def _descend(context: Context, tree: Tree, config: SearchConfig) -> _Descent:
             level=level + 1,
             active=goes_deeper,
             node=jnp.where(goes_deeper, child, node),
-            owed=jnp.where(goes_deeper | expands, step.owed, descent.owed),
+            pending_cost=jnp.where(goes_deeper | expands, step.pending_cost, descent.pending_cost),
             action=jnp.where(moves, action, descent.action),
             success=jnp.where(moves, step.success, descent.success),
             expands=descent.expands | expands,
@@ -212,7 +212,7 @@ def _descend(context: Context, tree: Tree, config: SearchConfig) -> _Descent:
         level=jnp.int32(0),
         active=is_open(context, tree, config),
         node=jnp.full((batch,), Tree.ROOT, jnp.int32),
-        owed=context.root.owed,
+        pending_cost=context.root.pending_cost,
         action=jnp.zeros((batch,), jnp.int32),
         success=nowhere,
         expands=nowhere,
@@ -234,22 +234,22 @@ def _descend(context: Context, tree: Tree, config: SearchConfig) -> _Descent:
 
 @struct.dataclass(kw_only=True)
 class _Odds:
-    """One action of each row: D without what is owed, P_S, R_S, R_F, and the guessed values after both outcomes."""
+    """One action of each row: D without the pending cost, P_S, R_S, R_F, and the guessed values after both outcomes."""
 
-    way: Float32[Array, "B"]
+    path_cost: Float32[Array, "B"]
     chance: Float32[Array, "B"]
     success_cost: Float32[Array, "B"]
     failure_cost: Float32[Array, "B"]
-    lost: Float32[Array, "B"]
-    won: Float32[Array, "B"]
+    failure_value: Float32[Array, "B"]
+    success_value: Float32[Array, "B"]
 
 
 @struct.dataclass(kw_only=True)
 class _Step:
-    """An outcome to follow, what is owed after it, and how the action depends on it (see ``_Descent``)."""
+    """An outcome to follow, the pending cost after it, and how the action depends on it (see ``_Descent``)."""
 
     success: Bool[Array, "B"]
-    owed: Float32[Array, "B"]
+    pending_cost: Float32[Array, "B"]
     base: Float32[Array, "B"]
     base_bound: Float32[Array, "B"]
     weight: Float32[Array, "B"]
@@ -263,20 +263,20 @@ def _expected_step(
     children: Int32[Array, "B 2"],
     accepts: Bool[Array, "B"],
 ) -> _Step:
-    """Follow the outcome to which the action owes more of the gap between its Q and its bound."""
+    """Follow the outcome that contributes more to the gap between its Q and its bound."""
     chance = odds.chance
-    won, won_bound = _outcome(context, tree, children[:, 1], odds.won, odds.success_cost)
-    lost, lost_bound = _outcome(context, tree, children[:, 0], odds.lost, odds.failure_cost)
-    success = chance * (won - won_bound) >= (1.0 - chance) * (lost - lost_bound)
+    success_value, success_bound = _outcome(context, tree, children[:, 1], odds.success_value, odds.success_cost)
+    failure_value, failure_bound = _outcome(context, tree, children[:, 0], odds.failure_value, odds.failure_cost)
+    success = chance * (success_value - success_bound) >= (1.0 - chance) * (failure_value - failure_bound)
     # Nothing is to be learnt from satisfying the task, and a certain success cannot fail.
     success = (success & ~accepts) | (chance >= 1.0)
-    known = odds.way + chance * odds.success_cost + (1.0 - chance) * odds.failure_cost
+    known = odds.path_cost + chance * odds.success_cost + (1.0 - chance) * odds.failure_cost
     weight, rest = jnp.where(success, chance, 1.0 - chance), jnp.where(success, 1.0 - chance, chance)
     return _Step(
         success=success,
-        owed=jnp.where(success, odds.success_cost, odds.failure_cost),
-        base=known + rest * jnp.where(success, lost, won),
-        base_bound=known + rest * jnp.where(success, lost_bound, won_bound),
+        pending_cost=jnp.where(success, odds.success_cost, odds.failure_cost),
+        base=known + rest * jnp.where(success, failure_value, success_value),
+        base_bound=known + rest * jnp.where(success, failure_bound, success_bound),
         weight=weight,
         add=jnp.zeros_like(weight),
     )
@@ -286,12 +286,12 @@ def _sampled_step(
     odds: _Odds, success: Bool[Array, "B"], q_value: Float32[Array, "B"], spread: Float32[Array, "B"]
 ) -> _Step:
     """The sampled outcome; Q is the mean of the sampled costs."""
-    owed = jnp.where(success, odds.success_cost, odds.failure_cost)
-    cost = odds.way + owed
+    pending_cost = jnp.where(success, odds.success_cost, odds.failure_cost)
+    cost = odds.path_cost + pending_cost
     count = jnp.round(1.0 / (spread * spread)) + 1.0
     return _Step(
         success=success,
-        owed=owed,
+        pending_cost=pending_cost,
         base=q_value + (cost - q_value) / count,
         base_bound=jax.lax.rsqrt(count),
         weight=1.0 / count,
@@ -304,11 +304,11 @@ def _outcome(
     tree: Tree,
     child: Int32[Array, "B"],
     guessed: Float32[Array, "B"],
-    owed: Float32[Array, "B"],
+    pending_cost: Float32[Array, "B"],
 ) -> tuple[Float32[Array, "B"], Float32[Array, "B"]]:
     """Value and bound of an outcome: those of its node, or by the guess where there is none."""
     rows = jnp.arange(child.shape[0], dtype=jnp.int32)
-    value, bound = arrival(tree.values[rows, jnp.maximum(child, 0)], owed, context.dead_end_cost)
+    value, bound = arrival(tree.values[rows, jnp.maximum(child, 0)], pending_cost, context.dead_end_cost)
     new = child == Tree.UNVISITED
     return jnp.where(new, guessed, value), jnp.where(new, (1.0 - context.optimism) * guessed, bound)
 
@@ -324,7 +324,7 @@ def _expand(
     rows = jnp.arange(tree.size.shape[0], dtype=jnp.int32)
     capacity = tree.q_values.shape[1] - 1
     row = unpack_rows(context.packed[rows, descent.action], context.tables.actions)
-    parent = tree.history(descent.node, descent.owed)
+    parent = tree.history(descent.node, descent.pending_cost)
     history = jax.vmap(step_row)(context.tables, row, parent, descent.success)
     node = new_node(context, history, config)
     known, key, slot = find(context, tree, history)
@@ -335,7 +335,7 @@ def _expand(
     added = is_new & has_room
     arrived = tree.values[rows, jnp.where(descent.expands, jnp.maximum(known, 0), descent.node)]
     entry = jnp.concatenate([key, tree.size[:, None]], axis=1)
-    # A node that is not added goes to the spare place behind the others.
+    # A node that is not added goes to the spare slot behind the others.
     index = jnp.where(is_new, tree.size, capacity)
 
     def write(array: Array, new: Array, index: Array = index) -> Array:
@@ -347,9 +347,9 @@ def _expand(
         bounds=write(tree.bounds, node.bounds),
         chances=write(tree.chances, node.chances),
         success_costs=write(tree.success_costs, node.success_costs),
-        lost=write(tree.lost, node.lost),
-        won=write(tree.won, node.won),
-        place=write(tree.place, history.place),
+        failure_value=write(tree.failure_value, node.failure_value),
+        success_value=write(tree.success_value, node.success_value),
+        location=write(tree.location, history.location),
         state=write(tree.state, history.state),
         holds=write(tree.holds, history.holds),
         fails=write(tree.fails, history.fails),
@@ -361,10 +361,12 @@ def _expand(
         | status_of_rows(descent.active, Status.DEPTH_OVERFLOW),
     )
     # Read back what was written: minima over rows still to be computed would compute them again and again.
-    values = least_values(context, tree.q_values[rows, index], tree.bounds[rows, index], history.place, history.state)
+    values = least_values(
+        context, tree.q_values[rows, index], tree.bounds[rows, index], history.location, history.state
+    )
     tree = dataclasses.replace(tree, values=write(tree.values, values))
     values = jnp.where(is_new[:, None], values, arrived)
-    value, bound = arrival(values, descent.owed, context.dead_end_cost)
+    value, bound = arrival(values, descent.pending_cost, context.dead_end_cost)
     if config.mode is SearchMode.AUTHORS_CODE:
         dead = jnp.isinf(jnp.minimum(values[:, 0], values[:, 1]))
         value = jnp.where(dead, context.dead_end_cost, 0.0)
@@ -382,8 +384,8 @@ def _back_up(
     config: SearchConfig,
 ) -> Tree:
     """From the leaf to the root: Q of the actions taken, and the values of their nodes. Writes only."""
-    batch, places, actions = tree.q_values.shape
-    rows, capacity = jnp.arange(batch, dtype=jnp.int32), places - 1
+    batch, slots, actions = tree.q_values.shape
+    rows, capacity = jnp.arange(batch, dtype=jnp.int32), slots - 1
     authors = config.mode is SearchMode.AUTHORS_CODE
 
     def ascend(carry):

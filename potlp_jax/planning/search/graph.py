@@ -1,8 +1,8 @@
 """What a search has found: the graph of histories, its new nodes, and how to find a history in it.
 
-The way back that is owed never enters a node: an action either leaves the unknown region, and pays what is owed
-whatever it is, or goes on inside and pays nothing. A node keeps the least cost of both kinds apart from what is owed,
-so histories that know the same at the same place are one node, in whatever order they came to know it.
+The pending cost never enters a node: an action either leaves the unknown region and pays it, or goes on inside and pays
+nothing. A node keeps the least cost of both kinds, the pending cost left out, so histories that know the same at the
+same location are one node, in whatever order they came to know it.
 """
 
 import dataclasses
@@ -39,7 +39,7 @@ OPTIMISM_OF_FEW: float = 0.7
 with 5 attempts each, and finish."""
 
 NOWHERE: int = -1
-"""Spot of actions that are not attempted beyond a subgoal: finish, and padding."""
+"""Product state of actions that are not attempted beyond a subgoal: finish, and padding."""
 
 UNTRIED: float = 1e18
 """Spread of an action that must be tried before others are tried again; finite, so that an action that is not
@@ -112,20 +112,20 @@ class SearchConfig:
 class Tree:
     """Searched histories, a graph; node 0 is the root.
 
-    A node is what is known at a place in a state, in whatever order it came to be known. What is owed there is left out
-    of all its numbers.
+    A node is what is known at a location in a state, in whatever order it came to be known. The pending cost is left
+    out of all its numbers.
 
     Attributes:
       q_values: expected cost of each action at each node, inf where it is not available.
       bounds: what the descent compares: the same with optimistic guesses. In the mode ``AUTHORS_CODE``
         ``1 / sqrt(n_a)``, n_a the descents that took the action.
       chances, success_costs: P_S and R_S of each action, given what is known at the node.
-      lost, won: guessed values after each action's failure and success.
+      failure_value, success_value: guessed values after each action's failure and success.
       children: node reached by each action after failure and after success, or ``UNVISITED``. Outcomes that satisfy
         the task have no node: their value is 0.
       values: per node the least Q of the actions that leave the unknown region, of those that stay inside, the least
         bound of both kinds, and the descents that went on from here.
-      place, state, holds, fails, visited: the node's history, as in ``history.History``.
+      location, state, holds, fails, visited: the node's history, as in ``history.History``.
       table: per slot the key of a history and its node, -1 where the slot is empty.
       root_visits: descents that began with each action.
       size: nodes in use.
@@ -138,11 +138,11 @@ class Tree:
     bounds: Float32[Array, "*B N A"]
     chances: Float32[Array, "*B N A"]
     success_costs: Float32[Array, "*B N A"]
-    lost: Float32[Array, "*B N A"]
-    won: Float32[Array, "*B N A"]
+    failure_value: Float32[Array, "*B N A"]
+    success_value: Float32[Array, "*B N A"]
     children: Int32[Array, "*B N A 2"]
     values: Float32[Array, "*B N 5"]
-    place: Int32[Array, "*B N"]
+    location: Int32[Array, "*B N"]
     state: Int32[Array, "*B N"]
     holds: UInt32[Array, "*B N S W"]
     fails: UInt32[Array, "*B N S W"]
@@ -157,13 +157,13 @@ class Tree:
     ROOT = 0
     UNVISITED = -1
 
-    def history(self, node: Int32[Array, "*B"], owed: Float32[Array, "*B"]) -> History:
-        """The history of one node of each row, with what is owed there."""
+    def history(self, node: Int32[Array, "*B"], pending_cost: Float32[Array, "*B"]) -> History:
+        """The history of one node of each row, with the pending cost there."""
         at = (jnp.arange(self.size.shape[0], dtype=jnp.int32), node) if self.size.ndim else node
         return History(
-            place=self.place[at],
+            location=self.location[at],
             state=self.state[at],
-            owed=owed,
+            pending_cost=pending_cost,
             holds=self.holds[at],
             fails=self.fails[at],
             visited=self.visited[at],
@@ -196,7 +196,7 @@ def new_search(
     """Tables of a batch of problems, and graphs of the roots alone."""
     context = prepare(structure, leaves, seeds, config)
     root = new_node(context, context.root, config)
-    values = least_values(context, root.q_values, root.bounds, context.root.place, context.root.state)
+    values = least_values(context, root.q_values, root.bounds, context.root.location, context.root.state)
     batch, actions = root.q_values.shape
 
     def first(values: Array, fill: float = 0) -> Array:
@@ -208,11 +208,11 @@ def new_search(
         bounds=first(root.bounds, jnp.inf),
         chances=first(root.chances),
         success_costs=first(root.success_costs),
-        lost=first(root.lost),
-        won=first(root.won),
+        failure_value=first(root.failure_value),
+        success_value=first(root.success_value),
         children=jnp.full((batch, config.capacity + 1, actions, 2), Tree.UNVISITED, jnp.int32),
         values=first(values),
-        place=first(context.root.place),
+        location=first(context.root.location),
         state=first(context.root.state),
         holds=first(context.root.holds),
         fails=first(context.root.fails),
@@ -299,55 +299,68 @@ class Node:
     bounds: Float32[Array, "*B A"]
     chances: Float32[Array, "*B A"]
     success_costs: Float32[Array, "*B A"]
-    lost: Float32[Array, "*B A"]
-    won: Float32[Array, "*B A"]
+    failure_value: Float32[Array, "*B A"]
+    success_value: Float32[Array, "*B A"]
 
 
 def new_node(context: Context, history: History, config: SearchConfig) -> Node:
     """The numbers of one node per row when nothing below it has been seen."""
-    inner = dataclasses.replace(history, owed=jnp.zeros_like(history.owed))
+    inner = dataclasses.replace(history, pending_cost=jnp.zeros_like(history.pending_cost))
     terms = jax.vmap(terms_of_all)(context.tables, inner)
     chance, available = terms.success_probability, terms.available
     if config.mode is SearchMode.AUTHORS_CODE:
-        lost = won = jnp.zeros_like(chance)
+        failure_value = success_value = jnp.zeros_like(chance)
         q_values = jnp.where(available, 0.0, jnp.inf).astype(jnp.float32)
         bounds = jnp.where(available, UNTRIED, 1.0).astype(jnp.float32)
     else:
-        spot = history.place * context.tables.accepting.shape[1] + history.state
-        lost, won = guess_outcomes(
-            context.rule, spot, history.owed, available, chance, terms.success_cost, config.guess_failures
+        product_state = history.location * context.tables.accepting.shape[1] + history.state
+        failure_value, success_value = guess_outcomes(
+            context.rule,
+            product_state,
+            history.pending_cost,
+            available,
+            chance,
+            terms.success_cost,
+            config.guess_failures,
         )
         known = terms.distance + chance * terms.success_cost + (1.0 - chance) * terms.failure_cost
-        guessed = chance * won + (1.0 - chance) * lost
+        guessed = chance * success_value + (1.0 - chance) * failure_value
         q_values = jnp.where(available, known + guessed, jnp.inf)
         bounds = jnp.where(available, known + (1.0 - context.optimism[:, None]) * guessed, jnp.inf)
-    return Node(q_values=q_values, bounds=bounds, chances=chance, success_costs=terms.success_cost, lost=lost, won=won)
+    return Node(
+        q_values=q_values,
+        bounds=bounds,
+        chances=chance,
+        success_costs=terms.success_cost,
+        failure_value=failure_value,
+        success_value=success_value,
+    )
 
 
 def least_values(
     context: Context,
     q_values: Float32[Array, "B A"],
     bounds: Float32[Array, "B A"],
-    place: Int32[Array, "B"],
+    location: Int32[Array, "B"],
     state: Int32[Array, "B"],
 ) -> Float32[Array, "B 5"]:
     """``Tree.values`` of new nodes."""
-    inside = context.facts[:, :, 0] == (place * context.tables.accepting.shape[1] + state)[:, None]
+    inside = context.facts[:, :, 0] == (location * context.tables.accepting.shape[1] + state)[:, None]
     least = [
         least_of_each(jnp.where(kind, row, jnp.inf), jnp.inf)
         for row in (q_values, bounds)
         for kind in (~inside, inside)
     ]
-    return jnp.stack([*least, jnp.zeros(place.shape, jnp.float32)], axis=-1)
+    return jnp.stack([*least, jnp.zeros(location.shape, jnp.float32)], axis=-1)
 
 
 def arrival(
-    values: Float32[Array, "*B 5"], owed: Float32[Array, "*B"], dead_end_cost: Float32[Array, "*B"]
+    values: Float32[Array, "*B 5"], pending_cost: Float32[Array, "*B"], dead_end_cost: Float32[Array, "*B"]
 ) -> tuple[Float32[Array, "*B"], Float32[Array, "*B"]]:
-    """Value and bound of a node at which ``owed`` is owed."""
+    """Value and bound of a node at which ``pending_cost`` is pending."""
 
     def least(leave: Array, stay: Array) -> Array:
-        best = jnp.minimum(owed + leave, stay)
+        best = jnp.minimum(pending_cost + leave, stay)
         return jnp.where(jnp.isinf(best), dead_end_cost, best)
 
     return least(values[..., 0], values[..., 1]), least(values[..., 2], values[..., 3])
@@ -370,17 +383,17 @@ def find(
 
 
 def _key(context: Context, history: History) -> Int32[Array, "B 2"]:
-    """64 bits that tell histories with different futures apart; what is owed is not part of it."""
-    rows = jnp.arange(history.place.shape[0], dtype=jnp.int32)
+    """64 bits that tell histories with different futures apart; the pending cost is not part of it."""
+    rows = jnp.arange(history.location.shape[0], dtype=jnp.int32)
     relevant = context.relevant[rows, history.state][:, None, :]
     holds, fails = history.holds & relevant, history.fails & relevant
     number = jnp.arange(holds.shape[1] * holds.shape[2], dtype=jnp.uint32).reshape(1, *holds.shape[1:])
     where = jnp.arange(history.visited.shape[1] * history.visited.shape[2], dtype=jnp.uint32)
     visited = mix(history.visited ^ mix(where.reshape(1, *history.visited.shape[1:]) + jnp.uint32(0x51ED270B)))
-    place = mix((history.place * 64 + history.state).astype(jnp.uint32) + jnp.uint32(0x2545F491))
+    location = mix((history.location * 64 + history.state).astype(jnp.uint32) + jnp.uint32(0x2545F491))
     words = []
     for salt in (0x9E3779B9, 0xC2B2AE3D):
         mixed = mix(mix(holds + number * jnp.uint32(salt)) ^ (fails * jnp.uint32(0x85EBCA77) + jnp.uint32(salt)))
         total = jnp.sum(mixed, axis=(1, 2), dtype=jnp.uint32) + jnp.sum(visited, axis=(1, 2), dtype=jnp.uint32)
-        words.append(mix((total ^ place) * jnp.uint32(salt | 1) + place))
+        words.append(mix((total ^ location) * jnp.uint32(salt | 1) + location))
     return jax.lax.bitcast_convert_type(jnp.stack(words, axis=1), jnp.int32)

@@ -6,7 +6,7 @@ failed, exact ways, and a dead end where the chain has nothing left; each succes
 from there on with nothing known. Ordering by cost per chance is optimal for independent tests without ways in between
 (Mitten 1960); with ways it is a policy like any other, so that a guess is seldom too low.
 
-Everything here has a leading axis of lanes, written out by hand: a chain is a loop of a few operations on all lanes.
+Everything here has a leading batch axis, written out by hand: a chain is a loop of a few operations on all rows.
 
 References:
   L. G. Mitten, An analytic solution to the least cost testing sequence problem, J. of Industrial Engineering, 1960.
@@ -34,24 +34,25 @@ PASSES: int = 4
 class Rule:
     """The rule in a batch of problems.
 
-    ``ways[r, p, a]`` is the way to action ``a`` from the spot ``p = place * Z + state``; ``spots`` where each action is
-    attempted, -1 for finish. ``spends[r, a, b]``: if ``a`` fails, so does ``b``. ``after_success`` is what is guessed
-    to be left after each action's success, with what is then owed; 0 where that satisfies the task, and after finish.
+    ``path_costs[r, p, a]`` is the path cost to action ``a`` from the product state ``p = location * Z + state``;
+    ``product_states`` where each action is attempted, -1 for finish. ``closes[r, a, b]``: if ``a`` fails, so does
+    ``b``. ``after_success`` is the guessed cost after each action's success, the pending cost included; 0 where that
+    satisfies the task, and after finish.
     """
 
-    ways: Float32[Array, "*R P A"]
-    spots: Int32[Array, "*R A"]
+    path_costs: Float32[Array, "*R P A"]
+    product_states: Int32[Array, "*R A"]
     failure_cost: Float32[Array, "*R A"]
-    spends: Bool[Array, "*R A A"]
+    closes: Bool[Array, "*R A A"]
     after_success: Float32[Array, "*R A"]
     dead_end_cost: Float32[Array, "*R"]
 
 
 @struct.dataclass(kw_only=True)
 class _Chain:
-    """Actions in the order in which the rule tries them as long as they fail, per level and lane.
+    """Actions in the order in which the rule tries them as long as they fail, per level and row.
 
-    ``action`` is A where a lane has ended; ``cost`` is the expected cost of an attempt, what is left after its success
+    ``action`` is A where a row has ended; ``cost`` is the expected cost of an attempt, what is left after its success
     included, ``chance`` its P_S, ``rest`` the expected cost from this level on, given that all before have failed.
     """
 
@@ -63,7 +64,7 @@ class _Chain:
 
 def make_rule(
     tables: ActionTables,
-    spots: Int32[Array, "R A"],
+    product_states: Int32[Array, "R A"],
     chance: Float32[Array, "R A"],
     success_cost: Float32[Array, "R A"],
     reach: Bool[Array, "R Z Z"],
@@ -75,21 +76,21 @@ def make_rule(
 
     Args:
       tables: of a batch of problems.
-      spots: ``place * Z + state`` of each action's attempt.
+      product_states: ``location * Z + state`` of each action's attempt.
       chance, success_cost: P_S and R_S with nothing known.
       reach: ``[r, z, z']``: from z the rollout can get to z'.
       dead_end_cost: of each problem.
       length: failures in a row that are followed.
     """
     rows = tables.actions
-    count, actions = spots.shape
-    spends = jnp.any(rows.backward[:, :, None, :] & rows.condition_bits[:, None, :, :] != 0, axis=-1)
-    spends &= rows.subgoal[:, :, None] == rows.subgoal[:, None, :]
+    count, actions = product_states.shape
+    closes = jnp.any(rows.backward[:, :, None, :] & rows.condition_bits[:, None, :, :] != 0, axis=-1)
+    closes &= rows.subgoal[:, :, None] == rows.subgoal[:, None, :]
     rule = Rule(
-        ways=tables.distance.reshape(count, -1, actions),
-        spots=spots,
+        path_costs=tables.distance.reshape(count, -1, actions),
+        product_states=product_states,
         failure_cost=rows.failure_cost,
-        spends=spends,
+        closes=closes,
         after_success=jnp.where(rows.accepts, 0.0, dead_end_cost[:, None]).at[:, -1].set(0.0),
         dead_end_cost=dead_end_cost,
     )
@@ -101,8 +102,8 @@ def make_rule(
 
 def guess_outcomes(
     rule: Rule,
-    spot: Int32[Array, "R"],
-    owed: Float32[Array, "R"],
+    product_state: Int32[Array, "R"],
+    pending_cost: Float32[Array, "R"],
     available: Bool[Array, "R A"],
     chance: Float32[Array, "R A"],
     success_cost: Float32[Array, "R A"],
@@ -111,11 +112,11 @@ def guess_outcomes(
     """What is guessed to be left after the failure and after the success of every action of one history per problem.
 
     After the failure of the rule's first action that is the rest of its chain. After that of another action the chain
-    begins there and does without it. What does not depend on the history is owed to ``rule``.
+    begins there and does without it. What does not depend on the history is kept in ``rule``.
     """
-    lanes = jnp.arange(spot.shape[0], dtype=jnp.int32)
-    gain = _gain(rule, lanes, chance, success_cost)
-    chain = _follow(rule, lanes, spot, owed, available, chance, gain, length)
+    problem = jnp.arange(product_state.shape[0], dtype=jnp.int32)
+    gain = _gain(rule, problem, chance, success_cost)
+    chain = _follow(rule, problem, product_state, pending_cost, available, chance, gain, length)
     first, levels, actions = chain.action[0], chain.action.shape[0], available.shape[1]
     index = jnp.arange(actions, dtype=jnp.int32)[None, :]
 
@@ -124,19 +125,19 @@ def guess_outcomes(
         left_out = spent + reached * chain.rest[level + 1]
         return (spent + reached * chain.cost[level], reached * (1.0 - chain.chance[level])), left_out
 
-    nothing = jnp.zeros_like(owed), jnp.ones_like(owed)
+    nothing = jnp.zeros_like(pending_cost), jnp.ones_like(pending_cost)
     _, left_out = jax.lax.scan(skip, nothing, jnp.arange(levels, dtype=jnp.int32))
     whole = jnp.broadcast_to(chain.rest[0][:, None], available.shape)
-    without = whole.at[lanes[None, :], chain.action].set(left_out, mode="drop", unique_indices=True)
+    without = whole.at[problem[None, :], chain.action].set(left_out, mode="drop", unique_indices=True)
 
     # The chain without an action begins where that action has failed instead of here.
     start = jnp.minimum(first, actions - 1)
-    way_here = chain.cost[0] - gain[lanes, start]
-    spots = jnp.maximum(rule.spots, 0)
-    way_there = rule.ways[lanes[:, None], spots, start[:, None]] + rule.failure_cost
-    way_there = jnp.where(rule.spots == rule.spots[lanes, start][:, None], 0.0, way_there)
-    way_there = jnp.where(jnp.isinf(way_there), way_here[:, None], way_there)
-    moved = jnp.where(index == first[:, None], 0.0, way_there - way_here[:, None])
+    cost_here = chain.cost[0] - gain[problem, start]
+    product_states = jnp.maximum(rule.product_states, 0)
+    cost_there = rule.path_costs[problem[:, None], product_states, start[:, None]] + rule.failure_cost
+    cost_there = jnp.where(rule.product_states == rule.product_states[problem, start][:, None], 0.0, cost_there)
+    cost_there = jnp.where(jnp.isinf(cost_there), cost_here[:, None], cost_there)
+    moved = jnp.where(index == first[:, None], 0.0, cost_there - cost_here[:, None])
     return without + moved, rule.after_success
 
 
@@ -149,7 +150,7 @@ def _value_successes(
     length: int,
 ) -> Rule:
     """Fill in ``after_success``, edges that end nearest to acceptance first."""
-    count, actions = rule.spots.shape
+    count, actions = rule.product_states.shape
     states, subgoals = reach.shape[1], tables.distance.shape[1] - 1
     edges = (actions - 1) // max(subgoals, 1)
     if edges == 0:
@@ -162,49 +163,49 @@ def _value_successes(
     todo = jnp.max(jnp.sum(~ends, axis=1, dtype=jnp.int32))
     others = ~jnp.eye(states, dtype=jnp.bool_)
     cyclic = jnp.any(reach & jnp.swapaxes(reach, 1, 2) & others[None], axis=(1, 2))
-    lanes = jnp.repeat(jnp.arange(count, dtype=jnp.int32), subgoals)
+    problem = jnp.repeat(jnp.arange(count, dtype=jnp.int32), subgoals)
     subgoal = jnp.tile(jnp.arange(subgoals, dtype=jnp.int32), count)
-    chances, costs, tried = chance[lanes], success_cost[lanes], chance[lanes] > 0
+    chances, costs, tried = chance[problem], success_cost[problem], chance[problem] > 0
 
     def value(step, after_success):
-        edge = order[lanes, step % jnp.maximum(todo, 1)]
+        edge = order[problem, step % jnp.maximum(todo, 1)]
         action = subgoal * edges + edge
         now = dataclasses.replace(rule, after_success=after_success)
-        spot = subgoal * states + jnp.maximum(targets[lanes, edge], 0)
-        owed = success_cost[lanes, action]
-        gain = _gain(now, lanes, chances, costs)
-        chain = _follow(now, lanes, spot, owed, tried, chances, gain, length)
+        product_state = subgoal * states + jnp.maximum(targets[problem, edge], 0)
+        pending_cost = success_cost[problem, action]
+        gain = _gain(now, problem, chances, costs)
+        chain = _follow(now, problem, product_state, pending_cost, tried, chances, gain, length)
         # A problem without cycles is not valued again because another of the batch has them.
-        stays = ends[lanes, edge] | ((step >= todo) & ~cyclic[lanes])
-        left = jnp.where(stays, after_success[lanes, action], chain.rest[0])
-        return after_success.at[lanes, action].set(left, unique_indices=True)
+        stays = ends[problem, edge] | ((step >= todo) & ~cyclic[problem])
+        left = jnp.where(stays, after_success[problem, action], chain.rest[0])
+        return after_success.at[problem, action].set(left, unique_indices=True)
 
     steps = todo * jnp.where(jnp.any(cyclic), PASSES, 1)
     return dataclasses.replace(rule, after_success=jax.lax.fori_loop(0, steps, value, rule.after_success))
 
 
 def _gain(
-    rule: Rule, lanes: Int32[Array, "N"], chance: Float32[Array, "N A"], success_cost: Float32[Array, "N A"]
+    rule: Rule, problem: Int32[Array, "N"], chance: Float32[Array, "N A"], success_cost: Float32[Array, "N A"]
 ) -> Float32[Array, "N A"]:
     """Expected cost of each attempt without the way to it, what is left after success included, after failure not."""
-    return chance * (success_cost + rule.after_success[lanes]) + (1.0 - chance) * rule.failure_cost[lanes]
+    return chance * (success_cost + rule.after_success[problem]) + (1.0 - chance) * rule.failure_cost[problem]
 
 
 def _follow(
     rule: Rule,
-    lanes: Int32[Array, "N"],
-    spot: Int32[Array, "N"],
-    owed: Float32[Array, "N"],
+    problem: Int32[Array, "N"],
+    product_state: Int32[Array, "N"],
+    pending_cost: Float32[Array, "N"],
     available: Bool[Array, "N A"],
     chance: Float32[Array, "N A"],
     gain: Float32[Array, "N A"],
     length: int,
 ) -> _Chain:
-    """The chain of the rule from a spot of each lane; ``lanes`` are the lanes' problems."""
+    """The chain of the rule from a product state of each problem row; ``problem`` is the problem of each row."""
     count, actions = available.shape
     index = jnp.arange(actions, dtype=jnp.int32)[None, :]
     number = jnp.arange(count, dtype=jnp.int32)
-    spots, inverse = rule.spots[lanes], jnp.where(available, 1.0 / chance, jnp.inf)
+    product_states, inverse = rule.product_states[problem], jnp.where(available, 1.0 / chance, jnp.inf)
     none = jnp.full((length, count), actions, jnp.int32)
     zeros = jnp.zeros((length, count), jnp.float32)
 
@@ -212,9 +213,9 @@ def _follow(
         return (carry[0] < length) & jnp.any(carry[4])
 
     def advance(carry):
-        level, spot, owed, inverse, active, reached, records = carry
-        way = rule.ways[lanes, spot]
-        distance = jnp.where(spots == spot[:, None], 0.0, way + owed[:, None])
+        level, product_state, pending_cost, inverse, active, reached, records = carry
+        path_cost = rule.path_costs[problem, product_state]
+        distance = jnp.where(product_states == product_state[:, None], 0.0, path_cost + pending_cost[:, None])
         score = jax.lax.optimization_barrier(jnp.where(jnp.isinf(inverse), jnp.inf, (distance + gain) * inverse))
         least = least_of_each(score, jnp.inf)
         action = least_of_each(jnp.where(score <= least[:, None], index, actions - 1), actions - 1)
@@ -224,25 +225,33 @@ def _follow(
         records = tuple(
             jax.lax.dynamic_update_index_in_dim(old, entry, level, 0) for old, entry in zip(records, new, strict=True)
         )
-        inverse = jnp.where(rule.spends[lanes, action], jnp.inf, inverse)
+        inverse = jnp.where(rule.closes[problem, action], jnp.inf, inverse)
         reached = reached * (1.0 - odds)
         return (
             level + 1,
-            jnp.where(moves, spots[number, action], spot),
-            jnp.where(moves, rule.failure_cost[lanes, action], owed),
+            jnp.where(moves, product_states[number, action], product_state),
+            jnp.where(moves, rule.failure_cost[problem, action], pending_cost),
             inverse,
             moves & (reached > NEGLIGIBLE),
             reached,
             records,
         )
 
-    start = (jnp.int32(0), spot, owed, inverse, jnp.ones_like(spot, bool), jnp.ones_like(owed), (none, zeros, zeros))
+    start = (
+        jnp.int32(0),
+        product_state,
+        pending_cost,
+        inverse,
+        jnp.ones_like(product_state, bool),
+        jnp.ones_like(pending_cost),
+        (none, zeros, zeros),
+    )
     action, cost, odds = jax.lax.while_loop(goes_on, advance, start)[-1]
 
     def add(rest, level):
         rest = cost[level] + (1.0 - odds[level]) * rest
         return rest, rest
 
-    end = rule.dead_end_cost[lanes]
+    end = rule.dead_end_cost[problem]
     _, rest = jax.lax.scan(add, end, jnp.arange(length, dtype=jnp.int32), reverse=True)
     return _Chain(action=action, cost=cost, chance=odds, rest=jnp.concatenate([rest, end[None]]))

@@ -21,7 +21,7 @@ def tree_top(problem: PlanningProblem, tree: Tree, *, depth: int = 2, width: int
       width: actions per node: those of least Q, ties by index.
 
     Returns:
-      A node: ``place`` (None at the robot), ``state``, ``value``, ``visits``, ``accepting``, ``dead_end`` and
+      A node: ``location`` (None at the robot), ``state``, ``value``, ``visits``, ``accepting``, ``dead_end`` and
       ``actions`` (empty at the last level). An action: ``index``, ``subgoal``, ``from_state``, ``to_state`` (all None
       for finish), ``q_value``, ``visits`` (below the root those of the nodes that it leads to, which other orders of
       the same events may share), ``distance`` (D), ``success`` and ``failure``. An outcome (None where it cannot
@@ -42,7 +42,7 @@ class _TreeViewer:
     def node(self, index: int, history: History, depth: int) -> dict[str, Any]:
         """A node of the tree with the branches below it, as this history arrives there."""
         terms = _action_terms(self._problem, history)
-        # The tree leaves out what is owed; the terms of the history include it.
+        # The tree leaves out the pending cost; the terms of the history include it.
         q_values = self._q_values[index] + self._paid(history)
         order = [int(a) for a in np.argsort(q_values, kind="stable")[: self._width] if np.isfinite(q_values[a])]
         actions = [self._action(index, a, float(q_values[a]), terms, history, depth) for a in order if depth > 0]
@@ -58,17 +58,17 @@ class _TreeViewer:
         }
 
     def _paid(self, history: History) -> np.ndarray:
-        """What each action pays of what is owed: all of it, or nothing where it goes on inside."""
-        place, state, edges = int(history.place), int(history.state), max(self._problem.edge_count, 1)
-        paid = np.full(self._problem.action_count, float(history.owed))
-        if place < self._problem.subgoal_count:
+        """What each action pays of the pending cost: all of it, or nothing where it goes on inside."""
+        location, state, edges = int(history.location), int(history.state), max(self._problem.edge_count, 1)
+        paid = np.full(self._problem.action_count, float(history.pending_cost))
+        if location < self._problem.subgoal_count:
             inside = np.asarray(self._problem.task.edges)[:, 0] == state
-            paid[place * edges : (place + 1) * edges][inside] = 0.0
+            paid[location * edges : (location + 1) * edges][inside] = 0.0
         return paid
 
     def _where(self, history: History) -> dict[str, Any]:
-        place = int(history.place)
-        return {"place": None if place == self._problem.subgoal_count else place, "state": int(history.state)}
+        location = int(history.location)
+        return {"location": None if location == self._problem.subgoal_count else location, "state": int(history.state)}
 
     def _visits(self, index: int, action: int) -> int:
         if index == Tree.ROOT:

@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 
+from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.grid import World
-from potlp_jax.world.panorama import CameraConfig
 
 BRICK, MORTAR = 0.5, 0.05
 TILE_EDGE, SAMPLES = 0.06, 6
