@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from potlp_jax.learning.estimator import TrainedEstimator
     from potlp_jax.planning.policies import DecisionConfig
 
-PARTS = ("search", "distances", "decision", "looking")
+PARTS = ("search", "distances", "decision", "perception")
 
 app = command_app()
 
@@ -34,14 +34,14 @@ app = command_app()
 
 [cyan]potlp bench --parts decision --environment firefighting --json[/cyan]
 
-[cyan]potlp bench --parts looking --environment firefighting --world 1[/cyan] - what the camera and the network add
+[cyan]potlp bench --parts perception --environment firefighting --world 1[/cyan] - what the camera and the network add
 
 [dim]Compiled anew for every measurement: the cache of compiled programs is left out.[/dim]
 """,
 )
 def run_bench(
     parts: Annotated[
-        str, typer.Option("--parts", help="search, distances, decision, looking; joined by commas.")
+        str, typer.Option("--parts", help="search, distances, decision, perception; joined by commas.")
     ] = "search,distances,decision",
     family: Annotated[str, typer.Option(help="Family of benchmark problems for the search.")] = "three-single",
     subgoals: Annotated[int, typer.Option(min=1, help="Subgoals of the problems for the search.")] = 8,
@@ -84,7 +84,7 @@ def run_bench(
             progress.update(bar, description="exploring a world")
             asked = make(environment).task(task)
             # First of all, so that a missing estimator is reported before anything long.
-            trained = estimator_for(asked.propositions) if "looking" in chosen else None
+            trained = estimator_for(asked.propositions) if "perception" in chosen else None
             scene = make_scene(make_world(environment, size, world), asked)
             progress.update(bar, description="compiling and measuring")
             rows |= _measure_scene(
@@ -106,7 +106,7 @@ def _measure_scene(
     sources: int,
     repeats: int,
 ) -> dict[str, list[Any]]:
-    from potlp_jax.bench.perception import measure_looking
+    from potlp_jax.bench.perception import measure_perception
     from potlp_jax.bench.planner import measure_decision, measure_distances
 
     rows: dict[str, list[Any]] = {}
@@ -115,7 +115,7 @@ def _measure_scene(
     if "decision" in parts:
         rows["decision"] = measure_decision(scene, decision, repeats)
     if trained is not None:
-        rows["looking"] = measure_looking(scene, trained, decision, repeats)
+        rows["perception"] = measure_perception(scene, trained, decision, repeats)
     return rows
 
 
@@ -165,8 +165,8 @@ def _print(rows: dict[str, list[Any]], where: dict[str, Any]) -> None:
         out.print(_distance_table(rows["distances"]))
     if "decision" in rows:
         out.print(_phase_table("one decision, by phase", rows["decision"]))
-    if "looking" in rows:
-        out.print(_phase_table("looking, and one decision with the trained network, by phase", rows["looking"]))
+    if "perception" in rows:
+        out.print(_phase_table("perception, and one decision with the trained network, by phase", rows["perception"]))
     out.print("medians; compile is what XLA took, run is one call after a warm-up", style="dim")
 
 

@@ -29,7 +29,7 @@ SHOWN: int = 4
 
 app = command_app("estimator", "Describe or evaluate a trained estimator.")
 EstimatorArgument = Annotated[
-    Path, typer.Argument(metavar="CHECKPOINT", help="An estimator (.npz), as train.fit writes it.")
+    Path, typer.Argument(metavar="CHECKPOINT", help="An estimator (.npz), as `potlp fit` writes it.")
 ]
 
 
@@ -48,7 +48,9 @@ EstimatorArgument = Annotated[
 )
 def evaluate_estimator(
     checkpoint: EstimatorArgument,
-    dataset: Annotated[Path, typer.Argument(metavar="DATASET", help="Folder of samples, as train.collect writes it.")],
+    dataset: Annotated[
+        Path, typer.Argument(metavar="DATASET", help="Folder of samples, as `potlp collect` writes it.")
+    ],
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Folder for evaluation.json, table.txt and three pictures."),

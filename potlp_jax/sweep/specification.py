@@ -21,9 +21,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from potlp_jax.codec import config_from_dict, json_copy, with_settings
+from potlp_jax.codec import config_from_dict, json_copy, read_settings, settings_file, with_settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
 from potlp_jax.errors import SpecificationError, TaskError, WorldError
@@ -96,25 +94,15 @@ def configuration_hash(config: TrialConfig) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def read_specification(path: Path) -> Specification:
-    """Read and check a specification.
+def read_specification(given: str | Path) -> Specification:
+    """Read and check a specification: a file, or the name of one that is shipped (``potlp_jax/sweep/data``).
 
     Raises:
-        SpecificationError: the file or one of its entries is wrong.
-        ConfigurationError: a setting is.
+        ConfigurationError: there is no such file, or one of its entries is wrong.
         TaskError, WorldError: a formula or an environment is.
     """
-    return specification_from_dict(_read_yaml(path), str(path), path.parent)
-
-
-def _read_yaml(path: Path) -> Mapping[str, Any]:
-    try:
-        data = yaml.safe_load(path.read_text("utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise SpecificationError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(data, Mapping):
-        raise SpecificationError(f"{path}: give a mapping with environments, tasks, policies and worlds")
-    return data
+    path = settings_file(given, "potlp_jax.sweep")
+    return specification_from_dict(read_settings(path), str(path), path.parent)
 
 
 _REQUIRED = ("environments", "tasks", "policies", "worlds")
