@@ -13,13 +13,15 @@ References:
 
 import dataclasses
 from enum import StrEnum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
+from potlp_jax import plugins
+from potlp_jax.errors import PluginError
 from potlp_jax.planning.commitment import Intention, apply_commitment, intention_of
 from potlp_jax.planning.distances.paths import KnownPath, shortest_path
 from potlp_jax.planning.distances.product import (
@@ -40,6 +42,9 @@ from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_ACTION, NO_STATE, Status, status_array, status_if
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
 from potlp_jax.world.grid import BeliefMap
+
+GROUP: str = "potlp_jax.policies"
+"""Entry points of this group are policies of other packages."""
 
 
 class Policy(StrEnum):
@@ -206,6 +211,7 @@ def decide(
     return policy_function(policy)(situation, estimates, key, config, intention)
 
 
+@runtime_checkable
 class PolicyFunction(Protocol):
     """What a policy is: from a situation to a move. Any function of this signature can be given to ``run_trial``,
     ``run_robot`` and ``run_batch`` in place of a ``Policy``.
@@ -246,12 +252,36 @@ def policy_function(policy: Policy | PolicyFunction) -> PolicyFunction:
     return lambda situation, _estimates, _key, config, _intention: direct(situation, config)
 
 
+def named_policy(policy: Policy | PolicyFunction | str) -> Policy | PolicyFunction:
+    """The policy of a name, or the function itself.
+
+    Args:
+        policy: a function; or the name of one of the library's policies; or ``module:attribute``, or an entry point in
+            the group ``potlp_jax.policies``, of a function.
+
+    Returns:
+        One of the library's policies, or a function.
+
+    Raises:
+        PluginError: there is none of the name, or it is no function.
+    """
+    if not isinstance(policy, str):
+        return policy
+    # ``known_map`` is as good as ``known-map``.
+    own = policy.strip().replace("_", "-")
+    if own in list(Policy):
+        return Policy(own)
+    found = plugins.load(policy, group=GROUP, kind="policy", known=list(Policy))
+    if not callable(found):
+        raise PluginError(f"policy {policy!r}: {type(found).__name__} is no function (PolicyFunction)")
+    return found
+
+
 def policy_name(policy: Policy | PolicyFunction) -> str:
     """What a policy is called in records: its name, or ``module:attribute`` of a function."""
     if isinstance(policy, Policy):
         return policy.value
-    named = policy if hasattr(policy, "__qualname__") else type(policy)
-    return f"{named.__module__}:{named.__qualname__}"
+    return plugins.reference_of(policy)
 
 
 def planning_problem(situation: Situation, estimates: Estimates, config: DecisionConfig) -> PlanningProblem:
