@@ -48,9 +48,7 @@ EstimatorArgument = Annotated[
 )
 def evaluate_estimator(
     checkpoint: EstimatorArgument,
-    dataset: Annotated[
-        Path, typer.Argument(metavar="DATASET", help="Folder of samples, as `potlp collect` writes it.")
-    ],
+    dataset: Annotated[Path, typer.Argument(metavar="DATASET", help="Folder of samples from `potlp collect`.")],
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Folder for evaluation.json, table.txt and three pictures."),
