@@ -119,5 +119,5 @@ def _info(time_step: TimeStep) -> dict[str, Any]:
     return {
         "action_mask": np.asarray(time_step.observation.action_mask),
         "cost": float(time_step.extras["cost"]),
-        "outcome": OUTCOME_NAMES.get(number, "running"),
+        "outcome": OUTCOME_NAMES[number],
     }
