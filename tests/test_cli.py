@@ -372,10 +372,10 @@ def test_exit_codes_of_the_process():
 def test_interrupt_has_exit_code_130():
     interrupted = _process(
         "import signal, os, sys\n"
-        "import potlp_jax.environments.tasks as tasks\n"
+        "import potlp_jax.task.reading as reading\n"
         # A process started in the background inherits that interrupts are ignored.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "tasks.read_task = lambda *args: os.kill(os.getpid(), signal.SIGINT)\n"
+        "reading.read_task = lambda *args: os.kill(os.getpid(), signal.SIGINT)\n"
         "sys.argv = ['potlp', 'task', 'F a']\n"
         "from potlp_jax.cli import main\n"
         "main()\n"

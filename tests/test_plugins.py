@@ -82,4 +82,4 @@ def test_errors_say_what_is_wrong(name, message):
 
 def test_references_are_told_from_names_and_files():
     assert plugins.is_reference("package.module:Class.method")
-    assert not any(map(plugins.is_reference, ("toy", "a file.npz", "C:\\maps\\x.npz", "map:office.yaml", "out/x:y/z")))
+    assert not any(map(plugins.is_reference, ("toy", "a file.npz", "C:\\maps\\x.npz", "out/x:y/z", "/maps/x.yaml")))
