@@ -41,8 +41,9 @@ from potlp_jax.sweep.statistics import KNOWN_MAP, Comparison
 from potlp_jax.sweep.store import Item, Row
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
-from potlp_jax.trials.loop import run_trial, trial_key
+from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import Outcome
+from potlp_jax.trials.rules import trial_key
 from potlp_jax.view.comparisons import draw_scatter, loss_lines, outcome_table, savings_table
 from potlp_jax.view.style import save_figure
 from potlp_jax.world.grid import World

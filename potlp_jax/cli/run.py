@@ -15,8 +15,9 @@ from potlp_jax.cli.inputs import (
 )
 from potlp_jax.cli.output import FAILED, console, output_folder, print_json, progress_bar
 from potlp_jax.environments.registry import make
-from potlp_jax.trials.loop import run_trial, trial_key
+from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import Outcome, Trial
+from potlp_jax.trials.rules import trial_key
 from potlp_jax.types import Status
 from potlp_jax.view.animation import save_animation
 from potlp_jax.view.maps import draw_trial

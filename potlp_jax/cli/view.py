@@ -31,5 +31,5 @@ def view_trial(record: Path, out: Path | None, open_it: bool) -> None:
 
 def panoramas_of(trial: Trial) -> dict[int, UInt8[np.ndarray, "rows columns 3"]]:
     """What the camera saw at the decisions whose panoramas were used, by number; none for policies that do not look."""
-    looks = sorted({look for decision in trial.decisions for look in decision.looks})
+    looks = sorted({look for decision in trial.decisions for look in decision.observations})
     return {look: np.asarray(panorama_at(trial, trial.decisions[look])) for look in looks}

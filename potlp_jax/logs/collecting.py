@@ -16,7 +16,7 @@ from potlp_jax.learning.dataset import DatasetMetadata, finished_shards, write_s
 from potlp_jax.learning.mistake_costs import WeightBounds
 from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views
-from potlp_jax.logs.drive import Drive, Eyes
+from potlp_jax.logs.drive import Drive, PanoramaReader
 from potlp_jax.trials.loop import versions
 from potlp_jax.world.camera import CameraConfig, Disturbance
 from potlp_jax.world.moves import step_lengths
@@ -66,7 +66,7 @@ def collect_drives(
         recorder = Recorder(number, config, WeightBounds(**metadata.weights))
         rng = np.random.default_rng([config.seed, zlib.crc32(split.encode()), number])
         pool = [tasks.draw(rng) for _ in range(config.tasks_per_world)]
-        eyes = Eyes(drive, config.camera)
+        reader = PanoramaReader(drive, config.camera)
         record_views(
             recorder,
             drive.world,
@@ -74,7 +74,7 @@ def collect_drives(
             poses_of(drive),
             pool,
             rng,
-            lambda pose, eyes=eyes: eyes.panorama(pose.step),
+            lambda pose, reader=reader: reader.panorama(pose.step),
             drive.unexplored(),
         )
         write_shard(folder, number, recorder.views, recorder.samples, metadata)

@@ -13,7 +13,7 @@ References:
 
 import dataclasses
 from enum import StrEnum
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -206,6 +206,7 @@ def decide(
     return policy_function(policy)(situation, estimates, key, config, intention)
 
 
+@runtime_checkable
 class PolicyFunction(Protocol):
     """What a policy is: from a situation to a move. Any function of this signature can be given to ``run_trial``,
     ``run_robot`` and ``run_batch`` in place of a ``Policy``.
@@ -246,12 +247,18 @@ def policy_function(policy: Policy | PolicyFunction) -> PolicyFunction:
     return lambda situation, _estimates, _key, config, _intention: direct(situation, config)
 
 
+def named_policy(policy: Policy | PolicyFunction | str) -> Policy | PolicyFunction:
+    """The policy of this name, or the function itself. Raises ValueError where there is none of the name."""
+    return Policy(policy) if isinstance(policy, str) else policy
+
+
 def policy_name(policy: Policy | PolicyFunction) -> str:
     """What a policy is called in records: its name, or ``module:attribute`` of a function."""
     if isinstance(policy, Policy):
         return policy.value
+    # A callable object has no name of its own: that of its class says what it is.
     named = policy if hasattr(policy, "__qualname__") else type(policy)
-    return f"{named.__module__}:{named.__qualname__}"
+    return f"{named.__module__}:{getattr(named, '__qualname__', '')}"
 
 
 def planning_problem(situation: Situation, estimates: Estimates, config: DecisionConfig) -> PlanningProblem:
