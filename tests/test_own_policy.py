@@ -81,7 +81,7 @@ def test_a_policy_of_ones_own_takes_the_same_path_alone_and_in_a_batch(policy, e
 
 
 def test_what_a_key_draws_is_up_to_the_policy():
-    paths = {run_trial(WORLDS[0], TASK, random_frontier, key, CONFIG).path for key in KEYS}
+    paths = {tuple(run_trial(world, TASK, random_frontier, key, CONFIG).path for world in WORLDS) for key in KEYS}
     assert len(paths) > 1
 
 
@@ -113,6 +113,9 @@ def test_a_robot_that_ends_or_stands_still_ends_the_run():
 
         def observe(self):
             return self.robot.observe()
+
+        def panorama(self):
+            return self.robot.panorama()
 
         def advance(self, path, stop):
             return self.leg
