@@ -12,11 +12,12 @@ from pathlib import Path
 from potlp_jax.cli.output import fail
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split, default_split, world_key
-from potlp_jax.learning.estimator import TrainedEstimator, named_estimator, shipped_estimator
+from potlp_jax.learning.estimator import TrainedEstimator, named_estimator
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.runner import RESULTS
 from potlp_jax.sweep.store import Store
+from potlp_jax.trials import run
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 from potlp_jax.world.grid import World
 
@@ -38,12 +39,12 @@ def record_file(trial: Path) -> Path:
 
 def default_policy(generator: Generator) -> Policy:
     """PO-TLP where an estimator is shipped for the environment's propositions, otherwise the baseline, with a note."""
-    if shipped_estimator(generator.propositions) is not None:
-        return Policy.POTLP
-    logger.warning(
-        f"no estimator is shipped for {generator.name}: the policy is {Policy.BASELINE}; choose another with --policy"
-    )
-    return Policy.BASELINE
+    policy = run.default_policy(generator.propositions)
+    if policy is not Policy.POTLP:
+        logger.warning(
+            f"no estimator is shipped for {generator.name}: the policy is {policy}; choose another with --policy"
+        )
+    return policy
 
 
 def read_estimator(name: str | None) -> TrainedEstimator | Estimator | None:
