@@ -125,8 +125,9 @@ def _why_infeasible(generator: "Generator", split: "Split", task: "Task", config
     from potlp_jax.cli.inputs import make_world
     from potlp_jax.environments.splits import MAX_INDEX
     from potlp_jax.planning.policies import Policy
-    from potlp_jax.trials.loop import run_trial, trial_key
+    from potlp_jax.trials.loop import run_trial
     from potlp_jax.trials.record import Outcome
+    from potlp_jax.trials.rules import trial_key
 
     def is_possible(number: int) -> bool:
         # The planner that knows the map from the start finds every path there is.
