@@ -19,6 +19,7 @@ from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.environments.toy import Toy
 from potlp_jax.errors import PotlpError, WorldError
+from potlp_jax.planning import policies
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
 from potlp_jax.trials.record import Outcome, load_trial
@@ -444,6 +445,7 @@ def test_completion_loads_nothing_of_the_library():
 def test_completed_names_are_those_of_the_library():
     assert tuple(Policy) == completion.POLICIES
     assert tuple(Split) == completion.SPLITS
+    assert policies.GROUP == completion.POLICY_GROUP
     assert {name: tuple(make(name).tasks) for name in NAMED} == dict(completion.TASKS)
 
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from potlp_jax.learning.estimator import TrainedEstimator
     from potlp_jax.planning.policies import DecisionConfig
 
+# In the order in which they are measured and shown.
 PARTS = ("search", "distances", "decision", "perception")
 
 app = command_app()
@@ -73,6 +74,7 @@ def run_bench(
     counts = _read_batches(batches)
     if family not in FAMILIES:
         fail(f"unknown family {family!r}; choose from: {', '.join(FAMILIES)}")
+    # Before anything starts XLA, which counts the cores once.
     _pin(core)
     decision = trial_config(simulations).decision
     rows: dict[str, list[Any]] = {}
@@ -141,6 +143,7 @@ def _pin(core: int | None) -> None:
     """Keep the process on one core; XLA, which has not started yet, then uses a single thread."""
     if core is None:
         return
+    # macOS has no such call.
     if not hasattr(os, "sched_setaffinity"):
         fail("--core needs Linux")
     try:

@@ -78,9 +78,11 @@ def compare_policies(
     from potlp_jax.environments.registry import make
     from potlp_jax.sweep.specification import specification_from_dict
 
+    # Before any trial runs: minutes later the complaint would cost those minutes.
     if picture is not None and out is None:
         fail("--picture needs --out, the folder in which the picture is written")
     generator = make(environment)
+    # The same entries as in a sweep's file, checked by the same code.
     entries: dict[str, Any] = {
         "environments": [environment],
         "tasks": [task],
@@ -98,6 +100,7 @@ def compare_policies(
         files = _write(results, out)
         if picture is not None:
             files.append(_draw(specification, results, out, picture))
+    # Without a folder the store is needed only until the results are read from it.
     else:
         files = []
         with tempfile.TemporaryDirectory(prefix="potlp-compare-") as folder:
@@ -157,6 +160,7 @@ def _draw(specification: "Specification", results: "Results", folder: Path, worl
     numbers = [world_of(pair) for pair in cell.pairs]
     if world not in numbers:
         fail(f"--picture {world}: the worlds compared are {', '.join(map(str, numbers))}")
+    # Rows keep no maps. The trials are made again from world and key, and are the same (tests/test_sweep.py).
     sweep, pair = Sweep(specification, folder), cell.pairs[numbers.index(world)]
     # The known map's path shows no exploration, which is what the picture is to compare.
     trials = [sweep.trial(row.item) for policy, row in pair.items() if policy != Policy.KNOWN_MAP]

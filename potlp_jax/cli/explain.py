@@ -75,6 +75,7 @@ def _read_decision(name: str) -> "tuple[Trial, Decision]":
     from potlp_jax.cli.inputs import record_file
     from potlp_jax.trials.record import load_trial
 
+    # The last colon separates: a path may hold others.
     match = re.fullmatch(r"(.+):(\d+)", name)
     if match is None:
         fail(f"{name!r} names no decision; write FOLDER:INDEX or FILE:INDEX, such as out/trial.json:0")
@@ -102,6 +103,7 @@ def _draw(
 
     if not decision.actions:
         fail(f"decision {decision.index} of policy {trial.policy} did not search: there is no tree to draw")
+    # A record keeps the actions of a decision but not the tree. Searching again with its key grows the same tree.
     problem, plan, tree = replay_decision(trial, decision.index, estimator)
     # Where commitment overrode the search, the record holds what the search itself preferred apart.
     if int(plan.action) != (decision.choice if decision.preferred is None else decision.preferred):

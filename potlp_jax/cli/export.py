@@ -12,6 +12,7 @@ from potlp_jax.cli.group import Command, command_app
 from potlp_jax.cli.options import Formula, Json, Propositions, Simulations
 from potlp_jax.cli.output import FAILED, console, fail, make_folder, print_json, progress_bar
 
+# What `jax.export` lowers for; an unknown name would fail deep within it.
 KNOWN_PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 
 app = command_app()
@@ -62,6 +63,7 @@ def export_task(
     folder = make_folder(out)
     with progress_bar() as progress:
         progress.add_task("lowering the planner", total=None)
+        # Serialising needs flatbuffers, which only the extra brings; the message names it.
         try:
             files = export_planner(task, folder, config)
         except ModuleNotFoundError as error:

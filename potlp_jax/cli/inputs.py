@@ -29,6 +29,7 @@ RECORD: str = "trial.json"
 
 def read_names(text: str | None) -> list[str] | None:
     """Names joined by commas; None stays None."""
+    # `a,,b` and `a, b,` are slips of the finger and mean what they seem to mean.
     return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
 
 
@@ -71,6 +72,7 @@ def warn_of_test_worlds() -> None:
 
 def make_world(generator: Generator, split: Split, number: int) -> World:
     """World ``number`` of a split. Raises WorldError where none can be made."""
+    # Checked here as well as in `world_key`, to name the option that was wrong.
     if number > MAX_INDEX:
         fail(f"--world {number} is too large; the last world is number {MAX_INDEX}")
     return generator.generate(world_key(split, number, generator.name))
@@ -99,6 +101,7 @@ def trial_config(simulations: int | None, generator: Generator | None = None, ca
 @contextmanager
 def open_store(folder: Path) -> Iterator[Store]:
     """The store of a sweep that has been begun, closed at the end."""
+    # Asked first, because opening a store makes one where there is none.
     if not (folder / RESULTS).is_file():
         fail(
             f"{folder}: there is no sweep in here (no {RESULTS}); begin one with `potlp sweep FILE.yaml --out {folder}`"

@@ -28,6 +28,7 @@ app = command_app(
     "log", "Use what a robot recorded: ROS 1 bags, ROS 2 bags and MCAP. Needs the extra [cyan]logs[/cyan], no ROS."
 )
 
+# How a log is read. Robots differ in topics, frames and cameras, so that every command that reads one has these.
 _BAG_HELP = "A .bag, .mcap or .db3 file, or the folder of a ROS 2 bag."
 BagFile = Annotated[Path, typer.Argument(metavar="BAG", help=_BAG_HELP)]
 BagFiles = Annotated[list[Path], typer.Argument(metavar="BAG...", help=f"{_BAG_HELP} All with one map frame.")]
@@ -102,6 +103,7 @@ def inspect_log(
         print_json(found)
     else:
         _print_inspection(found)
+    # For scripts: a log that is of no use is a failure, whatever there is to print about it.
     if log.bag.damaged or not any(use.startswith("yes") for use in found["uses"].values()):
         raise typer.Exit(FAILED)
 
@@ -170,6 +172,7 @@ def logs_to_dataset(
         drives = [_read_drive(bag, labels, config, GridConfig(resolution, radius)) for bag in bags]
         counts = collect_drives(drives, load_places(labels), out, name, split, collecting)
     samples = read_dataset(out)
+    # Read back rather than counted on the way: what is reported is what a training would read.
     holds = samples.success > 0
     summary = {
         "dataset": str(out),
@@ -315,6 +318,7 @@ def write_log(
 
     if kind is not None and kind not in list(BagFormat):
         fail(f"unknown format {kind!r}; choose from: {', '.join(BagFormat)}")
+    # ROS 1 bags are files and ROS 2 bags folders, so that the name decides unless --format does.
     by_name = BagFormat.ROS1 if out.suffix == ".bag" else BagFormat.ROS2
     chosen = by_name if kind is None else BagFormat(kind)
     if (chosen is BagFormat.ROS1) != (out.suffix == ".bag"):
@@ -404,6 +408,7 @@ def _default_policy(drive: "Drive", trained: "TrainedEstimator | None") -> "Poli
     if trained is None and shipped_estimator(drive.propositions) is None:
         logger.warning(f"no estimator is shipped for {', '.join(drive.propositions)}: the policy is {Policy.BASELINE}")
         return Policy.BASELINE
+    # The network sees nothing without pictures; the baseline needs the map alone.
     if not drive.pictures:
         logger.warning(f"the log has no panorama: the policy is {Policy.BASELINE}")
         return Policy.BASELINE

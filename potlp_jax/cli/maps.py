@@ -65,6 +65,7 @@ def inspect_map(
     from potlp_jax.environments.ros.map_files import load_map
     from potlp_jax.environments.ros.survey import survey_map
 
+    # What is odd about the file is listed with the map's other defects rather than as notes on stderr.
     with _caught_warnings() as remarks:
         image_map = load_map(file)
     clean = clean_map(image_map, resolution, radius, _read_start(start), "--start")
@@ -112,12 +113,14 @@ def write_clean_map(
     from potlp_jax.environments.ros.map_writer import save_map
 
     image_map = load_map(file)
+    # A cleaned map has lost what was cleaned away, so that it must not replace its source by accident.
     own = {path.resolve() for path in (image_map.settings.file, image_map.settings.image)}
     if own & {out.resolve(), out.with_suffix(".pgm").resolve()}:
         fail(f"--out {out} would overwrite the map itself; give another name")
     clean = clean_map(image_map, resolution, radius, _read_start(start), "--start")
     out.parent.mkdir(parents=True, exist_ok=True)
     image = save_map(out, clean.free, clean.frame)
+    # The map is written with obstacles grown already: growing them again would close passages.
     world = _environment(out, None, resolution, 0.0)
     if json:
         print_json({**_clean_facts(clean, radius), "files": [str(out), str(image)], "world": world})
@@ -182,6 +185,7 @@ def label_map(
     old = load_places(target) if add else Places(())
     labels = _joined(old, places=place or [], rooms=room or [], tasks=task or [], start=start)
     clean = clean_map(load_map(file), resolution, radius, labels.start, labels.source)
+    # Before anything is written: labels that no robot reaches would make every task impossible.
     check_points(labels, clean.free, clean.frame)
     letters = place_letters(labels, clean.free, clean.frame)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -384,6 +388,7 @@ def _joined(
         fail("there is nothing to label: give a --place or a --room")
     names = check_propositions(list(regions))
     formulas = dict(old.tasks) | dict(_named("--task", option, "NAME=FORMULA") for option in tasks)
+    # Compiled only to be checked; labels keep the text.
     for formula in formulas.values():
         Task.of_formula(formula, names)
     return Places(
@@ -433,6 +438,7 @@ def _read_start(text: str | None) -> "Point | None":
 
 def _read_numbers(what: str, text: str) -> list[float]:
     parts = [part.strip() for part in text.split(",")]
+    # `float` would also take "nan", "inf" and "1_0".
     if not all(re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)", part) for part in parts):
         fail(f"{what}: {text!r} are no numbers joined by commas")
     return [float(part) for part in parts]

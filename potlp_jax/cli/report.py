@@ -51,6 +51,7 @@ def write_report(
     page = out or folder / PAGE
     if page.suffix != ".html":
         fail(f"--out {page}: give a name that ends in .html")
+    # The sweep of the store itself, whatever the file that began it says by now.
     sweep = Sweep(specification_from_store(facts["specification"]), folder)
     policies = [policy.value for policy in sweep.specification.policies]
     cells: list[Cell] = []
@@ -72,6 +73,7 @@ def write_report(
 
 def _subject(policies: Sequence[str]) -> str:
     """The policy whose trials are looked at: PO-TLP where it took part, otherwise the last."""
+    # Savings need another policy than the two they are measured between; of several the last named is on trial.
     return "potlp" if "potlp" in policies else policies[-1]
 
 

@@ -109,11 +109,13 @@ def run_one(
             seed=world,
             estimator=trained,
         )
+    # The record first: should drawing fail, the trial is not lost.
     files = [] if folder is None else _write(trial, folder, animation)
     if json:
         print_json({**trial.summary(), "files": [str(file) for file in files]})
     else:
         _print(trial, files)
+    # After the result, because finding out may take a while: each world that is tried is made first.
     if trial.outcome is Outcome.INFEASIBLE:
         logger.warning(_why_infeasible(generator, chosen_split, asked, config, world=world))
     if trial.outcome is not Outcome.SATISFIED:

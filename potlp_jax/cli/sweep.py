@@ -33,6 +33,7 @@ class _RunByDefault(TyperGroup):
     """A group whose first command runs where none is named: `potlp sweep FILE.yaml`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        # A file called `show` would have to be written ./show.
         if args and not args[0].startswith("-") and args[0] not in self.commands:
             args = [next(iter(self.commands)), *args]
         return super().parse_args(ctx, args)
@@ -76,6 +77,7 @@ def run(
     if specification.split is Split.TEST:
         warn_of_test_worlds()
     run_reported(specification, make_folder(out), processes)
+    # From the store, so that a sweep shows the same tables whether it has just ended or is shown again.
     show(out, json)
 
 
@@ -98,6 +100,7 @@ def run_reported(specification: "Specification", folder: Path, processes: int | 
     """Run what is missing of a sweep, with progress on stderr; ``processes`` None: one per core."""
     from potlp_jax.sweep.runner import run_sweep
 
+    # The cores that this process may use, which on a cluster are fewer than the machine has.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     run_sweep(specification, folder, processes or cores, _Reporter().report)
 
@@ -173,6 +176,7 @@ def export(
 
 def _flat(row: "Row") -> dict[str, Any]:
     """One level of plain values."""
+    # Keys and versions as text: CSV has no lists, and Parquet's would differ from row to row.
     values = dataclasses.asdict(row)
     item = values.pop("item")
     values |= {"key": " ".join(map(str, row.key)), "versions": json_module.dumps(values["versions"], sort_keys=True)}
@@ -180,6 +184,7 @@ def _flat(row: "Row") -> dict[str, Any]:
 
 
 def _write_csv(rows: list[dict[str, Any]], file: Path) -> None:
+    # A sweep without a finished trial is an empty table, not an error.
     names = list(rows[0]) if rows else ["environment", "task", "policy", "world"]
     with file.open("w", encoding="utf-8", newline="") as opened:
         writer = csv.DictWriter(opened, names)
