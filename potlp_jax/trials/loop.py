@@ -6,6 +6,7 @@ ends is said in ``rules``.
 
 import dataclasses
 import importlib.metadata
+import logging
 
 import jax
 import jax.numpy as jnp
@@ -20,10 +21,12 @@ from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials import rules
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 from potlp_jax.trials.move_record import decision_of
-from potlp_jax.trials.record import Decision, Outcome, Run, Trial
+from potlp_jax.trials.record import Decision, Outcome, RunRecord, Trial
 from potlp_jax.trials.robot import Leg, Robot, SimulatedRobot
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.moves import Cell, as_cell, path_length
+
+logger = logging.getLogger(__name__)
 
 _decide = jax.jit(decide, static_argnames=("policy", "config"))
 _first_tally = jax.jit(rules.first_tally)
@@ -82,7 +85,7 @@ def run_robot(
     arrays: TaskArrays | None = None,
     estimator: TrainedEstimator | Estimator | None = None,
     world: World | None = None,
-) -> Run:
+) -> RunRecord:
     """Drive a robot, a simulated or a real one, until the task is satisfied or cannot go on.
 
     Args:
@@ -141,7 +144,7 @@ class _Loop:
         self._states: list[int] = [int(self._tally.state)]
         self._decisions: list[Decision] = []
 
-    def run(self) -> Run:
+    def run(self) -> RunRecord:
         """Loop until the task is satisfied or cannot go on."""
         gave_up, leg = False, Leg(cells=())
         while True:
@@ -174,6 +177,7 @@ class _Loop:
         )
         step, state = len(self._path) - 1, self._states[-1]
         self._decisions.append(decision_of(move, self._estimator, key, index=index, step=step, cell=cell, state=state))
+        logger.debug("decision %d in cell %s, automaton state %d", index, cell, state)
         return move
 
     def _advance(self, belief: BeliefMap, move: Move) -> Leg:
@@ -208,8 +212,8 @@ class _Loop:
             diagonal=jnp.int32(diagonal),
         )
 
-    def _result(self, outcome: Outcome, belief: BeliefMap) -> Run:
-        return Run(
+    def _result(self, outcome: Outcome, belief: BeliefMap) -> RunRecord:
+        return RunRecord(
             outcome=outcome,
             cost=path_length(self._path) * float(belief.resolution),
             path=tuple(self._path),
@@ -221,7 +225,7 @@ class _Loop:
 
 
 def make_trial(
-    run: Run,
+    run: RunRecord,
     task: Task,
     policy: Policy | PolicyFunction,
     config: TrialConfig,
@@ -246,7 +250,7 @@ def make_trial(
         The trial.
     """
     return Trial(
-        **{field.name: getattr(run, field.name) for field in dataclasses.fields(Run)},
+        **{field.name: getattr(run, field.name) for field in dataclasses.fields(RunRecord)},
         first_seen=first_seen,
         world=world,
         task_text=task.text,
