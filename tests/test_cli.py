@@ -168,6 +168,18 @@ def test_run_as_json_is_the_summary(recorded, tmp_path):
     assert not (tmp_path / "new" / "trial.gif").exists()
 
 
+def test_one_call_from_python_makes_the_trial_of_the_command_line():
+    data = _json(_potlp("run", "toy", "-t", "2", "--policy", "baseline", "--world", "4", "--json"))
+    assert {**run("toy", 2, "baseline", 4).summary(), "files": []} == data
+
+
+def test_environments_and_policies_of_others_are_run_by_their_names():
+    names = ("examples.own_environment:Corridor", "--policy", "examples.own_policy:largest_frontier")
+    data = _json(_potlp("run", *names, "--camera", "examples.own_camera:thermal", "--json"))
+    assert (data["environment"], data["policy"]) == (f"{names[0]}/validation", names[2])
+    assert data["outcome"] == "satisfied"
+
+
 def test_without_an_estimator_the_default_policy_is_the_baseline():
     result = _potlp("run", "toy", "-t", "2")
     assert result.exit_code == 0
@@ -330,10 +342,10 @@ def test_exit_codes_of_the_process():
 def test_interrupt_has_exit_code_130():
     interrupted = _process(
         "import signal, os, sys\n"
-        "import potlp_jax.environments.tasks as tasks\n"
+        "import potlp_jax.task.reading as reading\n"
         # A process started in the background inherits that interrupts are ignored.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "tasks.read_task = lambda *args: os.kill(os.getpid(), signal.SIGINT)\n"
+        "reading.read_task = lambda *args: os.kill(os.getpid(), signal.SIGINT)\n"
         "sys.argv = ['potlp', 'task', 'F a']\n"
         "from potlp_jax.cli import main\n"
         "main()\n"

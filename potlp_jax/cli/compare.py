@@ -10,7 +10,16 @@ from rich.console import Console
 
 from potlp_jax.cli.completion import complete_policies
 from potlp_jax.cli.group import Command, command_app
-from potlp_jax.cli.options import Environment, EstimatorFile, Json, Simulations, SplitName, TaskName, WorldNumber
+from potlp_jax.cli.options import (
+    CameraName,
+    Environment,
+    EstimatorName,
+    Json,
+    Simulations,
+    SplitName,
+    TaskName,
+    WorldNumber,
+)
 from potlp_jax.cli.output import console, make_folder, print_json, to_json
 from potlp_jax.cli.sweep import print_cell, run_reported
 
@@ -55,7 +64,8 @@ def compare_policies(
         typer.Option("--out", "-o", help="Folder for the sweep, compare.json, trials.csv, scatter.png and table.txt."),
     ] = None,
     simulations: Simulations = None,
-    estimator: EstimatorFile = None,
+    estimator: EstimatorName = None,
+    camera: CameraName = None,
     processes: Annotated[int, typer.Option(min=1, help="Workers, each on a core of its own.")] = 1,
     json: Json = False,
 ) -> None:
@@ -72,10 +82,10 @@ def compare_policies(
         "worlds": trials,
         "split": read_split(split, generator).value,
         "first_world": world,
-        "settings": {} if simulations is None else {"decision": {"search": {"simulations": simulations}}},
+        "settings": _settings(simulations, camera),
     }
     if estimator is not None:
-        entries["estimator"] = str(estimator)
+        entries["estimator"] = estimator
     specification = specification_from_dict(entries, "compare")
     if out is not None:
         results = _run(specification, make_folder(out), processes)
@@ -91,6 +101,12 @@ def compare_policies(
     if out is not None:
         console().print(f"wrote compare.json, trials.csv, scatter.png and table.txt in {out}", markup=False)
         console().print(f"next: potlp report {out}", markup=False, style="dim")
+
+
+def _settings(simulations: int | None, camera: str | None) -> dict[str, Any]:
+    """What the options change of the settings that the environment calls for."""
+    search = {} if simulations is None else {"decision": {"search": {"simulations": simulations}}}
+    return search if camera is None else {**search, "camera": {"renderer": camera}}
 
 
 def _run(specification: "Specification", folder: Path, processes: int) -> "Results":

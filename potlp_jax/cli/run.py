@@ -7,8 +7,9 @@ import typer
 
 from potlp_jax.cli.group import Command, command_app
 from potlp_jax.cli.options import (
+    CameraName,
     Environment,
-    EstimatorFile,
+    EstimatorName,
     Json,
     PolicyName,
     Simulations,
@@ -50,29 +51,29 @@ def run_one(
     ] = None,
     animation: Annotated[bool, typer.Option(help="Make the animation, the slowest of the three files.")] = True,
     simulations: Simulations = None,
-    estimator: EstimatorFile = None,
+    estimator: EstimatorName = None,
+    camera: CameraName = None,
     json: Json = False,
 ) -> None:
     """Run one trial: one world, one task, one policy."""
     from potlp_jax.cli.inputs import (
         default_policy,
         make_world,
-        read_policy,
+        read_estimator,
         read_split,
-        read_trained_estimator,
         trial_config,
     )
     from potlp_jax.environments.registry import make
-    from potlp_jax.environments.tasks import environment_task
+    from potlp_jax.planning.policies import named_policy
     from potlp_jax.trials.loop import run_trial
     from potlp_jax.trials.record import Outcome
     from potlp_jax.trials.rules import trial_key
 
     generator = make(environment)
     chosen_split = read_split(split, generator)
-    chosen_policy = default_policy(generator) if policy is None else read_policy(policy)
-    trained = read_trained_estimator(estimator)
-    asked = environment_task(generator, task)
+    chosen_policy = default_policy(generator) if policy is None else named_policy(policy)
+    trained = read_estimator(estimator)
+    asked = generator.task(task)
     made = make_world(generator, chosen_split, world)
     folder = None if out is None else make_folder(out)
     with progress_bar() as progress:
@@ -82,7 +83,7 @@ def run_one(
             asked,
             chosen_policy,
             trial_key(world),
-            trial_config(simulations, generator),
+            trial_config(simulations, generator, camera),
             environment=f"{environment}/{chosen_split}",
             seed=world,
             estimator=trained,

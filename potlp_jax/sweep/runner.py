@@ -19,10 +19,10 @@ import jax
 
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, world_key
-from potlp_jax.environments.tasks import environment_task
 from potlp_jax.errors import WorldError
-from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, read_estimator
-from potlp_jax.planning.policies import Policy
+from potlp_jax.learning.estimator import TrainedEstimator, identity_of, named_estimator
+from potlp_jax.planning.estimates import Estimator
+from potlp_jax.planning.policies import Policy, named_policy
 from potlp_jax.sweep.rows import batch_row
 from potlp_jax.sweep.specification import Cell, Specification
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store
@@ -30,7 +30,7 @@ from potlp_jax.task.task import Task, TaskArrays, TaskSizes
 from potlp_jax.trials.batch import Finished, Start, run_batch
 from potlp_jax.trials.loop import run_trial, versions
 from potlp_jax.trials.record import Outcome, Trial
-from potlp_jax.trials.rules import trial_key
+from potlp_jax.trials.rules import estimator_of, trial_key
 from potlp_jax.world.grid import World
 
 RESULTS: str = "results.sqlite"
@@ -114,13 +114,13 @@ class Sweep:
                     return True
         return False
 
-    def _claimed(self, environment: str, policy: Policy, first: int) -> Iterator[Item]:
+    def _claimed(self, environment: str, policy: str, first: int) -> Iterator[Item]:
         """Trials that are missing in the portion from the ``first`` world on, claimed a few at a time."""
         for cell in self.specification.cells:
             if cell.environment != environment:
                 continue
             worlds = self._worlds(self.store.possible(environment, cell.task))[first : first + PORTION]
-            missing = [Item(environment, cell.task, policy.value, world) for world in worlds]
+            missing = [Item(environment, cell.task, policy, world) for world in worlds]
             while missing and (block := self.store.claim(missing, BLOCK)):
                 yield from block
                 missing = missing[missing.index(block[-1]) + 1 :]
@@ -153,38 +153,37 @@ class Sweep:
         trials = self._trials(items, items[0].environment, Policy.KNOWN_MAP)
         return {item.world: trial.outcome is Outcome.SATISFIED for item, trial in trials}
 
-    def rows(self, items: Iterable[Item], environment: str, policy: Policy) -> Iterator[Row]:
+    def rows(self, items: Iterable[Item], environment: str, policy: str) -> Iterator[Row]:
         """The rows of trials of one environment and policy, as they end."""
         config = self.specification.config
-        trained = self._trained(environment) if policy is Policy.POTLP else None
+        asked = self._asked(environment, policy)
         for item, trial in self._trials(items, environment, policy):
             world = self._world(environment, item.world)
-            yield batch_row(item, trial, world, self._key(item.world), config, versions(trained))
+            yield batch_row(item, trial, world, self._key(item.world), config, versions(asked))
 
-    def _trials(self, items: Iterable[Item], environment: str, policy: Policy) -> Iterator[tuple[Item, Finished]]:
+    def _trials(self, items: Iterable[Item], environment: str, policy: str) -> Iterator[tuple[Item, Finished]]:
         def start(item: Item) -> Start:
             world = self._world(environment, item.world)
             return Start(world, self._tasks[environment, item.task][1], self._key(item.world), name=item)
 
-        trained = self._trained(environment) if policy is Policy.POTLP else None
-        for trial in run_batch(map(start, items), policy, self.specification.config, estimator=trained):
+        asked = self._asked(environment, policy)
+        for trial in run_batch(map(start, items), policy, self.specification.config, estimator=asked):
             assert isinstance(trial.name, Item)
             yield trial.name, trial
 
     def trial(self, item: Item) -> Trial:
         """The whole record of a trial, run or made again."""
-        policy = Policy(item.policy)
         task, arrays = self._tasks[item.environment, item.task]
         return run_trial(
             self._world(item.environment, item.world),
             task,
-            policy,
+            item.policy,
             self._key(item.world),
             self.specification.config,
             environment=f"{item.environment}/{self.specification.split.value}",
             seed=item.world,
             arrays=arrays,
-            estimator=self._trained(item.environment) if policy is Policy.POTLP else None,
+            estimator=self._asked(item.environment, item.policy),
         )
 
     def _make_world(self, environment: str, number: int) -> World:
@@ -199,7 +198,7 @@ class Sweep:
     def _tasks(self) -> dict[tuple[str, str], tuple[Task, TaskArrays]]:
         """Tasks by environment and formula, padded per environment to one size: one compilation serves all."""
         tasks = {
-            (cell.environment, cell.task): environment_task(self._generator(cell.environment), cell.task)
+            (cell.environment, cell.task): self._generator(cell.environment).task(cell.task)
             for cell in self.specification.cells
         }
         sizes: dict[str, TaskSizes] = {}
@@ -208,19 +207,19 @@ class Sweep:
         return {key: (task, task.padded(sizes[key[0]])) for key, task in tasks.items()}
 
     @cached_property
-    def _estimator(self) -> TrainedEstimator | None:
-        path = self.specification.estimator
-        return None if path is None else read_estimator(path)
+    def _estimator(self) -> TrainedEstimator | Estimator | None:
+        name = self.specification.estimator
+        return None if name is None else named_estimator(name)
 
-    def _trained(self, environment: str) -> TrainedEstimator:
-        return estimator_for(self._generator(environment).propositions, self._estimator)
+    def _asked(self, environment: str, policy: str) -> TrainedEstimator | Estimator | None:
+        """What a policy asks in the worlds of an environment; None where it asks nothing."""
+        return estimator_of(named_policy(policy), self._generator(environment).propositions, self._estimator)
 
     def _estimator_identity(self) -> str | None:
-        """Of the network, so that a store never mixes two. Raises CheckpointError where there is none for a task."""
-        if Policy.POTLP not in self.specification.policies:
-            return None
-        found = [self._trained(name) for name in sorted({cell.environment for cell in self.specification.cells})]
-        return ", ".join(dict.fromkeys(estimator.identity for estimator in found))
+        """Of all that policies ask, so that a store never mixes two. Raises CheckpointError where there is none."""
+        environments = sorted({cell.environment for cell in self.specification.cells})
+        asked = [self._asked(*pair) for pair in itertools.product(environments, self.specification.policies)]
+        return ", ".join(dict.fromkeys(identity_of(estimator) for estimator in asked if estimator is not None)) or None
 
 
 def run_sweep(
