@@ -263,6 +263,7 @@ class Task:
 
     def describe(self) -> dict[str, Any]:
         """The task for people and programs; JSON-able. Guards are canonical covers in words."""
+        # Indices are those of the arrays, so that a planner's values can be looked up here.
         dfa = self.dfa
         return {
             "formula": self.text,
@@ -316,6 +317,7 @@ def stack_tasks(tasks: Sequence[Task], sizes: TaskSizes | None = None) -> TaskAr
     Raises:
         TaskError: no task, different propositions, or a task that does not fit.
     """
+    # Tasks of other propositions could be padded too, but a letter would mean different things from row to row.
     if not tasks:
         raise TaskError("there is no task to stack")
     for task in tasks:

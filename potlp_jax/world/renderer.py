@@ -269,7 +269,7 @@ def _passed(optics: Int32[Array, "*shape"], length: Float32[Array, "*shape"]) ->
 def _pass_smoke(crossed: Int32[Array, "steps columns"], rays: _Rays) -> Int32[Array, "steps columns"]:
     """Where each ray enters each cell: the light that comes through and the glow of the smoke, see ``_pack_sight``."""
 
-    def cross(state, cell):
+    def cross(state: tuple[Array, Array], cell: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
         transmission, glow = state
         optics, length = cell
         after = transmission * _passed(optics, length)

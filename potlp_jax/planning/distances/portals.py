@@ -153,7 +153,7 @@ def table_by_portals(
     # Real sources first: the loop runs over these alone.
     order = jnp.argsort(~real, stable=True)
 
-    def solve(number, table):
+    def solve(number: Array, table: tuple[Array, Array]) -> tuple[Array, Array]:
         source = order[number]
         from_start = jnp.where(usable, lengths[start_of[source]], jnp.inf)
         costs, finish = _costs_of_source(from_start, source_states[source], from_active, entering, accepting)
@@ -188,7 +188,7 @@ def _costs_of_source(
 
     # Bellman and Ford on (state, active cell): as many rounds as the longest shortest path has active cells, on arrays
     # of at most Z x 64 x 64. It ends because lengths are positive.
-    def relax(carry):
+    def relax(carry: tuple[Array, Array]) -> tuple[Array, Array]:
         best, _ = carry
         arrived = jnp.min(best[:, :, None] + from_active[None, :, :capacity], axis=1)
         better = jnp.minimum(best, _enter(jnp.minimum(arrived, first[:, :capacity]), entering[:capacity]))
