@@ -134,7 +134,7 @@ class Task:
                 is a trap.
         """
         formula = parse_formula(text, propositions)
-        # By way of HOA text, so that formulas and files take one path and a shipped file is what Spot would deliver.
+        # Through HOA text, so that formulas and files take one path and a shipped file is what Spot would deliver.
         automaton = read_hoa(translate(formula))
         return cls._compile(text, formula.propositions, automaton, max_positive_literals)
 

@@ -1,4 +1,4 @@
-"""Product distances between a few cells by way of the cells whose letters matter.
+"""Product distances between a few cells through the cells whose letters matter.
 
 Most cells of a map carry a letter that changes no state. Distances over those cells alone do not depend on the state
 of the automaton, so that one grid per key cell serves all states: keys are the sources and the **active** cells, whose
@@ -123,7 +123,7 @@ def table_by_portals(
     target_cells: Int32[Array, "T 2"],
     arrivals: Callable[[Int32[Array, "keys 2"], Int32[Array, ""], Int32[Array, "ends 2"]], Float32[Array, "keys ends"]],
 ) -> tuple[Float32[Array, "Q T Z"], Float32[Array, " Q"]]:
-    """Costs in cells as ``product.distance_table`` gives them, by way of the active cells.
+    """Costs in cells as ``product.distance_table`` gives them, through the active cells.
 
     Args:
         transitions: the product.

@@ -5,7 +5,7 @@ a diagonal move needs both cells beside it free. Entering a cell in state ``z`` 
 
 Whole grids of distances are solved by frontal sweeps (``sweeping``). A table of costs between a few cells needs no
 sweep per state where few cells carry letters that matter (``portals``): the table of a fire-fighting decision takes 3
-to 5 ms that way instead of 20 to 25 (docs/results/planner.md).
+to 5 ms instead of 20 to 25 (docs/results/planner.md).
 """
 
 import functools
@@ -111,7 +111,7 @@ def distance_table(
     """Costs from each source to each target, and to acceptance anywhere.
 
     The same distances as ``product_distances``, up to rounding, without its grids. Where few cells carry letters that
-    matter, they are found by way of those cells (``portals``), elsewhere by sweeps.
+    matter, they are found through those cells (``portals``), elsewhere by sweeps.
 
     Args:
         transitions: state after entering each cell from each state, as ``product_transitions`` gives it.

@@ -28,7 +28,7 @@ class Relaxation:
     Below: in one state of the automaton (or those that paths lead to from it) every attempt can be made once at most;
     it costs no less than the cheapest path to its subgoal, shared by the attempts there, and succeeds with the largest
     probability that later knowledge may give it. With the order of attempts free, the best one is by ratio of cost to
-    probability, and the rollout ends when success leads on, the robot finishes, or nothing is left. Attempts that are
+    probability, and the rollout ends when success leads on, the robot finishes, or nothing remains. Attempts that are
     certain to stay available must be made before a dead end; others may be left out.
 
     Above: the dead end after as many of the longest steps as there are conditions to close.
