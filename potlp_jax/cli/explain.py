@@ -108,9 +108,9 @@ def _draw(
         logger.warning("searching again chose another action than recorded: the versions of the software may differ")
     top = tree_top(problem, tree, depth=depth, width=BREADTH)
     save_figure(draw_tree(top, describe_decision(trial, decision), breadth=BREADTH), out)
-    if not decision.looks:
+    if not decision.observations:
         return [out]
-    seen = {look: np.asarray(panorama_at(trial, trial.decisions[look])) for look in decision.looks}
+    seen = {look: np.asarray(panorama_at(trial, trial.decisions[look])) for look in decision.observations}
     beside = out.with_name(f"{out.stem}-panoramas.png")
     save_figure(draw_panoramas(trial, decision, seen), beside)
     return [out, beside]

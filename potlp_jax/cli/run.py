@@ -64,8 +64,9 @@ def run_one(
     )
     from potlp_jax.environments.registry import make
     from potlp_jax.environments.tasks import environment_task
-    from potlp_jax.trials.loop import run_trial, trial_key
+    from potlp_jax.trials.loop import run_trial
     from potlp_jax.trials.record import Outcome
+    from potlp_jax.trials.rules import trial_key
 
     generator = make(environment)
     chosen_split = read_split(split, generator)

@@ -25,9 +25,10 @@ from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import Split
 from potlp_jax.planning.policies import Move, MoveKind, Policy, Situation, assess, direct_move, move_to
 from potlp_jax.task.task import Task
-from potlp_jax.trials.batch_step import OUTCOMES, Progress, Rules, Scene, advance, begin
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 from potlp_jax.trials.record import Outcome
+from potlp_jax.trials.rules import OUTCOMES
+from potlp_jax.trials.slots import Progress, Scene, Setup, advance, begin
 from potlp_jax.world.grid import World
 
 OUTCOME_NAMES: Mapping[int, str] = {number: outcome.value for number, outcome in enumerate(OUTCOMES)}
@@ -132,7 +133,7 @@ class TaskEnv:
         self.config: TrialConfig = trial_config_for(worlds[0]) if config is None else config
         self._edges = len(task.edges)
         self._finish = self.config.decision.frontiers.max_subgoals * self._edges
-        self._rules = Rules(policy=Policy.BASELINE, config=self.config, network=None)
+        self._setup = Setup(policy=Policy.BASELINE, config=self.config, network=None)
 
     @classmethod
     def of_family(
@@ -166,7 +167,7 @@ class TaskEnv:
     def reset_in(self, world: World) -> tuple[EnvState, TimeStep]:
         """Begin an episode in this world. Its shape must be that of the others, for one compilation to serve all."""
         # A trial draws for its planner and its camera alone, and an episode has neither.
-        scene, progress = begin(world, self.task.arrays, jax.random.key(0), None, rules=self._rules)
+        scene, progress = begin(world, self.task.arrays, jax.random.key(0), None, setup=self._setup)
         state = self._assessed(scene, progress)
         # Even an episode that cannot be won has a first step, as dm_env has it.
         return state, self._time_step(state, jnp.int8(StepType.FIRST), jnp.float32(0.0))
@@ -182,21 +183,24 @@ class TaskEnv:
             The next state, and what the agent gets.
         """
         before = state.progress
-        progress = advance(self._rules, before, state.scene, self._move(state.situation, action))
+        progress = advance(self._setup, before, state.scene, self._move(state.situation, action))
         after = self._assessed(state.scene, progress)
         resolution = state.scene.world.resolution
-        reward = -(after.progress.travelled - before.travelled) * resolution
-        failed = before.running & ~after.progress.running & (after.progress.outcome != _SATISFIED)
+        reward = -(after.progress.tally.travelled - before.tally.travelled) * resolution
+        failed = before.tally.running & ~after.progress.tally.running & (after.progress.tally.outcome != _SATISFIED)
         reward = reward - jnp.where(failed, self._dead_end_cost(state.scene), 0.0)
-        kind = jnp.where(after.progress.running, StepType.MID, StepType.LAST).astype(jnp.int8)
+        kind = jnp.where(after.progress.tally.running, StepType.MID, StepType.LAST).astype(jnp.int8)
         return after, self._time_step(after, kind, reward)
 
     def _assessed(self, scene: Scene, progress: Progress) -> EnvState:
         """The state with known space assessed; where no action is left the task is infeasible."""
-        situation = assess(progress.belief, progress.cell, progress.state, scene.task, self.config.decision.frontiers)
-        nowhere = progress.running & ~jnp.any(self._action_mask(situation))
-        outcome = jnp.where(nowhere, jnp.int8(_INFEASIBLE), progress.outcome)
-        return EnvState(scene=scene, progress=dataclasses.replace(progress, outcome=outcome), situation=situation)
+        tally = progress.tally
+        frontiers = self.config.decision.frontiers
+        situation = assess(progress.belief, progress.cell, tally.state, scene.task, frontiers)
+        nowhere = tally.running & ~jnp.any(self._action_mask(situation))
+        outcome = jnp.where(nowhere, jnp.int8(_INFEASIBLE), tally.outcome)
+        tally = dataclasses.replace(tally, outcome=outcome)
+        return EnvState(scene=scene, progress=dataclasses.replace(progress, tally=tally), situation=situation)
 
     def _dead_end_cost(self, scene: Scene) -> Float32[Array, ""]:
         size = jnp.sum(scene.world.extent).astype(jnp.float32)
@@ -235,14 +239,14 @@ class TaskEnv:
 
     def _time_step(self, state: EnvState, step_type: Int8[Array, ""], reward: Float32[Array, ""]) -> TimeStep:
         progress = state.progress
-        goes_on = progress.running | (progress.outcome == _BUDGET)
-        cost = progress.travelled * state.scene.world.resolution
+        goes_on = progress.tally.running | (progress.tally.outcome == _BUDGET)
+        cost = progress.tally.travelled * state.scene.world.resolution
         return TimeStep(
             step_type=step_type,
             reward=reward,
             discount=goes_on.astype(jnp.float32),
             observation=self._observation(state),
-            extras={"cost": cost, "outcome": jnp.where(progress.running, jnp.int8(-1), progress.outcome)},
+            extras={"cost": cost, "outcome": jnp.where(progress.tally.running, jnp.int8(-1), progress.tally.outcome)},
         )
 
     def _observation(self, state: EnvState) -> Observation:
@@ -252,11 +256,11 @@ class TaskEnv:
             cells=progress.belief.cells,
             letters=progress.belief.letters,
             position=progress.cell,
-            state=progress.state,
+            state=progress.tally.state,
             subgoals=situation.subgoals.cells,
             subgoal_mask=situation.subgoals.mask,
             distances=jnp.where(jnp.isfinite(distances), distances, 0.0),
             finish_distance=jnp.where(jnp.isfinite(finish), finish, 0.0),
             # After the end there is nothing to choose.
-            action_mask=self._action_mask(situation) & progress.running,
+            action_mask=self._action_mask(situation) & progress.tally.running,
         )

@@ -28,8 +28,9 @@ from potlp_jax.sweep.specification import Cell, Specification
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store
 from potlp_jax.task.task import Task, TaskArrays, TaskSizes
 from potlp_jax.trials.batch import Finished, Start, run_batch
-from potlp_jax.trials.loop import run_trial, trial_key, versions
+from potlp_jax.trials.loop import run_trial, versions
 from potlp_jax.trials.record import Outcome, Trial
+from potlp_jax.trials.rules import trial_key
 from potlp_jax.world.grid import World
 
 RESULTS: str = "results.sqlite"

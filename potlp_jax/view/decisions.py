@@ -55,7 +55,7 @@ def action_table(trial: Trial, decision: Decision) -> Table:
 def describe_decision(trial: Trial, decision: Decision) -> str:
     """Where and when the decision was made, and what it led to, in one line."""
     went = "nowhere" if decision.target is None else f"cell {decision.target} in state {decision.target_state}"
-    better = decision.kept_from
+    better = decision.overruled
     kept = "" if better is None else f", kept although {action_name(better)} is better"
     return (
         f"decision {decision.index} of {trial.policy} (step {decision.step}): cell {decision.cell} in state "
