@@ -21,7 +21,7 @@ from potlp_jax.planning.exact.api import Bounds, ProblemTooLargeError, bound_exa
 from potlp_jax.planning.policies import DecisionConfig, Policy, decide
 from potlp_jax.planning.problem import PlanningProblem, enumerate_actions
 from potlp_jax.planning.search.api import Plan, plan_actions
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig
 from potlp_jax.task.task import Task, TaskArrays, TaskSizes, stack_tasks
 from potlp_jax.trials.batch import Finished, Start, run_batch
 from potlp_jax.trials.config import TrialConfig

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from potlp_jax.planning.policies import DecisionConfig
-from potlp_jax.planning.search.graph import SearchConfig, SearchMode
+from potlp_jax.planning.search.config import SearchConfig, UctConfig
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.panorama import CameraConfig, Disturbance
 from potlp_jax.world.sensing import SensorConfig
@@ -54,11 +54,14 @@ def trial_config_from_dict(data: Mapping[str, Any]) -> TrialConfig:
                     "commitment": 0.0,  # of records older than the setting
                     **decision,
                     "frontiers": FrontierConfig(**decision["frontiers"]),
-                    "search": SearchConfig(**{**decision["search"], "mode": SearchMode(decision["search"]["mode"])}),
+                    "search": _SEARCHES[decision["search"]["kind"]](**decision["search"]),
                 }
             ),
         }
     )
+
+
+_SEARCHES = {"best-first": SearchConfig, "uct": UctConfig}
 
 
 def _camera_from_dict(data: Mapping[str, Any]) -> CameraConfig:

@@ -14,6 +14,7 @@ from potlp_jax.planning.policies import DecisionConfig, Policy, assess, planning
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import Plan, search_tree
 from potlp_jax.planning.search.graph import Tree
+from potlp_jax.planning.search.uct import UctTree
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials.config import TrialConfig, trial_config_from_dict
 from potlp_jax.trials.record import LOG_PREFIX, Decision, Trial
@@ -24,7 +25,7 @@ from potlp_jax.world.panorama import Disturbance
 
 def replay_decision(
     trial: Trial, index: int, estimator: TrainedEstimator | None = None
-) -> tuple[PlanningProblem, Plan, Tree]:
+) -> tuple[PlanningProblem, Plan, Tree | UctTree]:
     """Search again as in decision ``index`` of a recorded trial: its problem, plan and searched tree.
 
     ``estimator`` is the one of the trial, where its policy uses one; by default the shipped one.
