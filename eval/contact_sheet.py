@@ -27,8 +27,9 @@ from potlp_jax.environments.firefighting import (
 )
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.view.style import CHOSEN, INK, area_colour, new_figure
+from potlp_jax.world.camera import CameraConfig, Disturbance, disturb
 from potlp_jax.world.grid import World
-from potlp_jax.world.panorama import CameraConfig, Disturbance, disturb, render
+from potlp_jax.world.renderer import render
 
 _WIDTH, _ROW_HEIGHT = 15.0, 1.85
 _PICTURE_SHARE = 0.62

@@ -20,8 +20,9 @@ from potlp_jax.environments.campus.floor_plans import FloorPlanConfig, FloorPlan
 from potlp_jax.environments.campus.furnishing import PEOPLE, Floor, Kind, Placement
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.view.style import INK, new_figure
+from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.grid import World
-from potlp_jax.world.panorama import CameraConfig, render
+from potlp_jax.world.renderer import render
 
 _COLUMNS, _WIDTH = 4, 15.0
 _PLAN_HEIGHT, _VIEW_HEIGHT = 2.5, 1.9

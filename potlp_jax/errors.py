@@ -14,12 +14,20 @@ class PotlpWarning(UserWarning):
     """Base of all remarks on what was given: it can be used, and something about it should be known."""
 
 
+class ConfigurationError(PotlpError):
+    """A setting is missing, unknown or has a value that does not fit; the message names it and what can be given."""
+
+
 class TaskError(PotlpError):
     """What is wrong with a task: its formula, its automaton or its propositions."""
 
 
 class WorldError(PotlpError):
     """A world, or the configuration of a world, is not valid; the message says what and where."""
+
+
+class PluginError(PotlpError):
+    """An environment, policy, camera or estimator cannot be found or loaded by its name; the message lists what can."""
 
 
 class MapError(PotlpError):
@@ -69,8 +77,8 @@ class BatchError(PotlpError):
     """Trials do not fit into one batch; the message says which and why."""
 
 
-class SpecificationError(PotlpError):
-    """A specification cannot be used: names the file, the entry and what to do."""
+class SpecificationError(ConfigurationError):
+    """A specification of a sweep cannot be used: names the file, the entry and what to do."""
 
 
 class StoreError(PotlpError):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from potlp_jax.cli.explain import explain_decision
-from potlp_jax.environments import make
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.errors import CheckpointError
 from potlp_jax.learning.estimator import (
@@ -30,9 +30,10 @@ from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import ActionRecord, load_trial
 from potlp_jax.trials.replay import panorama_at, replay_decision
 from potlp_jax.view.panoramas import draw_panoramas
+from potlp_jax.world.camera import Disturbance
 from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
 from potlp_jax.world.grid import BeliefMap
-from potlp_jax.world.panorama import Disturbance, render
+from potlp_jax.world.renderer import render
 from potlp_jax.world.sensing import SensorConfig, observe
 from tests.reference.dijkstra import product_distances
 
@@ -251,7 +252,7 @@ def test_each_subgoal_is_shown_in_the_centre_of_the_panorama_that_its_estimates_
 def test_explain_writes_the_panoramas_beside_the_tree(trial, trained_file, tmp_path, capsys):
     trial.save(tmp_path / "trial.json")
     index = next(decision.index for decision in trial.decisions if decision.actions)
-    explain_decision(f"{tmp_path}:{index}", tmp_path / "tree.png", 2, trained_file, json=False)
+    explain_decision(f"{tmp_path}:{index}", out=tmp_path / "tree.png", estimator=trained_file)
     told = capsys.readouterr().out
     for name in ("tree.png", "tree-panoramas.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")

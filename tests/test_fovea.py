@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from potlp_jax.learning.fovea import ABOVE, BAND, BELOW, bands_of, packed, patch, unpacked
+from potlp_jax.world.camera import CameraConfig, bearing, floor_rows, rows_at_slopes
 from potlp_jax.world.grid import make_world
-from potlp_jax.world.panorama import CameraConfig, bearing, floor_rows, render, rows_at_slopes
+from potlp_jax.world.renderer import render
 
 SHAPE = (64, 128)
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from potlp_jax.task import Task, TaskError
 from potlp_jax.task.automaton import canonical_dfa
-from potlp_jax.task.cubes import MAX_PRIMES_EXACT, cube_letters, hull, minimal_cover, prime_implicants
+from potlp_jax.task.guards import MAX_PRIMES_EXACT, cube_letters, hull, minimal_cover, prime_implicants
 from potlp_jax.task.outcomes import find_outcomes
 from tests.reference import covers
 from tests.reference.make_golden_covers import GOLDEN_COVERS

@@ -413,7 +413,7 @@ def test_tree_is_consistent_with_equation_3():
     problem = shared_shape("F a & F b", 3, unreachable=0.1)
     plan, tree = tree_jit(problem, jax.random.key(0), config=dataclasses.replace(QUICK, optimism=1.0))
     q_values, bounds = (np.asarray(tree.q_values)[: int(tree.size)], np.asarray(tree.bounds)[: int(tree.size)])
-    values = jax.tree.map(np.asarray, NodeValues.unpack(tree.values[: int(tree.size)]))
+    values = NodeValues.unpack(tree.values[: int(tree.size)])
     np.testing.assert_array_equal(q_values.min(axis=1), np.minimum(values.leave, values.stay))
     np.testing.assert_array_equal(bounds.min(axis=1), np.minimum(values.leave_bound, values.stay_bound))
     assert np.all(bounds <= q_values)

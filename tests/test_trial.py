@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from eval.formulas import random_tasks
+from potlp_jax.codec import config_from_dict
 from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import RecordError
@@ -21,7 +22,7 @@ from potlp_jax.planning.search.config import SearchConfig
 from potlp_jax.task.task import Task, TaskSizes
 from potlp_jax.trials import loop as trial_module
 from potlp_jax.trials import robot
-from potlp_jax.trials.config import TrialConfig, trial_config_from_dict
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import Loop, run_trial
 from potlp_jax.trials.record import Outcome, load_trial
 from potlp_jax.trials.replay import replay_decision
@@ -142,7 +143,7 @@ def test_the_same_key_gives_the_same_trial_and_records_round_trip(tmp_path):
     first.save(tmp_path / "trial.json")
     loaded = load_trial(tmp_path / "trial.json")
     assert json.dumps(loaded.to_dict()) == json.dumps(first.to_dict())
-    assert trial_config_from_dict(loaded.config) == CONFIG
+    assert config_from_dict(TrialConfig, loaded.config, "trial record") == CONFIG
 
 
 def test_a_decision_is_replayed_from_its_record():

@@ -50,7 +50,7 @@ LARGE = ("gdc_floor2", "intel_lab")
 
 FIRST = 5
 CAMERA = {"noise": 6.0, "exposure": 0.15, "colour": 0.05}
-"""Disturbances of every picture (``world.panorama.Disturbance``)."""
+"""Disturbances of every picture (``world.camera.Disturbance``)."""
 
 
 def environment_of(maps: Path, name: str, out: Path) -> str:

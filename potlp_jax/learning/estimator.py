@@ -26,9 +26,9 @@ from potlp_jax.planning.distances.product import product_distances
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_STATE
+from potlp_jax.world.camera import bearing
 from potlp_jax.world.frontiers import Subgoals
 from potlp_jax.world.grid import BeliefMap
-from potlp_jax.world.panorama import bearing
 
 MEMORY: int = 32
 """Panoramas that are remembered. A trial takes 14 to 100, of which seldom more than a dozen still show a frontier."""

@@ -14,7 +14,7 @@ from types import MappingProxyType
 import jax.numpy as jnp
 import numpy as np
 
-from potlp_jax.task.cubes import Phi
+from potlp_jax.task.guards import Phi
 from potlp_jax.task.task import Task, TaskArrays, TaskSizes
 from potlp_jax.types import NO_CLASS
 

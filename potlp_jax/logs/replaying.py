@@ -20,8 +20,8 @@ from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import Loop, versions
 from potlp_jax.trials.record import LOG_PREFIX, NEVER_SEEN, Outcome, Trial
 from potlp_jax.trials.robot import DIAGONAL, Leg, Stop
+from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.grid import BeliefMap
-from potlp_jax.world.panorama import CameraConfig
 
 
 class LoggedRobot:

@@ -17,26 +17,22 @@
 import dataclasses
 import hashlib
 import json
-import types
-import typing
 from collections.abc import Mapping, Sequence
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from potlp_jax.environments import make
+from potlp_jax.codec import config_from_dict, json_copy, read_settings, settings_file, with_settings
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
-from potlp_jax.errors import SpecificationError, WorldError
+from potlp_jax.environments.tasks import environment_task
+from potlp_jax.errors import SpecificationError, TaskError, WorldError
 from potlp_jax.planning.policies import Policy
-from potlp_jax.task.task import Task
-from potlp_jax.trials.config import TrialConfig, trial_config_from_dict, with_settings
+from potlp_jax.trials.config import TrialConfig, trial_config_for
 
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """One cell of the sweep's grid: ``worlds`` trials of every policy. ``task`` is a formula."""
+    """One cell of the sweep's grid: ``worlds`` trials of every policy. ``task`` is a formula or a ``.hoa`` file."""
 
     environment: str
     task: str
@@ -88,35 +84,26 @@ def specification_from_store(data: Mapping[str, Any]) -> Specification:
         split=Split(data["split"]),
         first_world=data["first_world"],
         estimator=None if data["estimator"] is None else Path(data["estimator"]),
-        config=trial_config_from_dict(data["settings"]),
+        config=config_from_dict(TrialConfig, data["settings"], "settings"),
         seed=data["seed"],
     )
 
 
 def configuration_hash(config: TrialConfig) -> str:
     """Twelve hexadecimal digits that tell settings apart."""
-    text = json.dumps(dataclasses.asdict(config), sort_keys=True, default=str)
+    text = json.dumps(json_copy(dataclasses.asdict(config)), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def read_specification(path: Path) -> Specification:
-    """Read and check a specification.
+def read_specification(given: str | Path) -> Specification:
+    """Read and check a specification: a file, or the name of one that is shipped (``potlp_jax/sweep/data``).
 
     Raises:
-        SpecificationError: the file or one of its entries is wrong.
+        ConfigurationError: there is no such file, or one of its entries is wrong.
         TaskError, WorldError: a formula or an environment is.
     """
-    return specification_from_dict(_read_yaml(path), str(path), path.parent)
-
-
-def _read_yaml(path: Path) -> Mapping[str, Any]:
-    try:
-        data = yaml.safe_load(path.read_text("utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise SpecificationError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(data, Mapping):
-        raise SpecificationError(f"{path}: give a mapping with environments, tasks, policies and worlds")
-    return data
+    path = settings_file(given, "potlp_jax.sweep")
+    return specification_from_dict(read_settings(path), str(path), path.parent)
 
 
 _REQUIRED = ("environments", "tasks", "policies", "worlds")
@@ -152,7 +139,7 @@ def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = 
         split=split,
         first_world=_number(data, "first_world", 0, where, default=0),
         estimator=None if estimator is None else folder / estimator,
-        config=_settings(_common_config(environments, where), data.get("settings", {}), f"{where}: settings"),
+        config=with_settings(_common_config(environments, where), data.get("settings", {}), f"{where}: settings"),
         seed=_number(data, "seed", 0, where, default=0),
     )
 
@@ -195,20 +182,18 @@ def _split(name: Any, environments: Sequence[str], where: str) -> Split:
 
 
 def _formula(environment: str, task: Any, where: str) -> str:
-    """The formula of a task that is given by number, or as a formula. Raises for formulas that are no task."""
+    """A task by number as its formula, any other (a formula, a ``.hoa`` file) as it is. Raises for what is no task."""
     generator = make(environment)
-    text = str(task)
-    formula = generator.tasks.get(text, text)
-    if text.isdecimal() and formula == text:
-        known = ", ".join(generator.tasks) or "none"
-        raise SpecificationError(f"{where}: tasks: {environment} has no task {text}; it has: {known}")
-    Task.of_formula(formula, generator.propositions)
-    return formula
+    try:
+        environment_task(generator, str(task))
+    except TaskError as error:
+        raise SpecificationError(f"{where}: tasks: {error}") from error
+    return generator.tasks.get(str(task), str(task))
 
 
 def _common_config(environments: Sequence[str], where: str) -> TrialConfig:
     """What all environments call for."""
-    configs = {name: with_settings(TrialConfig(), make(name).settings) for name in environments}
+    configs = {name: trial_config_for(make(name)) for name in environments}
     first = configs[environments[0]]
     for name, config in configs.items():
         if config != first:
@@ -217,40 +202,3 @@ def _common_config(environments: Sequence[str], where: str) -> TrialConfig:
                 "has one; make a sweep of each"
             )
     return first
-
-
-def _settings(config: Any, data: Any, where: str) -> Any:
-    """A frozen configuration with some of its fields changed."""
-    if not isinstance(data, Mapping):
-        raise SpecificationError(f"{where}: give a mapping, found {data!r}")
-    hints = typing.get_type_hints(type(config))
-    for name in data:
-        if name not in hints:
-            raise SpecificationError(f"{where}: unknown field {name!r}; known: {', '.join(hints)}")
-    values = {
-        name: _setting(hints[name], getattr(config, name), value, f"{where}.{name}") for name, value in data.items()
-    }
-    try:
-        return dataclasses.replace(config, **values)
-    except ValueError as error:
-        raise SpecificationError(f"{where}: {error}") from error
-
-
-def _setting(hint: Any, current: Any, value: Any, where: str) -> Any:
-    if dataclasses.is_dataclass(hint):
-        return _settings(current, value, where)
-    if isinstance(hint, type) and issubclass(hint, Enum):
-        known = [entry.value for entry in hint]
-        if value not in known:
-            raise SpecificationError(f"{where}: choose from: {', '.join(map(str, known))}; found {value!r}")
-        return hint(value)
-    if typing.get_origin(hint) is tuple:
-        value = tuple(value) if isinstance(value, list) else value
-        hint = tuple
-    allowed = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-    if float in allowed and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
-    if not isinstance(value, tuple(allowed)) or (isinstance(value, bool) and bool not in allowed):
-        names = " or ".join("null" if kind is type(None) else kind.__name__ for kind in allowed)
-        raise SpecificationError(f"{where}: give a {names}, found {value!r}")
-    return value

@@ -15,16 +15,17 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.stats import DegenerateDataWarning, bootstrap
 
+from potlp_jax.codec import finite_or_null
 from potlp_jax.types import Status
 
 BASELINE = "baseline"
 KNOWN_MAP = "known-map"
 SATISFIED = "satisfied"
 
-LOSSES: Status = Status.SUBGOAL_OVERFLOW | Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW | Status.NOT_CONVERGED
+LOSSES: Status = Status.SUBGOAL_OVERFLOW | Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW
 """Status bits by which a fixed-size array or loop took something away from a trial; they are counted."""
 
-UNRELIABLE: Status = Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW | Status.NOT_CONVERGED
+UNRELIABLE: Status = Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW
 """Losses after which a trial is not what its planner would have done. It is never averaged in. (That only the nearest
 subgoals are kept is part of the model, docs/model.md section 6.)"""
 
@@ -124,7 +125,7 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able values; undefined figures become None."""
-        return _defined(dataclasses.asdict(self))
+        return finite_or_null(dataclasses.asdict(self))
 
 
 def attainable_share(
@@ -259,13 +260,3 @@ def _count(names: Sequence[str]) -> dict[str, int]:
 def _count_losses(trials: Sequence[TrialResult]) -> dict[str, int]:
     bits = [bit for trial in trials for bit in Status(trial.status & LOSSES)]
     return _count([str(bit.name).lower() for bit in bits])
-
-
-def _defined(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {key: _defined(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_defined(entry) for entry in value]
-    return value

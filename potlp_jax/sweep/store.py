@@ -17,6 +17,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from potlp_jax.codec import differences, json_copy
 from potlp_jax.errors import StoreError
 
 FORMAT = "potlp-sweep-2"
@@ -143,13 +144,14 @@ class Store:
         with self._transaction():
             written = self.facts()
             for name, value in facts.items():
-                text = json.dumps(value, sort_keys=True)
-                given = json.loads(text)
+                given = json_copy(value)
                 if name not in written or _is_longer(given, written[name]):
-                    self._connection.execute("INSERT OR REPLACE INTO facts VALUES (?, ?)", (name, text))
+                    self._connection.execute(
+                        "INSERT OR REPLACE INTO facts VALUES (?, ?)", (name, json.dumps(given, sort_keys=True))
+                    )
                 elif given != written[name]:
                     raise StoreError(
-                        f"{self.file}: was begun with another {name}: {_difference(written[name], given)}. "
+                        f"{self.file}: was begun with another {name}: {', '.join(differences(written[name], given))}. "
                         "Give the sweep a folder of its own, or the specification that this one was begun with"
                     )
 
@@ -277,15 +279,3 @@ def _is_longer(given: Any, written: Any) -> bool:
     if not (isinstance(given, Mapping) and isinstance(written, Mapping) and "worlds" in given):
         return False
     return {**written, "worlds": given["worlds"]} == given and given["worlds"] > written["worlds"]
-
-
-def _difference(written: Any, given: Any) -> str:
-    if isinstance(written, Mapping) and isinstance(given, Mapping):
-        names = sorted(name for name in written.keys() | given.keys() if written.get(name) != given.get(name))
-        return ", ".join(f"{name} was {_short(written.get(name))}, is {_short(given.get(name))}" for name in names)
-    return f"was {_short(written)}, is {_short(given)}"
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value, default=str)
-    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -6,7 +6,6 @@ step at which the cell was first seen, so that the belief at any step - and with
 
 import dataclasses
 import json
-import math
 import zlib
 from collections.abc import Mapping
 from enum import StrEnum
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int32
 
+from potlp_jax.codec import finite_or_text
 from potlp_jax.errors import RecordError
 from potlp_jax.world.grid import (
     BeliefMap,
@@ -160,7 +160,7 @@ class Trial:
         data["decisions"] = [dataclasses.asdict(decision) for decision in self.decisions]
         data["first_seen"] = pack_array(self.first_seen)
         data["world"] = world_to_dict(self.world)
-        return _finite({"format": FORMAT, **data})
+        return finite_or_text({"format": FORMAT, **data})
 
     def save(self, path: Path) -> None:
         """Write the record as JSON."""
@@ -233,14 +233,3 @@ def _action_from_dict(data: Mapping[str, Any]) -> ActionRecord:
 
 def _cells(rows: list[list[int]]) -> tuple[tuple[int, int], ...]:
     return tuple((int(row), int(column)) for row, column in rows)
-
-
-def _finite(value: Any) -> Any:
-    """JSON knows no infinities; they are written as strings, which ``float`` reads back."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else str(value)
-    if isinstance(value, Mapping):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
-    return value

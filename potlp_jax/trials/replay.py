@@ -4,8 +4,10 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int32, UInt8
 
+from potlp_jax.codec import config_from_dict
 from potlp_jax.errors import CheckpointError, RecordError
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, look
 from potlp_jax.learning.labels import TrueMapEstimator
@@ -16,11 +18,11 @@ from potlp_jax.planning.search.api import Plan, search_tree
 from potlp_jax.planning.search.graph import Tree
 from potlp_jax.planning.search.uct import UctTree
 from potlp_jax.task.task import Task, TaskArrays
-from potlp_jax.trials.config import TrialConfig, trial_config_from_dict
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import LOG_PREFIX, Decision, Trial
 from potlp_jax.trials.robot import photograph
+from potlp_jax.world.camera import Disturbance
 from potlp_jax.world.grid import BeliefMap
-from potlp_jax.world.panorama import Disturbance
 
 
 def replay_decision(
@@ -40,7 +42,7 @@ def replay_decision(
         raise ValueError(f"policy {trial.policy!r} does not search: its decisions have no tree")
     decision = trial.decisions[index]
     task = Task.from_hoa(trial.task_hoa, propositions=trial.propositions)
-    config = trial_config_from_dict(trial.config)
+    config = config_from_dict(TrialConfig, trial.config, "trial record")
     problem = _replayed_problem(
         trial.belief_at(decision.step),
         jnp.asarray(decision.cell, jnp.int32),
@@ -80,11 +82,17 @@ def panorama_at(trial: Trial, decision: Decision, config: TrialConfig | None = N
             f"the trial is the replay of a robot's log, {trial.environment.removeprefix(LOG_PREFIX)}: its panoramas "
             "are in the log, and in the page that `potlp log replay` wrote"
         )
-    config = trial_config_from_dict(trial.config) if config is None else config
+    config = config_from_dict(TrialConfig, trial.config, "trial record") if config is None else config
     if config.disturbance != Disturbance():
         raise ValueError("the trial's camera was disturbed: its panoramas cannot be made again without the trial's key")
     cell = jnp.asarray(decision.cell, jnp.int32)
     return photograph(trial.world, cell, jax.random.key(0), config.camera, config.disturbance)
+
+
+def panoramas_of(trial: Trial) -> dict[int, UInt8[np.ndarray, "rows columns 3"]]:
+    """What the camera saw at the decisions whose panoramas were used, by number; none for policies that do not look."""
+    looks = sorted({look for decision in trial.decisions for look in decision.looks})
+    return {look: np.asarray(panorama_at(trial, trial.decisions[look])) for look in looks}
 
 
 @partial(jax.jit, static_argnames=("config",))

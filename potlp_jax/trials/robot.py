@@ -17,8 +17,9 @@ from jaxtyping import Array, Bool, Float32, Int32, PRNGKeyArray, UInt8
 from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import NEVER_SEEN
+from potlp_jax.world.camera import CameraConfig, Disturbance, disturb
 from potlp_jax.world.grid import BeliefMap, World
-from potlp_jax.world.panorama import CameraConfig, Disturbance, disturb, render
+from potlp_jax.world.renderer import render
 from potlp_jax.world.sensing import SensorConfig, observe
 
 DIAGONAL: float = math.sqrt(2.0)
@@ -55,7 +56,7 @@ class Robot(Protocol):
         ...
 
     def panorama(self) -> UInt8[Array, "rows columns 3"]:
-        """What the camera sees from the robot's cell, in the frame of the map (``world.panorama``)."""
+        """What the camera sees from the robot's cell, in the frame of the map (``world.camera``)."""
         ...
 
     def advance(self, path: KnownPath, stop: Stop) -> Leg:

@@ -16,7 +16,7 @@ from rich.table import Table
 from potlp_jax.learning.dataset import Samples, decode
 from potlp_jax.learning.metrics import INTACT, CostErrors, Figures, Predictions, Report, class_in_words
 from potlp_jax.view.style import CHOSEN, FAINT, INK, STATE_COLOURS, new_figure
-from potlp_jax.world.panorama import roll_to
+from potlp_jax.world.camera import roll_to
 
 VARIANTS: Mapping[str, str] = MappingProxyType({INTACT: "intact", "image": "image blacked out", "phi": "phi shuffled"})
 """What was evaluated, in words."""

@@ -1,12 +1,12 @@
 """One decision for people and programs: the table of its actions."""
 
 import dataclasses
-import math
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
+from potlp_jax.codec import finite_or_null
 from potlp_jax.trials.record import ActionRecord, Decision, Trial
 
 
@@ -66,14 +66,4 @@ def describe_decision(trial: Trial, decision: Decision) -> str:
 def decision_to_dict(decision: Decision) -> dict[str, Any]:
     """JSON-able values of a decision, actions by expected cost; what is infinite becomes None."""
     ranked = dataclasses.replace(decision, actions=tuple(rank_actions(decision)))
-    return _finite(dataclasses.asdict(ranked))
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
-    return value
+    return finite_or_null(dataclasses.asdict(ranked))

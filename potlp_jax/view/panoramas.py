@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from potlp_jax.trials.record import Decision, Trial
 from potlp_jax.view.decisions import describe_decision, rank_actions
 from potlp_jax.view.style import CHOSEN, INK, new_figure
-from potlp_jax.world.panorama import bearing, roll_to
+from potlp_jax.world.camera import bearing, roll_to
 
 _ACTIONS_SHOWN = 6
 

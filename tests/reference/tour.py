@@ -16,8 +16,8 @@ from potlp_jax.logs.writing import BagFormat, labels_text, write_drive
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import NEVER_SEEN
 from potlp_jax.trials.robot import photograph
+from potlp_jax.world.camera import CameraConfig, Disturbance
 from potlp_jax.world.grid import BeliefMap
-from potlp_jax.world.panorama import CameraConfig, Disturbance
 from potlp_jax.world.sensing import SensorConfig, observe
 
 TOY = Toy(ToyConfig(door_row=4, start=(4, 2), goal=(2, 12), hazard=(6, 9)))

@@ -172,7 +172,7 @@ function mountReplay(root, data) {
     });
   }
 
-  // Columns run from -pi to pi of the bearing (world/panorama.py).
+  // Columns run from -pi to pi of the bearing (world/camera.py).
   function turn(from, to) {
     return Math.atan2(to[0] - from[0], to[1] - from[1]) / (2 * Math.PI);
   }
