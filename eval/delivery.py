@@ -29,10 +29,10 @@ from eval.savings import (
     sweep,
     table_lines,
 )
-from potlp_jax.environments import make
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.campus.floor_plans import FloorPlans
 from potlp_jax.environments.campus.furnishing import PEOPLE
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.learning.questions import HELD_OUT
 from potlp_jax.planning.policies import Policy

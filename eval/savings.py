@@ -13,11 +13,12 @@ from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.results import compare_pairs, pair_rows
+from potlp_jax.sweep.rows import read_path
 from potlp_jax.sweep.runner import RESULTS
 from potlp_jax.sweep.statistics import PolicyRow
 from potlp_jax.sweep.store import Row, Store
 from potlp_jax.types import Status
-from potlp_jax.verify.audit import problems_of_row
+from potlp_jax.verify.audit import problems_of_path
 
 SWEEP_COMMAND = (sys.executable, "-c", "from potlp_jax.cli import main; main()", "sweep")
 """``potlp sweep``, by the interpreter that runs."""
@@ -77,7 +78,10 @@ def audit(rows: Sequence[Row], generator: Generator, split: Split) -> list[str]:
             number = row.item.world
             world = generator.generate(world_key(split, number, generator.name))
         assert world is not None
-        problems += problems_of_row(row, world, generator.propositions)
+        found = problems_of_path(
+            world, read_path(row.path), row.cost, row.outcome, row.item.task, generator.propositions
+        )
+        problems += [f"{problem}: {row.item}" for problem in found]
     return problems
 
 

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from eval.savings import SWEEP_COMMAND, audit, figures, policy_row, write_specification
-from potlp_jax.environments import make
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.results import compare_pairs, pair_rows

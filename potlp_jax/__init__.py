@@ -1,75 +1,169 @@
 """Plan for temporal-logic tasks in buildings never seen before: PO-TLP, JAX-native and batched.
 
-The public names, from a formula to a trial:
-
-* a task: ``Task``, ``TaskArrays``, ``TaskError``, ``TaskSizes``, ``stack_tasks``
-* a world and what is known of it: ``World``, ``make_world``, ``BeliefMap``, ``SensorConfig``, ``observe``,
-  ``Subgoals``, ``FrontierConfig``, ``find_subgoals``
-* planning: ``product_transitions``, ``product_distances``, ``Estimates``, ``PlanningProblem``, ``enumerate_actions``,
-  ``SearchConfig``, ``Plan``, ``plan_actions``, ``solve_exact``, ``bound_exact``, ``Bounds``, ``ProblemTooLargeError``,
-  ``DecisionConfig``, ``Policy``, ``decide``, ``Intention``
-* whole trials: ``TrialConfig``, ``run_trial``, ``Trial``, ``Outcome``, ``load_trial``; many at once: ``run_batch``,
-  ``Start``, ``Finished``
-* sentinels and flags: ``NO_ACTION``, ``Status``
+``__all__`` lists the public names by use: a task, a world and what is known of it, planning, whole trials. They are
+imported on first use, so that ``import potlp_jax`` itself takes milliseconds and loads no JAX.
 """
 
-from potlp_jax.errors import TaskError
-from potlp_jax.planning.commitment import Intention
-from potlp_jax.planning.distances.product import product_distances, product_transitions
-from potlp_jax.planning.estimates import Estimates
-from potlp_jax.planning.exact.api import Bounds, ProblemTooLargeError, bound_exact, solve_exact
-from potlp_jax.planning.policies import DecisionConfig, Policy, decide
-from potlp_jax.planning.problem import PlanningProblem, enumerate_actions
-from potlp_jax.planning.search.api import Plan, plan_actions
-from potlp_jax.planning.search.graph import SearchConfig
-from potlp_jax.task.task import Task, TaskArrays, TaskSizes, stack_tasks
-from potlp_jax.trials.batch import Finished, Start, run_batch
-from potlp_jax.trials.config import TrialConfig
-from potlp_jax.trials.loop import run_trial
-from potlp_jax.trials.record import Outcome, Trial, load_trial
-from potlp_jax.types import NO_ACTION, Status
-from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
-from potlp_jax.world.grid import BeliefMap, World, make_world
-from potlp_jax.world.sensing import SensorConfig, observe
+import importlib
+from typing import TYPE_CHECKING, Any
 
-__all__ = [
-    "NO_ACTION",
-    "BeliefMap",
-    "Bounds",
-    "DecisionConfig",
-    "Estimates",
-    "Finished",
-    "FrontierConfig",
-    "Intention",
-    "Outcome",
-    "Plan",
-    "PlanningProblem",
-    "Policy",
-    "ProblemTooLargeError",
-    "SearchConfig",
-    "SensorConfig",
-    "Start",
-    "Status",
-    "Subgoals",
+if TYPE_CHECKING:
+    # What type checkers and editors see; ``_MODULES`` says the same at run time.
+    from potlp_jax.environments.base import Generator as Generator
+    from potlp_jax.environments.registry import make as make
+    from potlp_jax.environments.splits import Split as Split
+    from potlp_jax.environments.splits import world_key as world_key
+    from potlp_jax.errors import PotlpError as PotlpError
+    from potlp_jax.errors import ProblemTooLargeError as ProblemTooLargeError
+    from potlp_jax.errors import TaskError as TaskError
+    from potlp_jax.errors import WorldError as WorldError
+    from potlp_jax.planning.commitment import Intention as Intention
+    from potlp_jax.planning.decision import decide_from_estimates as decide_from_estimates
+    from potlp_jax.planning.decision import frontier_subgoals as frontier_subgoals
+    from potlp_jax.planning.distances.product import product_distances as product_distances
+    from potlp_jax.planning.distances.product import product_transitions as product_transitions
+    from potlp_jax.planning.estimates import Estimates as Estimates
+    from potlp_jax.planning.exact.api import Bounds as Bounds
+    from potlp_jax.planning.exact.api import bound_exact as bound_exact
+    from potlp_jax.planning.exact.api import solve_exact as solve_exact
+    from potlp_jax.planning.policies import DecisionConfig as DecisionConfig
+    from potlp_jax.planning.policies import Policy as Policy
+    from potlp_jax.planning.policies import decide as decide
+    from potlp_jax.planning.problem import PlanningProblem as PlanningProblem
+    from potlp_jax.planning.problem import enumerate_actions as enumerate_actions
+    from potlp_jax.planning.search.api import Plan as Plan
+    from potlp_jax.planning.search.api import plan_actions as plan_actions
+    from potlp_jax.planning.search.graph import SearchConfig as SearchConfig
+    from potlp_jax.task.task import Task as Task
+    from potlp_jax.task.task import TaskArrays as TaskArrays
+    from potlp_jax.task.task import TaskSizes as TaskSizes
+    from potlp_jax.task.task import stack_tasks as stack_tasks
+    from potlp_jax.trials.batch import Finished as Finished
+    from potlp_jax.trials.batch import Start as Start
+    from potlp_jax.trials.batch import run_batch as run_batch
+    from potlp_jax.trials.config import TrialConfig as TrialConfig
+    from potlp_jax.trials.loop import run_trial as run_trial
+    from potlp_jax.trials.record import Outcome as Outcome
+    from potlp_jax.trials.record import Trial as Trial
+    from potlp_jax.trials.record import load_trial as load_trial
+    from potlp_jax.trials.robot import Robot as Robot
+    from potlp_jax.types import NO_ACTION as NO_ACTION
+    from potlp_jax.types import Status as Status
+    from potlp_jax.world.frontiers import FrontierConfig as FrontierConfig
+    from potlp_jax.world.frontiers import Subgoals as Subgoals
+    from potlp_jax.world.frontiers import find_subgoals as find_subgoals
+    from potlp_jax.world.grid import BeliefMap as BeliefMap
+    from potlp_jax.world.grid import World as World
+    from potlp_jax.world.grid import belief_from_numpy as belief_from_numpy
+    from potlp_jax.world.grid import make_world as make_world
+    from potlp_jax.world.sensing import SensorConfig as SensorConfig
+    from potlp_jax.world.sensing import observe as observe
+
+    __version__: str
+
+__all__ = [  # noqa: RUF022 - by use, not by the alphabet
+    # A task: from a formula to arrays.
     "Task",
     "TaskArrays",
-    "TaskError",
     "TaskSizes",
-    "Trial",
-    "TrialConfig",
-    "World",
-    "bound_exact",
-    "decide",
-    "enumerate_actions",
-    "find_subgoals",
-    "load_trial",
-    "make_world",
-    "observe",
-    "plan_actions",
-    "product_distances",
-    "product_transitions",
-    "run_batch",
-    "run_trial",
-    "solve_exact",
     "stack_tasks",
+    # A world, and what is known of it.
+    "make",
+    "Generator",
+    "Split",
+    "world_key",
+    "World",
+    "make_world",
+    "BeliefMap",
+    "belief_from_numpy",
+    "SensorConfig",
+    "observe",
+    "FrontierConfig",
+    "Subgoals",
+    "find_subgoals",
+    # Planning: one decision.
+    "product_transitions",
+    "product_distances",
+    "frontier_subgoals",
+    "Estimates",
+    "decide_from_estimates",
+    "DecisionConfig",
+    "Intention",
+    "Policy",
+    "decide",
+    "PlanningProblem",
+    "enumerate_actions",
+    "SearchConfig",
+    "Plan",
+    "plan_actions",
+    "Bounds",
+    "bound_exact",
+    "solve_exact",
+    # Whole trials, one or many.
+    "TrialConfig",
+    "run_trial",
+    "Trial",
+    "Outcome",
+    "load_trial",
+    "Robot",
+    "Start",
+    "Finished",
+    "run_batch",
+    # Sentinels, flags and errors.
+    "NO_ACTION",
+    "Status",
+    "PotlpError",
+    "ProblemTooLargeError",
+    "TaskError",
+    "WorldError",
+    "__version__",
 ]
+
+_MODULES: dict[str, tuple[str, ...]] = {
+    "environments.base": ("Generator",),
+    "environments.registry": ("make",),
+    "environments.splits": ("Split", "world_key"),
+    "errors": ("PotlpError", "ProblemTooLargeError", "TaskError", "WorldError"),
+    "planning.commitment": ("Intention",),
+    "planning.decision": ("decide_from_estimates", "frontier_subgoals"),
+    "planning.distances.product": ("product_distances", "product_transitions"),
+    "planning.estimates": ("Estimates",),
+    "planning.exact.api": ("Bounds", "bound_exact", "solve_exact"),
+    "planning.policies": ("DecisionConfig", "Policy", "decide"),
+    "planning.problem": ("PlanningProblem", "enumerate_actions"),
+    "planning.search.api": ("Plan", "plan_actions"),
+    "planning.search.graph": ("SearchConfig",),
+    "task.task": ("Task", "TaskArrays", "TaskSizes", "stack_tasks"),
+    "trials.batch": ("Finished", "Start", "run_batch"),
+    "trials.config": ("TrialConfig",),
+    "trials.loop": ("run_trial",),
+    "trials.record": ("Outcome", "Trial", "load_trial"),
+    "trials.robot": ("Robot",),
+    "types": ("NO_ACTION", "Status"),
+    "world.frontiers": ("FrontierConfig", "Subgoals", "find_subgoals"),
+    "world.grid": ("BeliefMap", "World", "belief_from_numpy", "make_world"),
+    "world.sensing": ("SensorConfig", "observe"),
+}
+_HOME = {name: module for module, names in _MODULES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first asked for (PEP 562)."""
+    if name == "__version__":
+        # Imported here because it takes 25 ms, which nobody should pay who does not ask.
+        from importlib.metadata import version
+
+        # From the installed package, so that the version is written in pyproject.toml alone.
+        value = version("potlp-jax")
+    elif name in _HOME:
+        value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    # The next look-up finds it without coming here.
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """The public names, loaded or not."""
+    return sorted({*globals(), *__all__})

@@ -26,6 +26,10 @@ class WorldError(PotlpError):
     """A world, or the configuration of a world, is not valid; the message says what and where."""
 
 
+class PluginError(PotlpError):
+    """An environment, policy, camera or estimator cannot be found or loaded by its name; the message lists what can."""
+
+
 class MapError(PotlpError):
     """A map, or what is placed in it, cannot be used: names the file, the field, and what to do."""
 

@@ -1,20 +1,37 @@
 """Names shared by every room: array dimensions, sentinels and status bits.
 
-Dimension names (they appear in the jaxtyping annotations and mean the same thing everywhere):
+Glossary of the dimension names in jaxtyping annotations. ``tests/test_types.py`` compares it with the package: every
+name that is used stands here, and no other. A name with a ``1`` at its end has one entry more than the name without
+(``S1`` is ``S + 1``); names behind a star (``*batch``) stand for any number of axes, also none.
 
-====  ==========================================================================================
-H, W  rows and columns of the grid; row 0 is the top row, a cell is ``(row, column)``
-Z     states of the task automaton (DFA)
-L     letters, ``2 ** n`` for ``n`` propositions; bit ``i`` of a letter is proposition ``i``
-E     edges ``(z', z'')`` of the automaton that a high-level action can attempt
-C     outcome classes ``(stay, cube)``: what an estimator is asked for
-M     conditions: the C classes first, then the conditions that several cubes make up
-K     cubes of a condition, at most
-S     subgoals; node ``S`` of a planning problem is the robot's own cell
-A     actions of a planning problem, ``S * E + 1``: ``s * E + e``, and last the finish action
-B     batch
-N     nodes of a search tree
-====  ==========================================================================================
+=============================  ===========================================================================
+Grid
+H, W                           rows and columns of the grid; row 0 is the top row, a cell is (row, column)
+H2, W2                         the same with a margin of one cell on each side
+two_h, two_w                   ``2 H - 1`` and ``2 W - 1``: differences between the coordinates of two cells
+cells, real                    cells of the grid, counted row by row; ``real`` without the dummy entry
+capacity, block                entries of a list of cells; entries that are handled at once
+lines, side, steps             lines of sight, or rays; those of one side of a square; cells along each
+entries                        entries of a table of range maxima
+
+Task
+Z                              states of the task automaton (DFA)
+L                              letters, ``2 ** P``; bit ``i`` of a letter is proposition ``i``
+P                              propositions
+E                              edges (z', z'') of the automaton that a high-level action can attempt
+C                              outcome classes (stay, cube): what an estimator is asked for
+M                              conditions: the C classes first, then the conditions that several cubes make up
+K                              cubes of a condition, at most
+
+Planning
+S, S1                          subgoals; node ``S`` of a planning problem is the robot's own cell
+A                              actions, ``S * E + 1``: ``s * E + e``, and last the finish action
+Q, T                           sources and targets of distances
+shared                         Q, or 1 where all sources share the entry
+active, keys, ends             cells where the automaton's state can change; with the sources; with the targets
+to                             states that a move may lead to
+horizon1                       product states of a path: its moves and the source
+=============================  ===========================================================================
 
 Costs are ``float32`` in the unit of ``World.resolution`` (cells where it is 1). Unreachable is ``inf``.
 Masks are True where an entry is real, False where it is padding.
@@ -43,8 +60,12 @@ NO_ACTION: int = -1
 
 
 class Status(IntFlag):
-    """Sticky bits that every padded producer ORs into its ``status``; zero means that nothing was lost."""
+    """Sticky bits that every padded producer ORs into its ``status``; zero means that nothing was lost.
 
+    No array is truncated silently: evaluation counts trials with a bit apart (``sweep.statistics``).
+    """
+
+    # Rows of results hold these numbers, so they do not change; 32 is not used.
     OK = 0
     SUBGOAL_OVERFLOW = 1
     """More frontier components than the array of subgoals holds; the farthest were left out."""
@@ -56,8 +77,6 @@ class Status(IntFlag):
     """No action is available and the root is not accepting: the value is the dead-end cost."""
     ACCEPTING_ROOT = 16
     """The task is already satisfied: the value is zero."""
-    NOT_CONVERGED = 32
-    """An iteration reached its limit before its fixed point."""
     FALLBACK = 64
     """No action was available; the robot went to the nearest frontier that violates nothing (liveness)."""
     NO_FRONTIER = 128
@@ -68,9 +87,10 @@ class Status(IntFlag):
 
 def status_array(status: Status = Status.OK) -> UInt32[Array, ""]:
     """The bits as a device scalar."""
+    # By way of numpy: a Python integer would become int32, and strict dtype promotion refuses to mix the two.
     return jnp.asarray(np.uint32(int(status)))
 
 
 def status_if(condition: Array, status: Status) -> UInt32[Array, ""]:
-    """``status`` where ``condition`` holds, else no bits; works under jit and vmap."""
+    """``status`` where ``condition`` holds, otherwise no bits; works under jit and vmap."""
     return jnp.where(condition, np.uint32(int(status)), np.uint32(0))

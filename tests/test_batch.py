@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from potlp_jax.environments import make
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import BatchError
 from potlp_jax.learning.estimator import TrainedEstimator

@@ -13,7 +13,8 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from potlp_jax.cli import app
-from potlp_jax.environments import FAMILIES, make
+from potlp_jax.environments.families import FAMILIES
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.errors import WorldError
 from potlp_jax.task.task import Task

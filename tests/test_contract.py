@@ -1,7 +1,11 @@
 """The names and signatures that code outside of this repository relies on."""
 
+import ast
 import inspect
 import pickle
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +13,8 @@ import numpy as np
 import pytest
 
 import potlp_jax
-from potlp_jax.environments import FAMILIES, make
+from potlp_jax.environments.families import FAMILIES
+from potlp_jax.environments.registry import make
 
 
 def _parameters(function):
@@ -19,7 +24,31 @@ def _parameters(function):
 def test_public_names_exist_and_have_docstrings():
     for name in potlp_jax.__all__:
         value = getattr(potlp_jax, name)
-        assert name == "NO_ACTION" or inspect.getdoc(value), name
+        assert name in ("NO_ACTION", "__version__") or inspect.getdoc(value), name
+        assert name in dir(potlp_jax)
+
+
+def test_importing_the_package_loads_nothing_heavy():
+    script = "import sys, potlp_jax; print(*{name.split('.')[0] for name in sys.modules}); potlp_jax.__version__"
+    loaded = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True).stdout.split()
+    assert not {"jax", "numpy", "flax", "scipy", "matplotlib"} & set(loaded)
+
+
+def test_type_checkers_see_the_names_that_there_are():
+    block = next(node for node in ast.parse(Path(potlp_jax.__file__).read_text()).body if isinstance(node, ast.If))
+    seen = {
+        alias.asname: f"{node.module}.{alias.name}"
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert seen == {name: f"potlp_jax.{module}.{name}" for name, module in potlp_jax._HOME.items()}
+    assert sorted(potlp_jax.__all__) == sorted([*seen, "__version__"])
+
+
+def test_an_unknown_name_is_no_attribute():
+    with pytest.raises(AttributeError, match="no attribute 'plan_everything'"):
+        _ = potlp_jax.plan_everything
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from potlp_jax.environments import make
 from potlp_jax.environments.campus.delivery import Delivery, DeliveryConfig
 from potlp_jax.environments.campus.furnishing import (
     NO_ROOM,
@@ -21,6 +20,7 @@ from potlp_jax.environments.campus.furnishing import (
     furnish,
     missing_kinds,
 )
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import WorldError
 from potlp_jax.planning.policies import Policy

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from potlp_jax.cli.explain import explain_decision
-from potlp_jax.environments import make
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.errors import CheckpointError
 from potlp_jax.learning.estimator import (

@@ -10,6 +10,7 @@ import potlp_jax
 ORDER = (
     "types",
     "errors",
+    "plugins",
     "codec",
     "cache",
     "task",
@@ -19,10 +20,11 @@ ORDER = (
     "export",
     "learning",
     "trials",
+    "rl",
+    "verify",
+    "sweep",
     "recipes",
     "logs",
-    "sweep",
-    "verify",
     "bench",
     "view",
     "cli",
@@ -73,3 +75,19 @@ def test_one_module_imports_orbax_and_one_the_modules_of_flax():
     for prefix, module in {"orbax": "learning/checkpoints.py", "flax.linen": "learning/network.py"}.items():
         users = [path for path in SOURCES if any(f"{name}.".startswith(f"{prefix}.") for name in _imports(path))]
         assert [str(path.relative_to(PACKAGE)) for path in users] == [module]
+
+
+def test_nothing_imports_the_tests():
+    root = PACKAGE.parent
+    for folder in (PACKAGE, root / "eval", root / "train"):
+        for path in folder.rglob("*.py"):
+            assert not any(module.split(".")[0] == "tests" for module in _imports(path)), path
+
+
+def test_the_auditor_shares_no_code_with_the_planner():
+    # It reads the planner's data - worlds, tasks, records - and judges them by rules of its own.
+    allowed = ("task.task", "trials.record", "world.grid", "verify.", "errors.")
+    for path in (PACKAGE / "verify").glob("*.py"):
+        for module in _imports(path):
+            if _room(module) is not None:
+                assert module.removeprefix("potlp_jax.").startswith(allowed), f"{path.name} imports {module}"

@@ -15,7 +15,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from potlp_jax.cli import app
-from potlp_jax.environments import make
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.ros.map_files import load_map
 from potlp_jax.environments.ros.map_writer import save_map
 from potlp_jax.environments.ros.places import Disc, Places, Polygon, load_places, save_places

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from potlp_jax.codec import with_settings
-from potlp_jax.environments import make
 from potlp_jax.environments.campus.delivery import Delivery
 from potlp_jax.environments.campus.furnishing import PARCELS, Floor, FurnishConfig, Kind, furnish
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.ros.mapped_rooms import (
     LEARNED_RESOLUTION,
     MANY_SLIVERS,
@@ -21,7 +21,7 @@ from potlp_jax.environments.splits import world_key
 from potlp_jax.errors import MapError, MapWarning, SpecificationError, WorldError
 from potlp_jax.sweep.specification import specification_from_dict
 from potlp_jax.task.task import Task
-from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.config import TrialConfig, trial_config_for
 from tests.reference.map_files import drawn, p5, write_map
 
 # Three rooms above a hallway; a sign is half a metre.
@@ -116,12 +116,12 @@ def test_parcels_of_a_map_take_every_pair_of_rooms_and_are_lit(building):
 
 def test_trials_on_a_map_see_as_in_the_worlds_that_were_learned_from(building):
     same = MappedRooms(MappedRoomsConfig(building, resolution=LEARNED_RESOLUTION, radius=0.0))
-    learned_from = with_settings(TrialConfig(), make("parcels").settings)
+    learned_from = trial_config_for(make("parcels"))
     room = {"decision": {"frontiers": {"max_subgoals": MANY_SLIVERS}}}
     expected = with_settings(with_settings(learned_from, NARROW_DOORS), room)
-    assert with_settings(TrialConfig(), same.settings) == expected
+    assert trial_config_for(same) == expected
     fine = MappedRooms(MappedRoomsConfig(building, resolution=LEARNED_RESOLUTION / 2, radius=0.0))
-    config = with_settings(TrialConfig(), fine.settings)
+    config = trial_config_for(fine)
     assert config.camera.wall_height == TrialConfig().camera.wall_height * 2
     assert config.replan_distance == TrialConfig().replan_distance * 2
 
@@ -166,7 +166,7 @@ def test_two_rooms_of_a_kind_are_needed_where_two_things_are():
 def test_a_sweep_takes_what_the_environment_needs_and_the_file_says():
     data = {"environments": ["delivery"], "tasks": [1], "policies": ["baseline"], "worlds": 2}
     config = specification_from_dict(data, "here").config
-    assert config == with_settings(TrialConfig(), make("delivery").settings) != TrialConfig()
+    assert config == trial_config_for(make("delivery")) != TrialConfig()
     changed = {**data, "settings": {"decision": {"search": {"simulations": 9}}}}
     decision = specification_from_dict(changed, "here").config.decision
     assert (decision.search.simulations, decision.frontiers) == (9, config.decision.frontiers)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from potlp_jax.codec import json_copy, shipped_settings
-from potlp_jax.environments import make
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
 from potlp_jax.errors import ConfigurationError
 from potlp_jax.learning.dataset import read_metadata

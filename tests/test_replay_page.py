@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from potlp_jax.cli import app
-from potlp_jax.environments import make
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task

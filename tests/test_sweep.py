@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from eval.savings import decisions_of
 from potlp_jax.cli import app
-from potlp_jax.environments import make
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.errors import ConfigurationError, StoreError
 from potlp_jax.planning.policies import Policy

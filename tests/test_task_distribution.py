@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from potlp_jax.environments import make
 from potlp_jax.environments.firefighting import Firefighting
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.learning.labels import true_labels
 from potlp_jax.learning.questions import (

@@ -33,6 +33,7 @@ from potlp_jax.view.maps import (
     WALL_UNSEEN,
     cell_image,
     describe_outcome,
+    draw_side_by_side,
     draw_trial,
     place_labels,
 )
@@ -140,7 +141,7 @@ def test_picture_of_a_trial_shows_every_part(trial, tmp_path):
     names = {text.get_text() for text in axes.texts}
     assert {"goal", "hazard", "1"} <= names
     heading = " ".join(text.get_text() for text in figure.texts)
-    for part in (trial.task_text, "oracle", "21.2", "satisfied", "seed 3"):
+    for part in (trial.task_text, "oracle", "21.2", "satisfied", "world 3"):
         assert part in heading
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert {"state 0 (initial)", "state 1 (accepting)", "never seen", "start", "end", "goal", "hazard"} <= set(legend)
@@ -163,17 +164,47 @@ def test_trial_without_decisions_has_a_picture(trial, tmp_path):
 @pytest.mark.parametrize(
     ("environment", "shown"),
     [
-        ("firefighting/test", "firefighting/test, seed 3"),
-        ("map:/some/where/lab.yaml,places=a/b.yaml,resolution=0.3/validation", "map:lab.yaml/validation, seed 3"),
-        ("map:lab.yaml/validation", "map:lab.yaml/validation, seed 3"),
-        ("floorplan:/some/where/school.xml,resolution=0.4/test", "floorplan:school.xml/test, seed 3"),
-        ("floorplan:plans/schools//test", "floorplan:schools/test, seed 3"),
+        ("firefighting/test", "firefighting/test, world 3"),
+        ("map:/some/where/lab.yaml,places=a/b.yaml,resolution=0.3/validation", "map:lab.yaml/validation, world 3"),
+        ("map:lab.yaml/validation", "map:lab.yaml/validation, world 3"),
+        ("floorplan:/some/where/school.xml,resolution=0.4/test", "floorplan:school.xml/test, world 3"),
+        ("floorplan:plans/schools//test", "floorplan:schools/test, world 3"),
     ],
 )
 def test_heading_names_the_environment_briefly(trial, environment, shown):
     assert describe_outcome(dataclasses.replace(trial, environment=environment)).startswith(
         f"{shown}  ·  policy oracle"
     )
+
+
+def test_side_by_side_shows_each_path_under_its_cost_and_wastes_no_room(trial, tmp_path):
+    short = dataclasses.replace(trial, policy="potlp", cost=11.5, path=trial.path[:8], states=trial.states[:8])
+    figure = draw_side_by_side([trial, short], ["the baseline", "PO-TLP"])
+    texts = [text.get_text() for text in figure.texts]
+    assert "the baseline: cost 21.2, satisfied" in texts
+    assert "PO-TLP: cost 11.5, satisfied" in texts
+    assert trial.task_text in texts
+    lengths = [
+        len(artist.get_segments())
+        for axes in figure.axes
+        for artist in axes.collections
+        if isinstance(artist, LineCollection)
+    ]
+    assert lengths == [len(trial.path) - 1, 7]
+    save_figure(figure, tmp_path / "both.png")
+    assert not _overlaps(figure, [*figure.texts, *figure.legends[0].get_texts()])
+    ink = np.any(np.asarray(Image.open(tmp_path / "both.png").convert("RGB")) != 255, axis=-1)
+    # No margin is wider than a third of an inch, and no blank strip between the maps is.
+    rows, columns = np.flatnonzero(ink.any(axis=1)), np.flatnonzero(ink.any(axis=0))
+    gaps = [rows[0], ink.shape[0] - rows[-1], columns[0], ink.shape[1] - columns[-1]]
+    gaps += [np.diff(rows).max(), np.diff(columns).max()]
+    assert max(gaps) < figure.dpi / 3
+
+
+def test_only_trials_of_one_world_and_task_are_drawn_side_by_side(trial):
+    other = dataclasses.replace(trial, task_hoa=Task.shipped("toy-1").to_hoa())
+    with pytest.raises(PictureError, match="same world and task"):
+        draw_side_by_side([trial, other])
 
 
 def test_raster_colours_cells_by_what_is_known():

@@ -32,8 +32,8 @@ from scipy.sparse.csgraph import dijkstra
 
 from potlp_jax.environments.rooms import Rooms, RoomsConfig
 from potlp_jax.planning.distances.product import distance_table, product_distances, product_transitions
-from potlp_jax.planning.distances.sweeping import NEIGHBOURS
 from potlp_jax.task.task import Task
+from potlp_jax.world.moves import NEIGHBOURS
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import jax
 
 from potlp_jax.cache import enable_compilation_cache
-from potlp_jax.environments import make
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.learning.estimator import shipped_estimator
 from potlp_jax.planning.policies import Policy

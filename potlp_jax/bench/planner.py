@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Int32
 from potlp_jax.bench.memory import tree_memory
 from potlp_jax.bench.problems import family_problem
 from potlp_jax.bench.timing import Timing, compile_call
-from potlp_jax.environments import make
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.rooms import Rooms, RoomsConfig
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.learning.labels import TrueMapEstimator

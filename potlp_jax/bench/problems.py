@@ -23,6 +23,7 @@ from jaxtyping import Float64, Int32
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.task.task import Task, TaskArrays, TaskSizes
+from potlp_jax.world.moves import DIAGONAL
 
 Split = Literal["tuning", "test"]
 
@@ -184,7 +185,7 @@ def random_metric(places: int, rng: np.random.Generator) -> Float64[np.ndarray, 
     """Shortest paths between random places of the map: symmetric, 0 on the diagonal only, triangle inequality."""
     points = rng.uniform(0.0, _SIDE, (places, 2))
     offset = np.abs(points[:, None] - points[None])
-    octile = offset.max(axis=-1) + (np.sqrt(2.0) - 1.0) * offset.min(axis=-1)
+    octile = offset.max(axis=-1) + (DIAGONAL - 1.0) * offset.min(axis=-1)
     detour = np.triu(rng.uniform(1.0, _LARGEST_DETOUR, octile.shape), 1)
     return _shortest(np.maximum(octile, 1.0) * (detour + detour.T))
 

@@ -23,7 +23,7 @@ from potlp_jax.bench.problems import FAMILIES
 from potlp_jax.bench.timing import environment as describe_environment
 from potlp_jax.cli.inputs import read_environment_task, trial_config
 from potlp_jax.cli.output import console, fail, package_version, print_json, progress_bar
-from potlp_jax.environments import make
+from potlp_jax.environments.registry import make
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for
 from potlp_jax.planning.policies import DecisionConfig
 

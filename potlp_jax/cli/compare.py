@@ -29,7 +29,8 @@ from potlp_jax.cli.output import (
     progress_bar,
     to_json,
 )
-from potlp_jax.environments import Generator, make
+from potlp_jax.environments.base import Generator
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.planning.policies import Policy

@@ -5,13 +5,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from potlp_jax.cli.output import fail, note
-from potlp_jax.codec import with_settings
-from potlp_jax.environments import Generator
+from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split, default_split, world_key
 from potlp_jax.learning.estimator import TrainedEstimator, read_estimator, shipped_estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task, shipped_tasks
-from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.config import TrialConfig, trial_config_for
 from potlp_jax.world.grid import World
 
 
@@ -77,7 +76,7 @@ def make_world(generator: Generator, split: Split, seed: int) -> World:
 
 def trial_config(simulations: int | None, generator: Generator | None = None) -> TrialConfig:
     """What the generator's worlds call for, with another number of simulations if one is given."""
-    config = TrialConfig() if generator is None else with_settings(TrialConfig(), generator.settings)
+    config = TrialConfig() if generator is None else trial_config_for(generator)
     if simulations is None:
         return config
     search = dataclasses.replace(config.decision.search, simulations=simulations)

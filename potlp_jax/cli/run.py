@@ -14,7 +14,7 @@ from potlp_jax.cli.inputs import (
     trial_config,
 )
 from potlp_jax.cli.output import FAILED, console, output_folder, print_json, progress_bar
-from potlp_jax.environments import make
+from potlp_jax.environments.registry import make
 from potlp_jax.trials.loop import run_trial, trial_key
 from potlp_jax.trials.record import Outcome, Trial
 from potlp_jax.types import Status

@@ -1,50 +1,79 @@
 """What every family of worlds offers."""
 
+import abc
+import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from potlp_jax.environments.splits import Split, default_split, world_key
+from potlp_jax.errors import TaskError
+from potlp_jax.task.task import Task
 from potlp_jax.world.grid import World
-
-NO_SETTINGS: Mapping[str, Any] = MappingProxyType({})
-"""Trials run with the defaults."""
+from potlp_jax.world.settings import NO_SETTINGS, Settings
 
 
-@runtime_checkable
-class Generator(Protocol):
+class Generator(abc.ABC):
     """A family of worlds: one fixed array shape, one tuple of propositions, worlds drawn by key.
+
+    A family of your own derives from this class, sets ``name`` and ``propositions`` and defines ``draw``. Generators go
+    to other processes: their attributes must be picklable.
 
     Attributes:
         name: the family's name; it also separates the families' seeds.
         propositions: bit ``i`` of every letter of the family is ``propositions[i]``.
-        config: the parameters of the worlds, a frozen dataclass.
         tasks: formulas that belong to the family, by the number (or name) used on the command line.
         settings: what trials in its worlds need to be different from the defaults: fields of
-            ``trial_config.TrialConfig``, nested as in a sweep's file.
+            ``trials.config.TrialConfig``, nested as in a sweep's file. Every world of the family carries them.
+        config: the parameters of the worlds, a frozen dataclass; None where there are none.
     """
 
-    @property
-    def name(self) -> str: ...
+    name: str
+    propositions: tuple[str, ...]
+    tasks: Mapping[str, str] = MappingProxyType({})
+    settings: Settings = NO_SETTINGS
+    config: Any = None
 
-    @property
-    def config(self) -> Any: ...
+    @abc.abstractmethod
+    def draw(self, key: PRNGKeyArray) -> World:
+        """Make the world of this key: on the host, the same on every machine. Called by ``generate``.
 
-    @property
-    def propositions(self) -> tuple[str, ...]: ...
-
-    @property
-    def tasks(self) -> Mapping[str, str]: ...
-
-    @property
-    def settings(self) -> Mapping[str, Any]: ...
+        Raises:
+            WorldError: no world can be made.
+        """
 
     def generate(self, key: PRNGKeyArray) -> World:
-        """The world of this key: on the host, the same on every machine. Raises WorldError where none can be made."""
-        ...
+        """The world of this key, with the propositions and settings of its family. Raises WorldError as ``draw``."""
+        return self.signed(self.draw(key))
+
+    def signed(self, world: World) -> World:
+        """The world with the propositions and settings of this family."""
+        # A world that says itself what it needs cannot be run with the settings of another family by oversight.
+        return dataclasses.replace(world, propositions=self.propositions, settings=self.settings)
+
+    def world(self, index: int, split: Split | str | None = None) -> World:
+        """World number ``index`` of a split, by default of that from which the command line takes its worlds.
+
+        Raises:
+            WorldError: the family has no such world.
+        """
+        return self.generate(world_key(default_split(self.name) if split is None else split, index, self.name))
+
+    def task(self, text: str | int) -> Task:
+        """One of the family's tasks by number (or name), or the task of a formula over the family's propositions.
+
+        Raises:
+            TaskError: there is no such task, or the formula is none.
+        """
+        formula = self.tasks.get(str(text), str(text))
+        if formula.strip().isdecimal():
+            known = ", ".join(f"{number} ({entry})" for number, entry in self.tasks.items()) or "none"
+            raise TaskError(f"{self.name} has no task {text}; it has: {known}. Or give a formula.")
+        return Task.of_formula(formula, self.propositions)
 
 
 def host_generators(key: PRNGKeyArray, count: int) -> tuple[np.random.Generator, ...]:

@@ -13,13 +13,12 @@ import dataclasses
 import enum
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, PRNGKeyArray, UInt8
 
-from potlp_jax.environments.base import NO_SETTINGS, host_generators
+from potlp_jax.environments.base import Generator, host_generators
 from potlp_jax.errors import WorldError
 from potlp_jax.world.grid import Appearance, World, make_world
 
@@ -130,7 +129,7 @@ class FirefightingLayout:
         return self.fire_hallway == self.dead_end
 
 
-class Firefighting:
+class Firefighting(Generator):
     """Generator of fire-fighting buildings (Bradley et al. 2021, section V-A)."""
 
     name: str = "firefighting"
@@ -143,7 +142,6 @@ class Firefighting:
             "4": "!fire U exit",
         }
     )
-    settings: Mapping[str, Any] = NO_SETTINGS
 
     def __init__(self, config: FirefightingConfig | None = None) -> None:
         self.config = FirefightingConfig() if config is None else config
@@ -157,7 +155,7 @@ class Firefighting:
             )
         )
 
-    def generate(self, key: PRNGKeyArray) -> World:
+    def draw(self, key: PRNGKeyArray) -> World:
         """The world of this key."""
         return self.generate_with_layout(key)[0]
 
@@ -168,7 +166,7 @@ class Firefighting:
         occupied = _walls(self.config, layout)
         letters = _letters(self.config, layout, self.propositions)
         look = _appearance(self.config, layout, occupied, look_rng)
-        return make_world(occupied, letters, layout.start, appearance=look), layout
+        return self.signed(make_world(occupied, letters, layout.start, appearance=look)), layout
 
 
 def hallway_rows(config: FirefightingConfig, hallway: int) -> tuple[int, int]:

@@ -6,14 +6,11 @@ propositions occur.
 """
 
 import dataclasses
-from collections.abc import Mapping
-from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int32, PRNGKeyArray
 
-from potlp_jax.environments.base import NO_SETTINGS, host_generators
+from potlp_jax.environments.base import Generator, host_generators
 from potlp_jax.errors import WorldError
 from potlp_jax.world.grid import World, make_world, pad_world
 
@@ -52,34 +49,22 @@ class RoomsConfig:
             raise WorldError("door_width, patches and patch_radius must be positive and smaller than a room")
 
 
-class Rooms:
+class Rooms(Generator):
     """Generator of floors of rooms."""
 
     name = "rooms"
-    settings: Mapping[str, Any] = NO_SETTINGS
 
     def __init__(self, config: RoomsConfig | None = None) -> None:
-        self.config = RoomsConfig() if config is None else config
+        self.config: RoomsConfig = RoomsConfig() if config is None else config
+        self.propositions = self.config.propositions
+        self.tasks = _tasks(self.propositions)
 
     @classmethod
     def toy(cls) -> "Rooms":
         """Floors of 16 to 24 cells a side."""
         return cls(RoomsConfig(smallest=16, largest=24, room=5, patches=1, patch_radius=0))
 
-    @property
-    def propositions(self) -> tuple[str, ...]:
-        """As configured."""
-        return self.config.propositions
-
-    @property
-    def tasks(self) -> Mapping[str, str]:
-        """Find each proposition, in any order (1) and in the order of their names (2)."""
-        ordered = f"F {self.propositions[-1]}"
-        for name in reversed(self.propositions[:-1]):
-            ordered = f"F({name} & {ordered})"
-        return MappingProxyType({"1": " & ".join(f"F {name}" for name in self.propositions), "2": ordered})
-
-    def generate(self, key: PRNGKeyArray) -> World:
+    def draw(self, key: PRNGKeyArray) -> World:
         """The floor of this key."""
         (rng,) = host_generators(key, 1)
         height, width = (int(rng.integers(self.config.smallest, self.config.largest + 1)) for _ in range(2))
@@ -89,6 +74,14 @@ class Rooms:
         start = free[rng.integers(len(free))]
         world = make_world(occupied, _letters(rng, self.config, occupied), (int(start[0]), int(start[1])))
         return pad_world(world, self.config.largest, self.config.largest)
+
+
+def _tasks(propositions: tuple[str, ...]) -> dict[str, str]:
+    """Find each proposition, in any order (1) and in the order of their names (2)."""
+    ordered = f"F {propositions[-1]}"
+    for name in reversed(propositions[:-1]):
+        ordered = f"F({name} & {ordered})"
+    return {"1": " & ".join(f"F {name}" for name in propositions), "2": ordered}
 
 
 def _walls(rng: np.random.Generator, size: int, room: int) -> list[int]:

@@ -7,12 +7,11 @@ door, so that both tasks can be satisfied in every world. What the configuration
 import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from potlp_jax.environments.base import NO_SETTINGS, host_generators
+from potlp_jax.environments.base import Generator, host_generators
 from potlp_jax.errors import WorldError
 from potlp_jax.world.grid import World, make_world
 
@@ -42,18 +41,17 @@ class ToyConfig:
             raise WorldError(f"a toy world needs height >= 5 and an odd width >= 9, found {self.height}x{self.width}")
 
 
-class Toy:
+class Toy(Generator):
     """Generator of two-room worlds. Propositions: goal, hazard."""
 
     name: str = "toy"
     propositions: tuple[str, ...] = ("goal", "hazard")
     tasks: Mapping[str, str] = MappingProxyType({"1": "F goal", "2": "!hazard U goal"})
-    settings: Mapping[str, Any] = NO_SETTINGS
 
     def __init__(self, config: ToyConfig | None = None) -> None:
         self.config = ToyConfig() if config is None else config
 
-    def generate(self, key: PRNGKeyArray) -> World:
+    def draw(self, key: PRNGKeyArray) -> World:
         """The world of this key. Raises WorldError where the configuration puts something on a wall."""
         config = self.config
         (rng,) = host_generators(key, 1)

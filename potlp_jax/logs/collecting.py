@@ -4,6 +4,8 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from potlp_jax.environments.ros.places import Places
 from potlp_jax.errors import DatasetError, LogError
 from potlp_jax.learning.dataset import DatasetMetadata, finished_shards, write_shard
@@ -19,7 +21,7 @@ from potlp_jax.learning.recording import (
 from potlp_jax.learning.sample_weights import WeightBounds
 from potlp_jax.logs.drive import Drive, Eyes
 from potlp_jax.trials.loop import versions
-from potlp_jax.trials.robot import DIAGONAL
+from potlp_jax.world.moves import step_lengths
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -31,13 +33,10 @@ class LogCollectConfig(RecordingConfig):
 
 def poses_of(drive: Drive) -> Iterator[Pose]:
     """The poses of a drive at which there is a picture."""
-    travelled = 0.0
+    travelled = np.cumsum([0.0, *step_lengths(drive.path)]).tolist()
     for step, cell in enumerate(drive.path):
-        if step:
-            before = drive.path[step - 1]
-            travelled += DIAGONAL if before[0] != cell[0] and before[1] != cell[1] else 1.0
         if step in drive.pictures:
-            yield Pose(belief=drive.belief_at(step), cell=cell, step=step, travelled=travelled)
+            yield Pose(belief=drive.belief_at(step), cell=cell, step=step, travelled=travelled[step])
 
 
 def collect_drives(

@@ -20,13 +20,14 @@ from potlp_jax.environments.ros.places import Places, place_letters
 from potlp_jax.errors import LogError
 from potlp_jax.logs.log import Log, MapMessage, Picture
 from potlp_jax.logs.pictures import match_pictures, vertical_field
-from potlp_jax.logs.poses import Cell, drive_path, read_poses
+from potlp_jax.logs.poses import drive_path, read_poses
 from potlp_jax.logs.working_grid import NEVER, GridConfig, WorkingGrid
 from potlp_jax.trials.record import NEVER_SEEN, belief_seen_by
 from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.equirectangular import from_equirectangular
 from potlp_jax.world.frontiers import FrontierConfig, frontier_cells
 from potlp_jax.world.grid import BeliefMap, World, make_world
+from potlp_jax.world.moves import Cell
 
 CORRECTED_SHARE = 0.02
 """Share of a map's known pixels that are otherwise in the final map, above which it is worth a note."""

@@ -8,8 +8,9 @@ from jaxtyping import Float64, Int64
 from potlp_jax.environments.ros.map_files import GridFrame
 from potlp_jax.errors import LogError
 from potlp_jax.logs.log import SECOND, Log, Picture
-from potlp_jax.logs.poses import Cell, Poses
+from potlp_jax.logs.poses import Poses
 from potlp_jax.logs.transforms import headings
+from potlp_jax.world.moves import Cell
 
 _OPTICAL = ("_optical", "_optical_frame")
 

@@ -2,7 +2,6 @@
 
 import heapq
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +12,7 @@ from potlp_jax.environments.ros.places import component_labels
 from potlp_jax.errors import LogError
 from potlp_jax.logs.log import SECOND, Log
 from potlp_jax.logs.working_grid import WorkingGrid
-
-Cell = tuple[int, int]
+from potlp_jax.world.moves import Cell, legal_moves
 
 FARTHEST_SNAP = 2.0
 """Cells, beyond the robot's radius, from the nearest free cell at which a pose still counts as being in it."""
@@ -112,7 +110,7 @@ def _way(free: Bool[np.ndarray, "H W"], start: Cell, goal: Cell) -> list[Cell]:
         _, cell = heapq.heappop(queue)
         if cell == goal:
             break
-        for there, length in _moves(free, cell):
+        for there, length in legal_moves(free, cell):
             cost = best[cell] + length
             if cost < best.get(there, math.inf):
                 best[there], came_from[there] = cost, cell
@@ -121,13 +119,3 @@ def _way(free: Bool[np.ndarray, "H W"], start: Cell, goal: Cell) -> list[Cell]:
     while way[-1] != start:
         way.append(came_from[way[-1]])
     return way[-2::-1]
-
-
-def _moves(free: Bool[np.ndarray, "H W"], cell: Cell) -> Iterator[tuple[Cell, float]]:
-    """Neighbours, and how far they are. The outermost cells are never free."""
-    row, column = cell
-    for down in (-1, 0, 1):
-        for right in (-1, 0, 1):
-            open_sides = free[row + down, column] and free[row, column + right]
-            if (down or right) and free[row + down, column + right] and open_sides:
-                yield (row + down, column + right), math.hypot(down, right)

@@ -25,10 +25,11 @@ from potlp_jax.logs.log import FIXED_TOPIC, IMAGE_TYPE, MAP_TYPE, ODOMETRY_TYPE,
 from potlp_jax.logs.transforms import Quaternion, quaternion_of
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import Trial, belief_seen_by
-from potlp_jax.trials.robot import DIAGONAL, photograph
+from potlp_jax.trials.robot import photograph
 from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.equirectangular import to_equirectangular
 from potlp_jax.world.grid import BeliefMap, World
+from potlp_jax.world.moves import step_lengths
 
 SECONDS_A_CELL = 0.4
 START = 1_600_000_000 * SECOND
@@ -92,13 +93,12 @@ def write_drive(
         raise LogError(f"{out} exists already: choose another name")
     out.parent.mkdir(parents=True, exist_ok=True)
     frame, turns = frame_of(world), _headings(path)
-    travelled, count = 0.0, 0
+    travelled = np.cumsum([0.0, *step_lengths(path)])
+    count = 0
     with _Recorder(out, kind) as recorder:
         recorder.transforms(FIXED_TOPIC, START, [("base_link", "panorama", (0.0, 0.0, 0.0), quaternion_of(0.0))])
         for step, cell in enumerate(path):
-            if step:
-                travelled += DIAGONAL if cell[0] != path[step - 1][0] and cell[1] != path[step - 1][1] else 1.0
-            time = START + round(travelled * SECONDS_A_CELL * SECOND)
+            time = START + round(travelled[step] * SECONDS_A_CELL * SECOND)
             recorder.map(time, frame, belief_seen_by(world, first_seen, step))
             x, y = frame.cell_to_metres(*cell)
             # Odometry begins where the robot starts, looking ahead.

@@ -263,7 +263,7 @@ def _finish_or_frontier(situation: Situation, config: DecisionConfig) -> Move:
     kind = jnp.where(finishes, MoveKind.FINISH, jnp.where(jnp.isfinite(value), MoveKind.FRONTIER, MoveKind.NONE))
     target_cell = jnp.where(finishes, situation.finish_cell, frontier_cell)
     target_state = jnp.where(finishes, situation.finish_state, frontier_state)
-    return _move(situation, config, kind, target_cell, target_state, value)
+    return move_to(situation, config, kind, target_cell, target_state, value)
 
 
 def search_move(
@@ -301,7 +301,7 @@ def planned_move(
     target_state = jnp.where(acts, plan.from_state, frontier_state)
     target_state = jnp.where(finishes, situation.finish_state, target_state)
     status = plan.status | status_if(falls_back, Status.FALLBACK)
-    return _move(
+    return move_to(
         situation,
         config,
         kind,
@@ -377,7 +377,7 @@ def _nearest_frontier(situation: Situation) -> tuple[Int32[Array, "2"], Int32[Ar
     return cell, state, jnp.min(cost)
 
 
-def _move(
+def move_to(
     situation: Situation,
     config: DecisionConfig,
     kind: Int32[Array, ""],
@@ -389,6 +389,20 @@ def _move(
     intention: Intention | None = None,
     status: UInt32[Array, ""] | None = None,
 ) -> Move:
+    """The move of a given kind to a product state of known space; where the kind is NONE, the robot stays.
+
+    Args:
+        situation: known space, assessed from the robot's product state.
+        config: ``path_horizon`` is what matters here.
+        kind: one of ``MoveKind``.
+        target_cell, target_state: where the path leads.
+        value: the expected cost, for the record.
+        action, search, intention: what a searching policy adds.
+        status: bits to add to those of the subgoals.
+
+    Returns:
+        The move; its path has length 0 where the target is out of reach.
+    """
     goes = kind != MoveKind.NONE
     cell = jnp.where(goes, target_cell, situation.cell).astype(jnp.int32)
     state = jnp.where(goes, target_state, situation.state).astype(jnp.int32)

@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Array, Int32, PRNGKeyArray, UInt8
 
 from potlp_jax.cache import enable_compilation_cache
-from potlp_jax.codec import json_copy, with_settings
-from potlp_jax.environments import Generator
+from potlp_jax.codec import json_copy
+from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import DatasetError
 from potlp_jax.learning.dataset import (
@@ -44,7 +44,7 @@ from potlp_jax.learning.recording import (
 )
 from potlp_jax.learning.sample_weights import WeightBounds
 from potlp_jax.recipes.exploration import Explorer, ExplorerConfig
-from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.config import trial_config_for
 from potlp_jax.trials.loop import versions
 from potlp_jax.world.camera import Disturbance, disturb
 from potlp_jax.world.grid import World
@@ -89,7 +89,7 @@ class _Job:
 
 def collection_of(generator: Generator) -> CollectConfig:
     """What to record in worlds of a family: subgoals as its trials have them, and never the formulas it holds out."""
-    frontiers = with_settings(TrialConfig(), generator.settings).decision.frontiers
+    frontiers = trial_config_for(generator).decision.frontiers
     return CollectConfig(
         frontiers=frontiers,
         explorer=ExplorerConfig(frontiers=frontiers),

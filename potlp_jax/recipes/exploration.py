@@ -18,16 +18,14 @@ from jaxtyping import Array, Int32
 from potlp_jax.learning.questions import LARGEST
 from potlp_jax.learning.recording import Pose
 from potlp_jax.planning.distances.paths import KnownPath, shortest_path
-from potlp_jax.planning.distances.sweeping import DIAGONAL
 from potlp_jax.planning.policies import Situation, assess
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.robot import SimulatedRobot, Stop
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import BeliefMap, World
+from potlp_jax.world.moves import Cell, path_length
 from potlp_jax.world.sensing import SensorConfig
-
-Cell = tuple[int, int]
 
 _HORIZON = 24
 """Moves before the next pose at most, so that there are poses along a way on which nothing new is seen."""
@@ -87,7 +85,7 @@ class Explorer:
             letters = np.asarray(self._robot.observe()[0].letters)
             self._read([int(letters[entered]) for entered in cells])
             step += len(cells)
-            travelled += _length([cell, *cells])
+            travelled += path_length([cell, *cells])
 
     def _take_task(self, letter: int) -> None:
         """A task that is not decided where the robot stands."""
@@ -161,11 +159,6 @@ def _path(situation: Situation, target: Int32[Array, "2"], target_state: Int32[A
 
 def _ends_at(path: KnownPath, target: Cell) -> bool:
     return _cell(np.asarray(path.cells)[int(path.length)]) == target
-
-
-def _length(cells: Sequence[Cell]) -> float:
-    steps = np.abs(np.diff(np.array(cells), axis=0)).sum(axis=1)
-    return float(np.where(steps == 2, DIAGONAL, 1.0).sum())
 
 
 def _cell(cell) -> Cell:

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from potlp_jax.codec import read_settings, settings_file, with_settings
-from potlp_jax.environments import make
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
 from potlp_jax.errors import ConfigurationError
 from potlp_jax.learning.dataset import read_dataset

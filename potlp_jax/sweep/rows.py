@@ -9,13 +9,13 @@ import jax
 import numpy as np
 from jaxtyping import Int32, PRNGKeyArray
 
-from potlp_jax.planning.distances.sweeping import NEIGHBOURS
 from potlp_jax.sweep.specification import configuration_hash
 from potlp_jax.sweep.store import Item, Row
 from potlp_jax.trials.batch import Finished
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import Trial
 from potlp_jax.world.grid import World
+from potlp_jax.world.moves import NEIGHBOURS
 
 
 def trial_row(item: Item, trial: Trial, key: PRNGKeyArray, config: TrialConfig, seconds: float) -> Row:
@@ -66,7 +66,7 @@ def trial_budget(world: World, factor: float) -> float:
 
 
 def path_text(path: Int32[np.ndarray, "steps 2"]) -> str:
-    """A path as text: its first cell, and one digit for each move, by its place in ``sweeps.NEIGHBOURS``."""
+    """A path as text: its first cell, and one digit for each move, by its place in ``world.moves.NEIGHBOURS``."""
     numbers = {move: str(number) for number, move in enumerate(NEIGHBOURS)}
     moves = np.diff(path, axis=0).tolist()
     return f"{path[0, 0]},{path[0, 1]}:" + "".join(numbers[row, column] for row, column in moves)

@@ -17,7 +17,8 @@ from pathlib import Path
 
 import jax
 
-from potlp_jax.environments import Generator, make
+from potlp_jax.environments.base import Generator
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, world_key
 from potlp_jax.errors import WorldError
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, read_estimator

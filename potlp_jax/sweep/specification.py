@@ -22,12 +22,12 @@ from pathlib import Path
 from typing import Any
 
 from potlp_jax.codec import config_from_dict, json_copy, read_settings, settings_file, with_settings
-from potlp_jax.environments import make
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
 from potlp_jax.errors import SpecificationError, WorldError
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
-from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.config import TrialConfig, trial_config_for
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,7 +195,7 @@ def _formula(environment: str, task: Any, where: str) -> str:
 
 def _common_config(environments: Sequence[str], where: str) -> TrialConfig:
     """What all environments call for."""
-    configs = {name: with_settings(TrialConfig(), make(name).settings) for name in environments}
+    configs = {name: trial_config_for(make(name)) for name in environments}
     first = configs[environments[0]]
     for name, config in configs.items():
         if config != first:

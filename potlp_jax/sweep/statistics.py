@@ -22,10 +22,10 @@ BASELINE = "baseline"
 KNOWN_MAP = "known-map"
 SATISFIED = "satisfied"
 
-LOSSES: Status = Status.SUBGOAL_OVERFLOW | Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW | Status.NOT_CONVERGED
+LOSSES: Status = Status.SUBGOAL_OVERFLOW | Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW
 """Status bits by which a fixed-size array or loop took something away from a trial; they are counted."""
 
-UNRELIABLE: Status = Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW | Status.NOT_CONVERGED
+UNRELIABLE: Status = Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW
 """Losses after which a trial is not what its planner would have done. It is never averaged in. (That only the nearest
 subgoals are kept is part of the model, docs/model.md section 6.)"""
 

@@ -176,7 +176,7 @@ def step(scene: Scene, params: Params | None, rules: Rules, progress: Progress) 
 
     def act(progress: Progress, scene: Scene, *thoughts: Any) -> Progress:
         move = _phase(progress.running, partial(planned_move, config=decision), *thoughts, progress.intention)
-        return _advance(rules, progress, scene, move)
+        return advance(rules, progress, scene, move)
 
     return _each(act, dataclasses.replace(progress, views=views), scene, situation, problem, plans)
 
@@ -223,7 +223,7 @@ def _decide_directly(rules: Rules, progress: Progress, scene: Scene) -> Progress
         lambda situation: direct_move(situation, rules.policy, rules.config.decision),
         situation,
     )
-    return _advance(rules, progress, scene, move)
+    return advance(rules, progress, scene, move)
 
 
 def _assess(rules: Rules, progress: Progress, scene: Scene) -> Situation:
@@ -274,7 +274,7 @@ def _estimator(rules: Rules, params: Params | None, views: Views | None, scene: 
     return NetworkEstimator(params=params, views=views, config=rules.network)
 
 
-def _advance(rules: Rules, progress: Progress, scene: Scene, move: Move) -> Progress:
+def advance(rules: Rules, progress: Progress, scene: Scene, move: Move) -> Progress:
     """Follow the move's path until the next decision is due, and see whether the trial ends there."""
     config = rules.config
     stop = Stop(

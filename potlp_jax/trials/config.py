@@ -2,8 +2,11 @@
 
 import dataclasses
 
+from potlp_jax.codec import with_settings
+from potlp_jax.environments.base import Generator
 from potlp_jax.planning.policies import DecisionConfig
 from potlp_jax.world.camera import CameraConfig, Disturbance
+from potlp_jax.world.grid import World
 from potlp_jax.world.sensing import SensorConfig
 
 
@@ -22,3 +25,8 @@ class TrialConfig:
     replan_distance: float = 4.0
     budget_factor: float = 20.0
     revealed: bool = False
+
+
+def trial_config_for(source: World | Generator) -> TrialConfig:
+    """What trials in a world, or in the worlds of a family, call for."""
+    return with_settings(TrialConfig(), source.settings)

@@ -20,7 +20,7 @@ from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.history import ActionTerms
 from potlp_jax.planning.policies import Move, MoveKind, Policy, decide
 from potlp_jax.task.task import Task, TaskArrays
-from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.config import TrialConfig, trial_config_for
 from potlp_jax.trials.record import ActionRecord, Decision, Outcome, Trial
 from potlp_jax.trials.robot import DIAGONAL, Robot, SimulatedRobot, Stop, as_cell
 from potlp_jax.types import NO_ACTION
@@ -44,6 +44,8 @@ def run_trial(
 ) -> Trial:
     """One trial of ``policy`` in ``world``, from its start to acceptance or failure.
 
+    Without ``config`` the settings are those that the world calls for (``World.settings``).
+
     ``key`` drives the planner's search and the camera's disturbance; the same arguments give the same trial. ``arrays``
     are the task's device arrays where they shall be padded (default: ``task.arrays``). ``environment`` and ``seed`` go
     into the record. ``estimator`` is for the policy ``potlp``; by default the shipped one for the task's propositions.
@@ -52,7 +54,7 @@ def run_trial(
         CheckpointError: the estimator knows other propositions than the task, or none is shipped for them.
     """
     policy = Policy(policy)
-    config = TrialConfig() if config is None else config
+    config = trial_config_for(world) if config is None else config
     if policy is Policy.KNOWN_MAP:
         config = dataclasses.replace(config, revealed=True)
     robot = SimulatedRobot(world, config, sensing_key(key))

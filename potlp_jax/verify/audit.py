@@ -1,115 +1,171 @@
-"""Check a finished trial against the truth, independently of the planner.
+"""Check a finished trial against the truth, independently of the planner: also that of a planner of one's own.
 
-The word is judged by ``potlp_jax.verify.semantics``, an evaluator of the formula's semantics that shares no code
-with the library; moves, letters, cost and what was observed when are checked against the world.
+The word is judged by ``potlp_jax.verify.semantics``, an evaluator of the formula's semantics; moves, letters, cost and
+what was observed when are checked against the world by rules of this file alone. Nothing of how the library plans,
+moves or simulates is used: a mistake made there is not made here again.
 """
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
+from jaxtyping import Int32
 
-from potlp_jax.sweep.rows import read_path
-from potlp_jax.sweep.store import Row
 from potlp_jax.task.task import Task
 from potlp_jax.trials.record import NEVER_SEEN, Outcome, Trial
 from potlp_jax.verify.semantics import word_satisfies, word_violates
 from potlp_jax.world.grid import World
-from tests.reference.dijkstra import grid_moves
+
+Cell = tuple[int, int]
+Node = tuple[Cell, int]
+"""A cell and a state of the automaton."""
+
+Cells = list[list[bool]]
+"""Rows of a map; True where a cell is free."""
+
+# Costs are sums of float64 on both sides, in another order: only rounding may differ.
+_TOLERANCE = 1e-9
 
 
 def problems_of(trial: Trial, task: Task) -> list[str]:
-    """What is wrong with a trial; empty if nothing. Not ending satisfied is wrong where section 7 of docs/model.md promises it."""
-    found = [*_moves(trial), *_observation(trial), *_word(trial, task)]
+    """What is wrong with a trial in simulation; an empty list if nothing is.
+
+    Checks the path, the cost and the outcome as ``problems_of_path`` does, that the recorded word is the path's, that
+    no cell was entered before it had been observed, and that the trial ended satisfied where docs/model.md section 7
+    promises it.
+    """
+    word = _word_of(trial.world, trial.path)
+    found = problems_of_path(trial.world, trial.path, trial.cost, trial.outcome, task.text, task.propositions)
+    if list(trial.word) != word:
+        found.append("the word is not that of the path")
+    found += _entered_before_observed(trial)
     if trial.outcome is not Outcome.SATISFIED and satisfaction_is_promised(trial, task):
         found.append(f"ended {trial.outcome} although acceptance stays within reach of every state")
     return found
 
 
-def _moves(trial: Trial) -> list[str]:
-    cost = path_cost(trial.world, trial.path)
-    if cost is None:
-        return ["illegal move"]
-    return [] if math.isclose(cost, trial.cost, rel_tol=1e-9, abs_tol=1e-9) else [f"cost {trial.cost}, moves {cost}"]
+def problems_of_path(
+    world: World,
+    path: Sequence[Cell] | Int32[np.ndarray, "steps 2"],
+    cost: float,
+    outcome: str,
+    formula: str,
+    propositions: Sequence[str],
+) -> list[str]:
+    """What is wrong with a path that some planner took; an empty list if nothing is.
+
+    Args:
+        world: the true map.
+        path: cells entered in order, the start first.
+        cost: what the planner says that the path costs, in the unit of the world's resolution.
+        outcome: how the planner says that the trial ended; ``"satisfied"`` is the value that matters.
+        formula: the task, co-safe linear temporal logic.
+        propositions: names of the bits of the world's letters.
+
+    Returns:
+        One sentence for each problem. One about a violation of the task begins with ``violates``.
+    """
+    cells = [(int(row), int(column)) for row, column in np.asarray(path)]
+    found = []
+    true_cost = path_cost(world, cells)
+    if true_cost is None:
+        found.append("illegal move")
+    elif not math.isclose(true_cost, cost, rel_tol=_TOLERANCE, abs_tol=_TOLERANCE):
+        found.append(f"the cost is said to be {cost}, the moves cost {true_cost}")
+    word = _word_of(world, cells)
+    if word_satisfies(formula, propositions, word) != (outcome == Outcome.SATISFIED):
+        found.append(f"outcome {outcome} is not what the word says")
+    # A start that violates is nobody's move.
+    if len(word) > 1 and word_violates(formula, propositions, word):
+        found.append("violates the formula")
+    return found
 
 
-def problems_of_row(row: Row, world: World, propositions: Sequence[str]) -> list[str]:
-    """What is wrong with a trial of a sweep: its moves, its cost, its word. A violation begins with 'violates'."""
-    path, problems = read_path(row.path), []
-    cost = path_cost(world, [(int(row), int(column)) for row, column in path])
-    if cost is None or abs(cost - row.cost) > 1e-6 * max(cost, 1.0):
-        problems.append(f"moves of {row.item}: they cost {cost}, the row says {row.cost}")
-    word = np.asarray(world.letters)[path[:, 0], path[:, 1]].tolist()
-    if word_satisfies(row.item.task, propositions, word) != (row.outcome == Outcome.SATISFIED):
-        problems.append(f"outcome of {row.item}: {row.outcome} is not what the word says")
-    if len(word) > 1 and word_violates(row.item.task, propositions, word):
-        problems.append(f"violates: {row.item}")
-    return problems
-
-
-def path_cost(world: World, path: Sequence[tuple[int, int]]) -> float | None:
-    """What the moves of a path cost, None where one of them does not exist in the world."""
-    free = (~np.asarray(world.occupied)).tolist()
+def path_cost(world: World, path: Sequence[Cell]) -> float | None:
+    """What the moves of a path cost, in the unit of the resolution; None where one of them does not exist."""
+    free = _free(world)
     cost = 0.0
     for before, after in pairwise(path):
-        step = dict(grid_moves(free, before)).get(after)
-        if step is None or not free[after[0]][after[1]]:
+        length = dict(_moves(free, before)).get(after)
+        if length is None:
             return None
-        cost += step
+        cost += length
     return cost * float(world.resolution)
-
-
-def _observation(trial: Trial) -> list[str]:
-    seen = trial.first_seen
-    for step, cell in enumerate(trial.path[1:], start=1):
-        if seen[cell] == NEVER_SEEN or seen[cell] >= step:
-            return [f"step {step} enters {cell}, first seen at step {seen[cell]}"]
-    return []
-
-
-def _word(trial: Trial, task: Task) -> list[str]:
-    letters = np.asarray(trial.world.letters)
-    if list(trial.word) != [int(letters[cell]) for cell in trial.path]:
-        return ["the word is not that of the path"]
-    satisfied = word_satisfies(task.text, task.propositions, trial.word)
-    if satisfied != (trial.outcome is Outcome.SATISFIED):
-        return [f"outcome {trial.outcome}, but the word {'satisfies' if satisfied else 'does not satisfy'} the formula"]
-    # A start that violates is nobody's move.
-    if len(trial.word) > 1 and word_violates(task.text, task.propositions, trial.word):
-        return ["the word violates the formula"]
-    return []
 
 
 def satisfaction_is_promised(trial: Trial, task: Task) -> bool:
     """Whether acceptance stays within reach of every live product state that the robot can reach in the true world."""
     dfa = task.dfa
-    free, letters = (~np.asarray(trial.world.occupied)).tolist(), np.asarray(trial.world.letters).tolist()
     start = trial.path[0]
+    letters = np.asarray(trial.world.letters).tolist()
     first = (start, int(dfa.transitions[dfa.initial, letters[start[0]][start[1]]]))
-    reached, backward = {first}, {}
+    if dfa.trap[first[1]]:
+        return False
+    came_from = _explore(_free(trial.world), letters, task, first)
+    winning = {node for node in came_from if dfa.accepting[node[1]]}
+    # Backwards from acceptance: whatever can get there.
+    queue = deque(winning)
+    while queue:
+        for node in came_from[queue.popleft()]:
+            if node not in winning:
+                winning.add(node)
+                queue.append(node)
+    return len(winning) == len(came_from)
+
+
+def _explore(free: Cells, letters: list[list[int]], task: Task, first: Node) -> Mapping[Node, list[Node]]:
+    """Every product state that can be reached without entering a trap, with those from which it is entered."""
+    dfa = task.dfa
+    came_from: dict[Node, list[Node]] = {first: []}
     queue = deque([first])
     while queue:
         node = queue.popleft()
+        # After acceptance there is nothing left to do.
         if dfa.accepting[node[1]]:
             continue
-        for cell, _ in grid_moves(free, node[0]):
-            if not free[cell[0]][cell[1]]:
-                continue
+        for cell, _ in _moves(free, node[0]):
             state = int(dfa.transitions[node[1], letters[cell[0]][cell[1]]])
             if dfa.trap[state]:
                 continue
             following = (cell, state)
-            backward.setdefault(following, []).append(node)
-            if following not in reached:
-                reached.add(following)
+            if following not in came_from:
+                came_from[following] = []
                 queue.append(following)
-    winning = {node for node in reached if dfa.accepting[node[1]]}
-    queue = deque(winning)
-    while queue:
-        for node in backward.get(queue.popleft(), ()):
-            if node not in winning:
-                winning.add(node)
-                queue.append(node)
-    return len(winning) == len(reached) and not dfa.trap[first[1]]
+            came_from[following].append(node)
+    return came_from
+
+
+def _moves(free: Cells, cell: Cell) -> Iterator[tuple[Cell, float]]:
+    """Free cells that one move enters, and its length: 8-connected, and a diagonal move needs both sides free.
+
+    Written here again on purpose: the planner's own rule (``world.moves``) is what is to be checked.
+    """
+    row, column = cell
+    for i in range(max(row - 1, 0), min(row + 2, len(free))):
+        for j in range(max(column - 1, 0), min(column + 2, len(free[0]))):
+            is_diagonal = i != row and j != column
+            if (i, j) == cell or not free[i][j]:
+                continue
+            if is_diagonal and not (free[row][j] and free[i][column]):
+                continue
+            yield (i, j), math.sqrt(2.0) if is_diagonal else 1.0
+
+
+def _free(world: World) -> Cells:
+    return (~np.asarray(world.occupied)).tolist()
+
+
+def _word_of(world: World, path: Sequence[Cell]) -> list[int]:
+    letters = np.asarray(world.letters)
+    return [int(letters[cell]) for cell in path]
+
+
+def _entered_before_observed(trial: Trial) -> list[str]:
+    """The first step that enters a cell which had not been observed before that step."""
+    seen = trial.first_seen
+    for step, cell in enumerate(trial.path[1:], start=1):
+        if seen[cell] == NEVER_SEEN or seen[cell] >= step:
+            return [f"step {step} enters {cell}, first seen at step {seen[cell]}"]
+    return []

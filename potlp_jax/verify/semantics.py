@@ -1,31 +1,53 @@
-"""Semantics of linear temporal logic, written from its definition: no Spot, no automata, nothing of the library.
+"""Semantics of linear temporal logic, written from its definition: no Spot, no automata, nothing of the planner.
 
 * ``satisfies_lasso`` evaluates any LTL formula on an infinite word ``prefix . loop . loop . ...``, exactly.
-* ``word_satisfies`` and ``word_violates`` tell whether a finite word has settled a co-safe formula, whatever follows.
+* ``word_satisfies`` and ``word_violates`` tell whether a finite word decides a co-safe formula, whatever follows.
 
 Syntax: ``! & | -> <-> xor ^ X F G U R V W M true false 1 0 [] <>``, also ``&& || => <=>``, names, "quoted names" and
 parentheses. ``U R V W M`` and ``->`` associate to the right and bind as in Spot: from weak to strong
 ``-> <->``, ``xor``, ``|``, ``&``, ``U R W M``, ``X F G !``.
 
 A letter is an integer whose bit i is set where ``propositions[i]`` is true.
+
+Written to be checked by eye, not to be fast: a formula is nested tuples, an infinite word is a finite graph, and what a
+finite word leaves to do is a set of sets of formulas.
+
+References:
+  Baier and Katoen, Principles of Model Checking, 2008, section 5.1 (semantics, expansion laws, negation normal form).
 """
 
 import re
 from collections.abc import Sequence
 from functools import cache
 
+from potlp_jax.errors import TaskError
+
 Formula = tuple
 """Nested tuples: ("true",), ("false",), ("name", p), ("not", f), ("X", f), ("and", f, g), ("U", f, g), ..."""
 
+# Longer operators stand before their own beginnings, such as "<->" before "<>".
 _TOKEN = re.compile(r'\s*("(?:[^"\\]|\\.)*"|<->|<=>|->|=>|\[\]|<>|&&|\|\||[!&|^()01]|[A-Za-z_][A-Za-z0-9_.]*)')
 _ALIASES = {"&&": "&", "||": "|", "=>": "->", "<=>": "<->", "[]": "G", "<>": "F", "^": "xor", "V": "R"}
 _CONSTANTS = {"1": ("true",), "true": ("true",), "0": ("false",), "false": ("false",)}
 
 
 def satisfies_lasso(formula: str, propositions: Sequence[str], prefix: Sequence[int], loop: Sequence[int]) -> bool:
-    """Whether the infinite word ``prefix . loop^omega`` satisfies the formula (LTL with any operators)."""
+    """Whether the infinite word ``prefix . loop . loop . ...`` satisfies the formula (LTL with any operators).
+
+    Args:
+        formula: linear temporal logic.
+        propositions: names of the bits of a letter; the formula's names are among them.
+        prefix: letters that are read once; may be empty.
+        loop: letters that are read for ever after; not empty.
+
+    Returns:
+        Whether the word satisfies the formula.
+
+    Raises:
+        TaskError: the formula cannot be read, or the loop is empty.
+    """
     if not loop:
-        raise ValueError("the loop of a lasso needs a letter")
+        raise TaskError("the loop of an infinite word is empty: give at least one letter that repeats")
     letters = [*prefix, *loop]
     successor = [*range(1, len(letters)), len(prefix)]
     bit = {name: i for i, name in enumerate(propositions)}
@@ -35,14 +57,37 @@ def satisfies_lasso(formula: str, propositions: Sequence[str], prefix: Sequence[
 def word_satisfies(formula: str, propositions: Sequence[str], word: Sequence[int]) -> bool:
     """Whether every infinite continuation of the finite word satisfies the co-safe formula (a good prefix).
 
-    Exact: what is left to do after the word, as a positive combination of obligations, has finitely many successors;
-    the word is good if no infinite sequence of them avoids "nothing left to do".
+    Exact: what remains to be done after the word, as a positive combination of obligations, has finitely many
+    successors; the word is good if no infinite sequence of them avoids "nothing remains".
+
+    Args:
+        formula: co-safe linear temporal logic.
+        propositions: names of the bits of a letter; the formula's names are among them.
+        word: letters read so far.
+
+    Returns:
+        Whether the task is accomplished.
+
+    Raises:
+        TaskError: the formula cannot be read or is not co-safe.
     """
     return _always_reaches_done(_after(formula, tuple(propositions), word), _own_letters(formula, tuple(propositions)))
 
 
 def word_violates(formula: str, propositions: Sequence[str], word: Sequence[int]) -> bool:
-    """Whether no continuation of the finite word satisfies the co-safe formula (a bad prefix). Exact."""
+    """Whether no continuation of the finite word satisfies the co-safe formula (a bad prefix). Exact.
+
+    Args:
+        formula: co-safe linear temporal logic.
+        propositions: names of the bits of a letter; the formula's names are among them.
+        word: letters read so far.
+
+    Returns:
+        Whether the task can no longer be accomplished.
+
+    Raises:
+        TaskError: the formula cannot be read or is not co-safe.
+    """
     return not _can_reach_done(_after(formula, tuple(propositions), word), _own_letters(formula, tuple(propositions)))
 
 
@@ -50,21 +95,32 @@ def word_violates(formula: str, propositions: Sequence[str], word: Sequence[int]
 
 
 class _Parser:
-    def __init__(self, text: str):
-        self.tokens = []
+    """Recursive descent: one method per level of precedence, weakest first; ``""`` ends the tokens."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        tokens: list[str] = []
         position = 0
         while text[position:].strip():
             match = _TOKEN.match(text, position)
-            assert match, f"cannot read {text[position:]!r}"
-            self.tokens += _split_operators(match.group(1))
+            if match is None:
+                raise TaskError(f"formula {text!r}: cannot read {text[position:]!r}")
+            tokens += _split_operators(match.group(1))
             position = match.end()
-        self.tokens = [_ALIASES.get(token, token) for token in self.tokens] + [""]
+        self.tokens = [_ALIASES.get(token, token) for token in tokens] + [""]
+
+    def whole(self) -> Formula:
+        parsed = self.formula()
+        if self.tokens != [""]:
+            raise TaskError(f"formula {self.text!r}: cannot read {' '.join(self.tokens)!r} after its end")
+        return parsed
 
     def take(self, *texts: str) -> str | None:
         return self.tokens.pop(0) if self.tokens[0] in texts else None
 
     def formula(self) -> Formula:
         left = self.exclusive()
+        # Recursion on the right-hand side alone makes an operator associate to the right.
         if operator := self.take("->", "<->"):
             return (operator, left, self.formula())
         return left
@@ -100,10 +156,12 @@ class _Parser:
             return (operator, self.unary())
         if self.take("("):
             inner = self.formula()
-            assert self.take(")"), "missing ')'"
+            if not self.take(")"):
+                raise TaskError(f"formula {self.text!r}: ')' is missing before {self.tokens[0]!r}")
             return inner
         token = self.tokens.pop(0)
-        assert token not in ("", ")", "&", "|"), f"expected a formula, found {token!r}"
+        if not re.match(r'["A-Za-z_01]', token):
+            raise TaskError(f"formula {self.text!r}: expected a formula, found {token or 'its end'!r}")
         if token in _CONSTANTS:
             return _CONSTANTS[token]
         return ("name", re.sub(r"\\(.)", r"\1", token[1:-1]) if token.startswith('"') else token)
@@ -118,16 +176,16 @@ def _split_operators(token: str) -> list[str]:
 
 def _normal_form(text: str) -> Formula:
     """Parsed, and rewritten to true, false, literals, and, or, X, U, R."""
-    parser = _Parser(text)
-    parsed = parser.formula()
-    assert parser.tokens == [""], f"trailing {parser.tokens}"
-    return _push_negation(parsed, True)
+    return _push_negation(_Parser(text).whole(), True)
 
 
 def _push_negation(f: Formula, positive: bool) -> Formula:
+    """``f``, or its negation where not ``positive``, with negations in front of names alone."""
+
     def same(g: Formula) -> Formula:
         return _push_negation(g, positive)
 
+    # De Morgan and the dualities of U and R: below a negation each operator becomes its dual.
     true, false = (("true",), ("false",)) if positive else (("false",), ("true",))
     conjunction, disjunction = ("and", "or") if positive else ("or", "and")
     until, release = ("U", "R") if positive else ("R", "U")
@@ -172,7 +230,7 @@ def _push_negation(f: Formula, positive: bool) -> Formula:
 
 
 def _truth(f: Formula, bit: dict[str, int], letters: list[int], successor: list[int]) -> list[bool]:
-    """Truth at each position of a lasso."""
+    """Truth at each position of a lasso: ``successor`` leads from the last position back into the loop."""
     positions = range(len(letters))
     match f:
         case ("true",) | ("false",):
@@ -190,12 +248,14 @@ def _truth(f: Formula, bit: dict[str, int], letters: list[int], successor: list[
             return [a and b for a, b in zip(left, right, strict=True)]
         case "or":
             return [a or b for a, b in zip(left, right, strict=True)]
-        case "U":  # least solution of u = right | (left & next u)
+        # Until and release are the least and the greatest solution of their expansion laws. Each round settles at
+        # least one more position, so that as many rounds as there are positions suffice.
+        case "U":  # u = right | (left & next u)
             truth = [False] * len(letters)
             for _ in positions:
                 truth = [right[i] or (left[i] and truth[successor[i]]) for i in positions]
             return truth
-        case "R":  # greatest solution of r = right & (left | next r)
+        case "R":  # r = right & (left | next r)
             truth = [True] * len(letters)
             for _ in positions:
                 truth = [right[i] and (left[i] or truth[successor[i]]) for i in positions]
@@ -203,8 +263,8 @@ def _truth(f: Formula, bit: dict[str, int], letters: list[int], successor: list[
     raise AssertionError(f)
 
 
-# Finite words. What is left to do is a disjunction of sets of obligations (formulas that the rest of the word must
-# satisfy), kept free of sets that contain another one: {} is false, {{}} is "nothing left to do".
+# Finite words. What remains to be done is a disjunction of sets of obligations (formulas that the rest of the word must
+# satisfy), kept free of sets that contain another one: {} is false, {{}} is "nothing remains".
 
 Rest = frozenset
 _DONE: Rest = frozenset({frozenset()})
@@ -225,7 +285,7 @@ def _both(a: Rest, b: Rest) -> Rest:
 
 @cache
 def _read(f: Formula, letter: frozenset[str]) -> Rest:
-    """What is left of a formula after a letter (the set of propositions that hold)."""
+    """What remains of a formula after a letter (the set of propositions that hold): its expansion law, one step."""
     match f:
         case ("true",):
             return _DONE
@@ -243,11 +303,13 @@ def _read(f: Formula, letter: frozenset[str]) -> Rest:
             return _any_of(_read(g, letter), _read(h, letter))
         case ("U", g, h):
             return _any_of(_read(h, letter), _both(_read(g, letter), frozenset({frozenset({f})})))
-    raise ValueError(f"{f} is not co-safe")
+    # Release is what only an infinite word can satisfy.
+    raise TaskError(f"{f} is not co-safe: no finite word decides it")
 
 
 @cache
 def _step(rest: Rest, letter: frozenset[str]) -> Rest:
+    """What remains after one more letter."""
     result = _HOPELESS
     for obligations in rest:
         alternative = _DONE
@@ -263,6 +325,7 @@ def _parsed(formula: str) -> Formula:
 
 
 def _after(formula: str, propositions: tuple[str, ...], word: Sequence[int]) -> Rest:
+    """What remains to be done after a word."""
     rest: Rest = frozenset({frozenset({_parsed(formula)})})
     for letter in word:
         rest = _step(rest, frozenset(name for i, name in enumerate(propositions) if letter >> i & 1))
@@ -283,7 +346,9 @@ def _own_letters(formula: str, propositions: tuple[str, ...]) -> tuple[frozenset
 
     collect(_parsed(formula))
     own = sorted(set(names))
-    assert set(own) <= set(propositions), f"{set(own) - set(propositions)} is not among the propositions"
+    unknown = sorted(set(own) - set(propositions))
+    if unknown:
+        raise TaskError(f"formula {formula!r}: {', '.join(unknown)} is not among the propositions {propositions}")
     return tuple(frozenset(name for i, name in enumerate(own) if letter >> i & 1) for letter in range(2 ** len(own)))
 
 
@@ -294,6 +359,7 @@ def _successors(rest: Rest, letters: tuple[frozenset[str], ...]) -> frozenset[Re
 
 @cache
 def _can_reach_done(rest: Rest, letters: tuple[frozenset[str], ...]) -> bool:
+    """Some sequence of letters leads to ``_DONE``."""
     reached, waiting = {rest}, [rest]
     while waiting:
         current = waiting.pop()

@@ -17,6 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from scipy import ndimage
 
+from potlp_jax.errors import PictureError
 from potlp_jax.task.task import Task
 from potlp_jax.trials.record import NEVER_SEEN, Decision, Trial
 from potlp_jax.view.style import CHOSEN, FAINT, INK, ROBOT, area_colour, new_figure, rgb, state_colour
@@ -40,20 +41,14 @@ def draw_trial(trial: Trial) -> Figure:
     width, height = _map_size(rows, columns, longest=11.0)
     task = Task.from_hoa(trial.task_hoa, trial.propositions)
     title, handles = _title(trial, width + 0.9), _legend(trial, task)
-    legend_columns = max(3, min(7, int(width / 1.6)))
-    head, foot = 0.24 * len(title) + 0.2, 0.52 + 0.2 * math.ceil(len(handles) / legend_columns)
+    legend_columns = _legend_columns(width)
+    head, foot = 0.24 * len(title) + 0.2, 0.52 + _legend_inches(handles, legend_columns)
     figure = new_figure(width + 0.9, height + head + foot)
     total = height + head + foot
     axes = figure.add_axes((0.55 / (width + 0.9), foot / total, width / (width + 0.9), height / total))
-    seen = trial.first_seen != NEVER_SEEN
-    show_cells(axes, trial.world, seen, trial.propositions, hatch=True)
-    draw_path(axes, trial.path, trial.states, inches_per_cell=width / columns)
-    _mark_changes(axes, trial)
-    draw_ends(axes, trial.path)
+    _draw_walk(axes, trial, inches_per_cell=width / columns)
     if trial.decisions:
         _mark_decisions(axes, trial)
-    labels = place_labels(trial.world, trial.propositions, trial.path, inches_per_cell=width / columns)
-    draw_labels(axes, labels)
     axes.tick_params(labelsize=7, colors="#6E6E6E", length=2)
     axes.set_xlabel("column", size=8, color="#6E6E6E", labelpad=1)
     axes.set_ylabel("row", size=8, color="#6E6E6E", labelpad=1)
@@ -61,16 +56,83 @@ def draw_trial(trial: Trial) -> Figure:
         weight = "normal" if line == len(title) - 1 else "bold"
         place = 1 - (0.16 + 0.24 * line) / total
         figure.text(0.5, place, text, ha="center", va="center", size=11 if weight == "bold" else 10, weight=weight)
+    _add_legend(figure, handles, legend_columns)
+    return figure
+
+
+def draw_side_by_side(trials: Sequence[Trial], titles: Sequence[str] | None = None) -> Figure:
+    """Several trials in one world on one picture, so that their paths can be compared.
+
+    The maps stand beside each other, or below each other where the world is wider than high; they share the heading
+    (task, environment, world) and the legend.
+
+    Args:
+        trials: at least one; all of the same world and task, such as those of two policies.
+        titles: what stands above each map, one per trial; default: the policy. Cost and outcome are added.
+
+    Returns:
+        The figure: paths coloured by the state of the task, unseen parts of each trial grey.
+    """
+    first = trials[0]
+    if any(trial.task_hoa != first.task_hoa or map_extent(trial.world) != map_extent(first.world) for trial in trials):
+        raise PictureError("trials that are drawn side by side must have the same world and task")
+    rows, columns = map_extent(first.world)
+    stacked = columns > rows
+    width, height = _map_size(rows, columns, longest=11.0 if stacked else 5.6)
+    across, down = (1, len(trials)) if stacked else (len(trials), 1)
+    edge, gap, row_head = 0.12, 0.2, 0.3
+    total_width = across * width + (across - 1) * gap + 2 * edge
+    heading = [*_formula_lines(first, total_width), _place_in_words(first)]
+    handles = _shared_legend(trials)
+    legend_columns = _legend_columns(total_width)
+    head, foot = 0.24 * len(heading) + 0.14, _legend_inches(handles, legend_columns) + 0.16
+    total = head + foot + down * (height + row_head)
+    figure = new_figure(total_width, total)
+    for line, text in enumerate(heading):
+        weight = "normal" if line == len(heading) - 1 else "bold"
+        figure.text(0.5, 1 - (0.16 + 0.24 * line) / total, text, ha="center", va="center", size=11, weight=weight)
+    for index, trial in enumerate(trials):
+        left = edge + (index % across) * (width + gap)
+        top = total - head - (index // across) * (height + row_head) - row_head
+        axes = figure.add_axes((left / total_width, (top - height) / total, width / total_width, height / total))
+        _draw_walk(axes, trial, inches_per_cell=width / columns)
+        axes.set(xticks=[], yticks=[])
+        name = trial.policy if titles is None else titles[index]
+        text = f"{name}: cost {trial.cost:.1f}, {trial.outcome.value}"
+        figure.text(left / total_width, (top + 0.06) / total, text, ha="left", va="bottom", size=11, weight="bold")
+    _add_legend(figure, handles, legend_columns)
+    return figure
+
+
+def _draw_walk(axes: Axes, trial: Trial, *, inches_per_cell: float) -> None:
+    """The map as it was known in the end, the names of its areas, and the path with its changes of state."""
+    seen = trial.first_seen != NEVER_SEEN
+    show_cells(axes, trial.world, seen, trial.propositions, hatch=True)
+    draw_path(axes, trial.path, trial.states, inches_per_cell=inches_per_cell)
+    _mark_changes(axes, trial)
+    draw_ends(axes, trial.path)
+    draw_labels(axes, place_labels(trial.world, trial.propositions, trial.path, inches_per_cell=inches_per_cell))
+
+
+def _legend_columns(width: float) -> int:
+    return max(3, min(7, int(width / 1.6)))
+
+
+def _legend_inches(handles: Sequence[Line2D | Patch], columns: int) -> float:
+    return 0.2 * math.ceil(len(handles) / columns)
+
+
+def _add_legend(figure: Figure, handles: list[Line2D | Patch], columns: int) -> None:
     figure.legend(
         handles=handles,
         loc="lower center",
-        ncols=legend_columns,
+        ncols=columns,
         fontsize=8.5,
         frameon=False,
         handlelength=1.6,
         columnspacing=1.4,
+        borderaxespad=0.2,
     )
-    return figure
 
 
 def map_extent(world: World) -> tuple[int, int]:
@@ -211,16 +273,25 @@ def letter_name(letter: int, propositions: Sequence[str]) -> str:
 
 
 def describe_outcome(trial: Trial) -> str:
-    """Environment, policy, cost and how the trial ended, in one line; of a path only the name is left."""
+    """Environment, policy, cost and how the trial ended, in one line."""
+    place = _place_in_words(trial)
+    return f"{place}  ·  policy {trial.policy}  ·  cost {trial.cost:.1f}  ·  {trial.outcome.value}"
+
+
+def _place_in_words(trial: Trial) -> str:
+    """The environment and which of its worlds it was; of a path only the name is kept."""
     environment = re.sub(r"^(map|floorplan|parcels):(?:[^,]*/)?([^/,]+)/?(,.*)?(/\w+)$", r"\1:\2\4", trial.environment)
-    seed = "" if trial.seed is None else f", seed {trial.seed}"
-    return f"{environment}{seed}  ·  policy {trial.policy}  ·  cost {trial.cost:.1f}  ·  {trial.outcome.value}"
+    return environment if trial.seed is None else f"{environment}, world {trial.seed}"
 
 
 def _title(trial: Trial, width: float) -> list[str]:
+    return [*_formula_lines(trial, width), *textwrap.wrap(describe_outcome(trial), max(20, int(width / 0.08)))]
+
+
+def _formula_lines(trial: Trial, width: float) -> list[str]:
+    """The formula in lines that fit ``width`` inches, four at most."""
     formula = textwrap.wrap(trial.task_text, max(20, int(width / 0.092)))
-    shown = formula if len(formula) <= 4 else [*formula[:3], formula[3] + " ..."]
-    return [*shown, *textwrap.wrap(describe_outcome(trial), max(20, int(width / 0.08)))]
+    return formula if len(formula) <= 4 else [*formula[:3], formula[3] + " ..."]
 
 
 def _map_size(rows: int, columns: int, longest: float) -> tuple[float, float]:
@@ -335,17 +406,7 @@ def draw_subgoals(axes: Axes, decision: Decision) -> None:
 
 
 def _legend(trial: Trial, task: Task) -> list[Line2D | Patch]:
-    handles: list[Line2D | Patch] = [
-        Patch(facecolor=FREE_SEEN, edgecolor=FAINT, label="seen free"),
-        Patch(facecolor=WALL_SEEN, label="seen wall"),
-        Patch(facecolor=FREE_UNSEEN, edgecolor="#8A8A8A", hatch="////", linewidth=0, label="never seen"),
-    ]
-    handles += area_handles(trial)
-    handles += state_handles(trial, task)
-    handles += [
-        Line2D([], [], marker="o", ls="", ms=8, mfc="white", mec=INK, mew=1.6, label="start"),
-        Line2D([], [], marker="*", ls="", ms=12, mfc=ROBOT, mec=INK, label="end"),
-    ]
+    handles = [*cell_handles(), *area_handles(trial), *state_handles(trial, task), *_end_handles()]
     if trial.decisions:
         handles.append(Line2D([], [], marker="o", ls="", ms=3.5, color=INK, label="decision"))
         if trial.decisions[-1].subgoals:
@@ -355,6 +416,29 @@ def _legend(trial: Trial, task: Task) -> list[Line2D | Patch]:
         if trial.decisions[-1].target is not None:
             handles.append(Line2D([], [], marker="^", ls="", ms=7, mfc=CHOSEN, mec="white", label="last target"))
     return handles
+
+
+def _shared_legend(trials: Sequence[Trial]) -> list[Line2D | Patch]:
+    """One legend for trials of one world and task: the states that any of them visited."""
+    task = Task.from_hoa(trials[0].task_hoa, trials[0].propositions)
+    visited = dataclasses.replace(trials[0], states=tuple(state for trial in trials for state in trial.states))
+    return [*cell_handles(), *area_handles(trials[0]), *state_handles(visited, task), *_end_handles()]
+
+
+def cell_handles() -> list[Line2D | Patch]:
+    """Legend entries of what is known of a cell."""
+    return [
+        Patch(facecolor=FREE_SEEN, edgecolor=FAINT, label="seen free"),
+        Patch(facecolor=WALL_SEEN, label="seen wall"),
+        Patch(facecolor=FREE_UNSEEN, edgecolor="#8A8A8A", hatch="////", linewidth=0, label="never seen"),
+    ]
+
+
+def _end_handles() -> list[Line2D | Patch]:
+    return [
+        Line2D([], [], marker="o", ls="", ms=8, mfc="white", mec=INK, mew=1.6, label="start"),
+        Line2D([], [], marker="*", ls="", ms=12, mfc=ROBOT, mec=INK, label="end"),
+    ]
 
 
 def area_handles(trial: Trial) -> list[Patch]:

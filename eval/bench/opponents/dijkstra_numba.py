@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, UInt8
 
-from potlp_jax.planning.distances.sweeping import NEIGHBOURS
+from potlp_jax.world.moves import NEIGHBOURS
 
 numba: Any = importlib.import_module("numba")
 """By name: an optional package."""

@@ -14,13 +14,12 @@ are padded to one shape.
 
 import dataclasses
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Int, PRNGKeyArray
 
-from potlp_jax.environments.base import host_generators
+from potlp_jax.environments.base import Generator, host_generators
 from potlp_jax.environments.campus.furnishing import (
     MANY_DOORS,
     NO_ROOM,
@@ -114,7 +113,7 @@ class DeliveryConfig:
             raise WorldError("not a delivery building: " + "; ".join(broken))
 
 
-class Delivery:
+class Delivery(Generator):
     """Generator of academic floors with people to find: by default the three of section V-B.
 
     Attributes:
@@ -122,12 +121,14 @@ class Delivery:
         errand: who is to be found, and where they can be.
     """
 
-    settings: Mapping[str, Any] = MANY_DOORS
+    settings = MANY_DOORS
 
     def __init__(self, config: DeliveryConfig | None = None, name: str = "delivery", errand: Errand = PEOPLE) -> None:
         self.config = DeliveryConfig() if config is None else config
         self.name = name
         self.errand = errand
+        self.propositions = errand.propositions
+        self.tasks = errand.tasks
 
     @classmethod
     def toy(cls) -> "Delivery":
@@ -139,17 +140,7 @@ class Delivery:
         """Floors with a document and a package to deliver in two rooms of any kind, which nothing but light tells."""
         return cls(DeliveryConfig(furnishing=FurnishConfig(coloured=False)), "parcels", PARCELS)
 
-    @property
-    def propositions(self) -> tuple[str, ...]:
-        """In the order of the letters' bits."""
-        return self.errand.propositions
-
-    @property
-    def tasks(self) -> Mapping[str, str]:
-        """Formulas by number."""
-        return self.errand.tasks
-
-    def generate(self, key: PRNGKeyArray) -> World:
+    def draw(self, key: PRNGKeyArray) -> World:
         """The world of this key."""
         return self.generate_with_layout(key)[0]
 
@@ -162,7 +153,7 @@ class Delivery:
         floor_key, furnish_key = jax.random.split(key)
         floor = self.draw_floor(floor_key)
         world, placement = furnish(floor, furnish_key, self.errand, self.config.furnishing, self.config.largest)
-        return world, floor, placement
+        return self.signed(world), floor, placement
 
     def draw_floor(self, key: PRNGKeyArray) -> Floor:
         """The building alone, with every kind of room that the task needs."""

@@ -22,13 +22,12 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Int, Int32, PRNGKeyArray
 
-from potlp_jax.environments.base import host_generators
+from potlp_jax.environments.base import Generator, host_generators
 from potlp_jax.environments.campus.floor_plan_xml import FloorPlan, PlanDoor, PlanRoom, read_kinds, read_plan
 from potlp_jax.environments.campus.furnishing import (
     MANY_DOORS,
@@ -139,7 +138,7 @@ class PlanFloor:
     report: FloorReport
 
 
-class FloorPlans:
+class FloorPlans(Generator):
     """Worlds on real plans; they differ in the building, who is where, light and colours.
 
     Attributes:
@@ -148,9 +147,9 @@ class FloorPlans:
         left_out: why files of a folder are no buildings, by name.
     """
 
-    propositions: tuple[str, ...] = PEOPLE.propositions
-    tasks: Mapping[str, str] = PEOPLE.tasks
-    settings: Mapping[str, Any] = MANY_DOORS
+    propositions = PEOPLE.propositions
+    tasks = PEOPLE.tasks
+    settings = MANY_DOORS
 
     def __init__(self, config: FloorPlanConfig) -> None:
         """Reads and rasterises the plans.
@@ -189,7 +188,7 @@ class FloorPlans:
         """
         return cls(parse_spec(spec))
 
-    def generate(self, key: PRNGKeyArray) -> World:
+    def draw(self, key: PRNGKeyArray) -> World:
         """The world of this key: a building, drawn uniformly, and people in it."""
         return self.generate_with_layout(key)[0]
 
@@ -198,7 +197,7 @@ class FloorPlans:
         furnish_key = jax.random.fold_in(key, 0)
         floor = self.building(key)
         world, placement = furnish(floor.floor, furnish_key, PEOPLE, self.config.furnishing, self._shape)
-        return world, floor, placement
+        return self.signed(world), floor, placement
 
     def building(self, key: PRNGKeyArray) -> PlanFloor:
         """The building of this key's world; trials in one building are not independent."""

@@ -17,7 +17,6 @@ import dataclasses
 import enum
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
 
 import cv2
 import jax.numpy as jnp
@@ -27,6 +26,7 @@ from jaxtyping import Bool, Float32, Int32, PRNGKeyArray
 from potlp_jax.environments.base import host_generators
 from potlp_jax.errors import WorldError
 from potlp_jax.world.grid import Appearance, World, make_world
+from potlp_jax.world.settings import Settings
 
 Cell = tuple[int, int]
 
@@ -77,7 +77,7 @@ PARCELS: Errand = Errand(
 )
 """Bradley et al. 2021, section V-C: a document and a package for two people, in any order or the document first."""
 
-MANY_DOORS: Mapping[str, Any] = MappingProxyType({"decision": {"frontiers": {"max_subgoals": 32}}})
+MANY_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 32}}})
 """Settings of trials: from a hallway one sees 18 to 27 doors at a time, in the mean of a trial."""
 
 _WALL_COLOURS = {

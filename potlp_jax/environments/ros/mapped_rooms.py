@@ -18,11 +18,11 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from potlp_jax.environments.base import Generator
 from potlp_jax.environments.campus.delivery import DeliveryConfig
 from potlp_jax.environments.campus.furnishing import NO_ROOM, PARCELS, Floor, FurnishConfig, Kind, Placement, furnish
 from potlp_jax.environments.options import parse_options
@@ -33,6 +33,7 @@ from potlp_jax.environments.splits import PARCELS_PREFIX
 from potlp_jax.errors import MapError, MapWarning
 from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.grid import World
+from potlp_jax.world.settings import Settings
 
 PERSON_RADIUS = 0.5
 """Metres around a person's cell, along rows and columns, on which the person is met."""
@@ -70,7 +71,7 @@ class MappedRoomsConfig:
     radius: float = 0.1
 
 
-class MappedRooms:
+class MappedRooms(Generator):
     """Worlds in one real building; they differ in who is where, the start, light and tints.
 
     Attributes:
@@ -81,8 +82,8 @@ class MappedRooms:
         left_out: rooms of the file of which too little can be reached.
     """
 
-    propositions: tuple[str, ...] = PARCELS.propositions
-    tasks: Mapping[str, str] = PARCELS.tasks
+    propositions = PARCELS.propositions
+    tasks = PARCELS.tasks
 
     def __init__(self, config: MappedRoomsConfig) -> None:
         """Reads the map and its rooms.
@@ -113,6 +114,7 @@ class MappedRooms:
                 MapWarning,
                 stacklevel=2,
             )
+        self.settings = _settings(config.resolution)
         reach = max(1, round(PERSON_RADIUS / config.resolution))
         self._furnishing = FurnishConfig(person_radius=reach, coloured=False)
 
@@ -128,24 +130,23 @@ class MappedRooms:
         file, values = parse_options(spec, PARCELS_PREFIX, "map", options, usage)
         return cls(MappedRoomsConfig(file, **values))
 
-    @property
-    def settings(self) -> Mapping[str, Any]:
-        """Camera and replanning as in ``parcels``, in metres, room for all frontiers, and none too narrow."""
-        scale, camera = LEARNED_RESOLUTION / self.config.resolution, CameraConfig()
-        lengths = {
-            name: getattr(camera, name) * scale for name in ("far", "eye_height", "wall_height", "texture_reach")
-        }
-        frontiers = {"max_subgoals": MANY_SLIVERS, **NARROW_DOORS["decision"]["frontiers"]}
-        replan_distance = REPLAN_DISTANCE / self.config.resolution
-        return {"decision": {"frontiers": frontiers}, "camera": lengths, "replan_distance": replan_distance}
-
-    def generate(self, key: PRNGKeyArray) -> World:
+    def draw(self, key: PRNGKeyArray) -> World:
         """The world of this key."""
         return self.generate_with_layout(key)[0]
 
     def generate_with_layout(self, key: PRNGKeyArray) -> tuple[World, Placement]:
         """The world of this key, and who is where."""
-        return furnish(self.floor, key, PARCELS, self._furnishing, self.floor.rooms.shape)
+        world, placement = furnish(self.floor, key, PARCELS, self._furnishing, self.floor.rooms.shape)
+        return self.signed(world), placement
+
+
+def _settings(resolution: float) -> Settings:
+    """Camera and replanning as in ``parcels``, in metres, space for all frontiers, and none too narrow."""
+    scale, camera = LEARNED_RESOLUTION / resolution, CameraConfig()
+    lengths = {name: getattr(camera, name) * scale for name in ("far", "eye_height", "wall_height", "texture_reach")}
+    frontiers = {"max_subgoals": MANY_SLIVERS, **NARROW_DOORS["decision"]["frontiers"]}
+    replan_distance = REPLAN_DISTANCE / resolution
+    return Settings({"decision": {"frontiers": frontiers}, "camera": lengths, "replan_distance": replan_distance})
 
 
 def _floor(

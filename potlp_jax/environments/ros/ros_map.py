@@ -21,23 +21,21 @@ Costs are in metres, since ``World.resolution`` is the size of a cell in metres.
 """
 
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int, Int32, PRNGKeyArray, Shaped
 from scipy import ndimage
 
-from potlp_jax.environments.base import host_generators
+from potlp_jax.environments.base import Generator, host_generators
 from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.ros.map_files import GridFrame, OccupancyMap, load_map
 from potlp_jax.environments.ros.places import Places, Point, component_labels, load_places, nearest_free, place_letters
 from potlp_jax.errors import MapError, MapWarning
 from potlp_jax.world.grid import World, make_world
+from potlp_jax.world.settings import Settings
 
 PREFIX = "map:"
 
@@ -97,7 +95,7 @@ class CutOff:
     area: float
 
 
-NARROW_DOORS: Mapping[str, Any] = MappingProxyType({"decision": {"frontiers": {"min_size": 1}}})
+NARROW_DOORS: Settings = Settings({"decision": {"frontiers": {"min_size": 1}}})
 """Settings of trials: after resampling, a door of a real building may be as narrow as one cell, and a frontier is to be
 dropped only where it is smaller than any passage (docs/model.md section 6)."""
 
@@ -119,7 +117,7 @@ class CleanMap:
     cut_off: tuple[CutOff, ...]
 
 
-class RosMap:
+class RosMap(Generator):
     """Worlds on one map; they differ in the start, unless the places fix it.
 
     Attributes:
@@ -130,7 +128,7 @@ class RosMap:
         clean: the grid; ``clean.frame`` converts metres to cells of the worlds.
     """
 
-    settings: Mapping[str, Any] = NARROW_DOORS
+    settings = NARROW_DOORS
 
     def __init__(self, config: RosMapConfig) -> None:
         """Reads and cleans the map, and places the propositions.
@@ -150,8 +148,8 @@ class RosMap:
         _warn_of_cut_off(config, self.clean)
         # Not the path as typed: the name separates the seeds, and a map is the same map from every folder.
         self.name = f"{PREFIX}{Path(config.file).stem}"
-        self.propositions: tuple[str, ...] = places.names
-        self.tasks: Mapping[str, str] = dict(places.tasks)
+        self.propositions = places.names
+        self.tasks = dict(places.tasks)
         self._letters = place_letters(places, self.clean.free, self.clean.frame)
         self._free_cells: Int32[np.ndarray, "N 2"] = np.argwhere(self.clean.free).astype(np.int32)
 
@@ -164,7 +162,7 @@ class RosMap:
         """
         return cls(parse_spec(spec))
 
-    def generate(self, key: PRNGKeyArray) -> World:
+    def draw(self, key: PRNGKeyArray) -> World:
         """The world with the start that the places fix, or with one drawn from all cells by key."""
         if self.places.start is not None:
             start = self.metres_to_cell(*self.places.start)

@@ -1,0 +1,66 @@
+"""Extensions by name: ``module:attribute``, or the name of an entry point that an installed package declares.
+
+Environments, policies, cameras and estimators of other packages are found here, each kind in an entry-point group of
+its own. A name is resolved again in every process, so it means the same in the workers of a sweep.
+"""
+
+import importlib
+import importlib.metadata
+import os
+import re
+import sys
+from collections.abc import Iterable
+from typing import Any
+
+from potlp_jax.errors import PluginError
+
+_REFERENCE = re.compile(r"(?P<module>[^\W\d]\w*(\.[^\W\d]\w*)*):(?P<attribute>[^\W\d]\w*(\.[^\W\d]\w*)*)")
+
+
+def is_reference(name: str) -> bool:
+    """Whether the name has the form ``module:attribute``."""
+    return _REFERENCE.fullmatch(name) is not None
+
+
+def entry_points(group: str) -> tuple[str, ...]:
+    """Names that installed packages declare in an entry-point group, sorted."""
+    return tuple(sorted(importlib.metadata.entry_points(group=group).names))
+
+
+def load(name: str, *, group: str, kind: str, known: Iterable[str] = ()) -> Any:
+    """The object that a name stands for.
+
+    Args:
+        name: ``module:attribute`` (attributes may be nested: ``module:Class.method``), or an entry point's name.
+        group: the entry-point group of this kind of extension.
+        kind: what is looked for, for messages: "environment", "policy".
+        known: names that are no extensions, listed where ``name`` is unknown.
+
+    Raises:
+        PluginError: nothing has this name, or what has it cannot be imported.
+    """
+    match = _REFERENCE.fullmatch(name)
+    if match is not None:
+        return _attribute(match["module"], match["attribute"], f"{kind} {name!r}")
+    found = importlib.metadata.entry_points(group=group, name=name)
+    for entry in found:
+        return _attribute(entry.module, entry.attr, f"{kind} {name!r} (entry point {entry.value!r})")
+    choices = ", ".join([*known, *entry_points(group)])
+    raise PluginError(f"unknown {kind} {name!r}; choose one of: {choices}; or write module:attribute")
+
+
+def _attribute(module_name: str, attribute: str, what: str) -> Any:
+    """``module.attribute``, with the current directory importable as under ``python -m``."""
+    # A console script has its own folder in sys.path instead of the current directory.
+    if not {"", os.getcwd()} & set(sys.path):
+        sys.path.insert(0, os.getcwd())
+    try:
+        found: Any = importlib.import_module(module_name)
+    except Exception as error:
+        # Whatever a foreign module raises on import, the user has to know which module, and why.
+        raise PluginError(f"{what}: importing {module_name} failed: {type(error).__name__}: {error}") from error
+    for part in attribute.split("."):
+        if not hasattr(found, part):
+            raise PluginError(f"{what}: {module_name} has no attribute {attribute!r}")
+        found = getattr(found, part)
+    return found
