@@ -24,15 +24,15 @@ from typing import Any
 from potlp_jax.codec import config_from_dict, json_copy, read_settings, settings_file, with_settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
-from potlp_jax.errors import SpecificationError, WorldError
+from potlp_jax.environments.tasks import environment_task
+from potlp_jax.errors import SpecificationError, TaskError, WorldError
 from potlp_jax.planning.policies import Policy
-from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """One cell of the sweep's grid: ``worlds`` trials of every policy. ``task`` is a formula."""
+    """One cell of the sweep's grid: ``worlds`` trials of every policy. ``task`` is a formula or a ``.hoa`` file."""
 
     environment: str
     task: str
@@ -182,15 +182,13 @@ def _split(name: Any, environments: Sequence[str], where: str) -> Split:
 
 
 def _formula(environment: str, task: Any, where: str) -> str:
-    """The formula of a task that is given by number, or as a formula. Raises for formulas that are no task."""
+    """A task by number as its formula, any other (a formula, a ``.hoa`` file) as it is. Raises for what is no task."""
     generator = make(environment)
-    text = str(task)
-    formula = generator.tasks.get(text, text)
-    if text.isdecimal() and formula == text:
-        known = ", ".join(generator.tasks) or "none"
-        raise SpecificationError(f"{where}: tasks: {environment} has no task {text}; it has: {known}")
-    Task.of_formula(formula, generator.propositions)
-    return formula
+    try:
+        environment_task(generator, str(task))
+    except TaskError as error:
+        raise SpecificationError(f"{where}: tasks: {error}") from error
+    return generator.tasks.get(str(task), str(task))
 
 
 def _common_config(environments: Sequence[str], where: str) -> TrialConfig:
