@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from potlp_jax.planning.problem import enumerate_actions as enumerate_actions
     from potlp_jax.planning.search.api import Plan as Plan
     from potlp_jax.planning.search.api import plan_actions as plan_actions
-    from potlp_jax.planning.search.graph import SearchConfig as SearchConfig
+    from potlp_jax.planning.search.config import SearchConfig as SearchConfig
+    from potlp_jax.planning.search.config import UctConfig as UctConfig
     from potlp_jax.rl.episodes import TaskEnv as TaskEnv
     from potlp_jax.task.task import Task as Task
     from potlp_jax.task.task import TaskArrays as TaskArrays
@@ -49,7 +50,7 @@ if TYPE_CHECKING:
     from potlp_jax.trials.loop import run_robot as run_robot
     from potlp_jax.trials.loop import run_trial as run_trial
     from potlp_jax.trials.record import Outcome as Outcome
-    from potlp_jax.trials.record import Run as Run
+    from potlp_jax.trials.record import RunRecord as RunRecord
     from potlp_jax.trials.record import Trial as Trial
     from potlp_jax.trials.record import load_trial as load_trial
     from potlp_jax.trials.robot import Leg as Leg
@@ -105,6 +106,7 @@ __all__ = [  # noqa: RUF022 - by use, not by the alphabet
     "PlanningProblem",
     "enumerate_actions",
     "SearchConfig",
+    "UctConfig",
     "Plan",
     "plan_actions",
     "Bounds",
@@ -116,7 +118,7 @@ __all__ = [  # noqa: RUF022 - by use, not by the alphabet
     "trial_config_for",
     "run_trial",
     "run_robot",
-    "Run",
+    "RunRecord",
     "Trial",
     "Outcome",
     "load_trial",
@@ -150,13 +152,13 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "planning.policies": ("DecisionConfig", "Policy", "PolicyFunction", "decide", "move_to"),
     "planning.problem": ("PlanningProblem", "enumerate_actions"),
     "planning.search.api": ("Plan", "plan_actions"),
-    "planning.search.graph": ("SearchConfig",),
+    "planning.search.config": ("SearchConfig", "UctConfig"),
     "rl.episodes": ("TaskEnv",),
     "task.task": ("Task", "TaskArrays", "TaskSizes", "stack_tasks"),
     "trials.batch": ("Finished", "Start", "run_batch"),
     "trials.config": ("TrialConfig", "trial_config_for"),
     "trials.loop": ("run_robot", "run_trial"),
-    "trials.record": ("Outcome", "Run", "Trial", "load_trial"),
+    "trials.record": ("Outcome", "RunRecord", "Trial", "load_trial"),
     "trials.robot": ("Leg", "Robot"),
     "trials.rules": ("Stop",),
     "trials.run": ("run",),

@@ -23,6 +23,7 @@ from potlp_jax.planning import policies
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
 from potlp_jax.trials.record import Outcome, load_trial
+from potlp_jax.trials.run import run
 
 ROOT = Path(__file__).parents[1]
 
@@ -171,6 +172,18 @@ def test_run_as_json_is_the_summary(recorded, tmp_path):
     assert data == load_trial(recorded / "trial.json").summary()
     assert [Path(file).name for file in files] == ["trial.json", "trial.png"]
     assert not (tmp_path / "new" / "trial.gif").exists()
+
+
+def test_one_call_from_python_makes_the_trial_of_the_command_line():
+    data = _json(_potlp("run", "toy", "-t", "2", "--policy", "baseline", "--world", "4", "--json"))
+    assert {**run("toy", 2, "baseline", 4).summary(), "files": []} == data
+
+
+def test_environments_and_policies_of_others_are_run_by_their_names():
+    names = ("examples.own_environment:Corridor", "--policy", "examples.own_policy:largest_frontier")
+    data = _json(_potlp("run", *names, "--camera", "examples.own_camera:thermal", "--json"))
+    assert (data["environment"], data["policy"]) == (f"{names[0]}/validation", names[2])
+    assert data["outcome"] == "satisfied"
 
 
 def test_without_an_estimator_the_default_policy_is_the_baseline():

@@ -5,6 +5,8 @@ those import jax; ``tests/test_cli.py`` compares them.
 """
 
 from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -54,6 +56,12 @@ def complete_policies(incomplete: str) -> list[str]:
     *before, last = incomplete.split(",")
     # The shell replaces the whole word, so that what stands before the last comma is part of every proposal.
     return [",".join([*before, name]) for name in complete_policy(last) if name not in before]
+
+
+def complete_recipe(incomplete: str) -> list[str]:
+    """Shipped recipes."""
+    folder = Path(str(resources.files("potlp_jax.recipes"))) / "data"
+    return _starting([path.stem for path in sorted(folder.glob("*.yaml"))], incomplete)
 
 
 def complete_split(incomplete: str) -> list[str]:

@@ -182,7 +182,7 @@ def _search_together(scene: Scene, asked: Asked, setup: Setup, progress: Progres
     def act(progress: Progress, scene: Scene, *considered: Any) -> Progress:
         tally = progress.tally
         move = _phase(tally.running, partial(planned_move, config=decision), *considered, tally.intention)
-        return _advance(setup, progress, scene, move)
+        return advance(setup, progress, scene, move)
 
     return _each(act, dataclasses.replace(progress, views=views), scene, situation, problem, plans)
 
@@ -196,7 +196,7 @@ def _decide_alone(setup: Setup, asked: Asked, progress: Progress, scene: Scene) 
         return policy_function(setup.policy)(situation, estimates, key, config, intention)
 
     move = _phase(tally.running, decide, situation, estimates, key, tally.intention)
-    return _advance(setup, dataclasses.replace(progress, views=views), scene, move)
+    return advance(setup, dataclasses.replace(progress, views=views), scene, move)
 
 
 def _each(function: Any, *batches: Any) -> Any:
@@ -282,8 +282,18 @@ def _estimator(setup: Setup, asked: Asked, views: Views | None, scene: Scene) ->
     return asked
 
 
-def _advance(setup: Setup, progress: Progress, scene: Scene, move: Move) -> Progress:
-    """Follow the move's path until the next decision is due, and see whether the trial ends there."""
+def advance(setup: Setup, progress: Progress, scene: Scene, move: Move) -> Progress:
+    """Follow a move's path until the next decision is due, and see whether the trial ends there.
+
+    Args:
+        setup: of the batch; static.
+        progress: of one slot.
+        scene: of the slot.
+        move: what was decided.
+
+    Returns:
+        The progress; unchanged where the trial is not running.
+    """
     config = setup.config
     stop = stop_of(move, progress.tally, progress.belief, config)
 
