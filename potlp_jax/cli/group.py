@@ -76,6 +76,9 @@ def command_app(name: str | None = None, about: str | None = None, cls: type[Typ
         name: name of a group of subcommands; None for a single command.
         about: what the subcommands of a group have in common, for its help.
         cls: class of a group.
+
+    Returns:
+        An application for ``COMMANDS``, still without commands.
     """
     # A group without arguments shows its help; a single command may need none. `potlp` alone installs completion.
     return typer.Typer(

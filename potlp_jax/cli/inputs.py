@@ -71,7 +71,19 @@ def warn_of_test_worlds() -> None:
 
 
 def make_world(generator: Generator, split: Split, number: int) -> World:
-    """World ``number`` of a split. Raises WorldError where none can be made."""
+    """One world.
+
+    Args:
+        generator: its family.
+        split: from which split.
+        number: within the split, from 0.
+
+    Returns:
+        The world, the same on every machine.
+
+    Raises:
+        WorldError: none can be made.
+    """
     # Checked here as well as in `world_key`, to name the option that was wrong.
     if number > MAX_INDEX:
         fail(f"--world {number} is too large; the last world is number {MAX_INDEX}")

@@ -97,7 +97,13 @@ def show(folder: SweepFolder, json: Json = False) -> None:
 
 
 def run_reported(specification: "Specification", folder: Path, processes: int | None) -> None:
-    """Run what is missing of a sweep, with progress on stderr; ``processes`` None: one per core."""
+    """Run what is missing of a sweep, with progress on stderr.
+
+    Args:
+        specification: what to run.
+        folder: of the store.
+        processes: workers; None: one per core.
+    """
     from potlp_jax.sweep.runner import run_sweep
 
     # The cores that this process may use, which on a cluster are fewer than the machine has.
@@ -143,7 +149,13 @@ def _duration(seconds: float) -> str:
 
 
 def print_cell(out: Console, cell: "CellResults", split: str) -> None:
-    """The results of one environment and task: a heading, one table, and what qualifies it."""
+    """Print the results of one environment and task: a heading, one table, and what qualifies it.
+
+    Args:
+        out: a terminal, or a file.
+        cell: the results.
+        split: from which the worlds are, for the heading.
+    """
     from potlp_jax.view.comparisons import comparison_table, remark_lines
 
     redrawn = f", {cell.redrawn} impossible ones left out" if cell.redrawn else ""
