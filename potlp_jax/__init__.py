@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from potlp_jax.planning.search.api import Plan as Plan
     from potlp_jax.planning.search.api import plan_actions as plan_actions
     from potlp_jax.planning.search.graph import SearchConfig as SearchConfig
+    from potlp_jax.rl.episodes import TaskEnv as TaskEnv
     from potlp_jax.task.task import Task as Task
     from potlp_jax.task.task import TaskArrays as TaskArrays
     from potlp_jax.task.task import TaskSizes as TaskSizes
@@ -42,11 +43,13 @@ if TYPE_CHECKING:
     from potlp_jax.trials.batch import Start as Start
     from potlp_jax.trials.batch import run_batch as run_batch
     from potlp_jax.trials.config import TrialConfig as TrialConfig
+    from potlp_jax.trials.config import trial_config_for as trial_config_for
     from potlp_jax.trials.loop import run_trial as run_trial
     from potlp_jax.trials.record import Outcome as Outcome
     from potlp_jax.trials.record import Trial as Trial
     from potlp_jax.trials.record import load_trial as load_trial
     from potlp_jax.trials.robot import Robot as Robot
+    from potlp_jax.trials.run import run as run
     from potlp_jax.types import NO_ACTION as NO_ACTION
     from potlp_jax.types import Status as Status
     from potlp_jax.world.frontiers import FrontierConfig as FrontierConfig
@@ -100,7 +103,9 @@ __all__ = [  # noqa: RUF022 - by use, not by the alphabet
     "bound_exact",
     "solve_exact",
     # Whole trials, one or many.
+    "run",
     "TrialConfig",
+    "trial_config_for",
     "run_trial",
     "Trial",
     "Outcome",
@@ -109,6 +114,7 @@ __all__ = [  # noqa: RUF022 - by use, not by the alphabet
     "Start",
     "Finished",
     "run_batch",
+    "TaskEnv",
     # Sentinels, flags and errors.
     "NO_ACTION",
     "Status",
@@ -133,12 +139,14 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "planning.problem": ("PlanningProblem", "enumerate_actions"),
     "planning.search.api": ("Plan", "plan_actions"),
     "planning.search.graph": ("SearchConfig",),
+    "rl.episodes": ("TaskEnv",),
     "task.task": ("Task", "TaskArrays", "TaskSizes", "stack_tasks"),
     "trials.batch": ("Finished", "Start", "run_batch"),
-    "trials.config": ("TrialConfig",),
+    "trials.config": ("TrialConfig", "trial_config_for"),
     "trials.loop": ("run_trial",),
     "trials.record": ("Outcome", "Trial", "load_trial"),
     "trials.robot": ("Robot",),
+    "trials.run": ("run",),
     "types": ("NO_ACTION", "Status"),
     "world.frontiers": ("FrontierConfig", "Subgoals", "find_subgoals"),
     "world.grid": ("BeliefMap", "World", "belief_from_numpy", "make_world"),

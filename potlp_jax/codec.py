@@ -14,9 +14,12 @@ import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum
+from importlib import resources
+from pathlib import Path
 from typing import Any, TypeVar
 
 import pydantic
+import yaml
 from pydantic_core import ErrorDetails
 
 from potlp_jax.errors import ConfigurationError
@@ -82,6 +85,42 @@ def differences(before: Any, now: Any, name: str = "") -> list[str]:
 def _short(value: Any) -> str:
     text = json.dumps(value, default=_json_value)
     return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 3]}..."
+
+
+def read_settings(file: Path) -> Mapping[str, Any]:
+    """The entries of a YAML file.
+
+    Raises:
+        ConfigurationError: the file is no YAML, or holds something else than entries by name.
+    """
+    try:
+        data = yaml.safe_load(file.read_text("utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"{file}: not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(data, Mapping):
+        raise ConfigurationError(f"{file}: give a mapping of names to values, found {_short(data)}")
+    return data
+
+
+def shipped_settings(package: str) -> dict[str, Path]:
+    """The YAML files that come with a package as its data, by name without the ending."""
+    folder = Path(str(resources.files(package))) / "data"
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+
+
+def settings_file(given: str | Path, package: str) -> Path:
+    """The file that a user means: by its path, or by the name of one that comes with ``package``.
+
+    Raises:
+        ConfigurationError: there is neither.
+    """
+    shipped = shipped_settings(package)
+    # A file of the user's own goes before a shipped one of the same name.
+    if Path(given).is_file():
+        return Path(given)
+    if str(given) in shipped:
+        return shipped[str(given)]
+    raise ConfigurationError(f"{given}: neither a file nor one of those that are shipped: {', '.join(shipped)}")
 
 
 def config_from_dict(kind: type[_Config], data: Any, where: str) -> _Config:

@@ -77,8 +77,8 @@ class BatchError(PotlpError):
     """Trials do not fit into one batch; the message says which and why."""
 
 
-class SpecificationError(PotlpError):
-    """A specification cannot be used: names the file, the entry and what to do."""
+class SpecificationError(ConfigurationError):
+    """A specification of a sweep cannot be used: names the file, the entry and what to do."""
 
 
 class StoreError(PotlpError):

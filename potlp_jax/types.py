@@ -2,17 +2,18 @@
 
 Glossary of the dimension names in jaxtyping annotations. ``tests/test_types.py`` compares it with the package: every
 name that is used stands here, and no other. A name with a ``1`` at its end has one entry more than the name without
-(``S1`` is ``S + 1``); names behind a star (``*batch``) stand for any number of axes, also none.
+(``S1`` is ``S + 1``). Names behind a star, such as ``*batch``, are not listed: they stand for any number of axes.
 
-=============================  ===========================================================================
+=============================  ======================================================================================
 Grid
 H, W                           rows and columns of the grid; row 0 is the top row, a cell is (row, column)
 H2, W2                         the same with a margin of one cell on each side
 two_h, two_w                   ``2 H - 1`` and ``2 W - 1``: differences between the coordinates of two cells
-cells, real                    cells of the grid, counted row by row; ``real`` without the dummy entry
+h, w, h2, w2                   rows and columns of an image file or a map file, in pixels; the same once grown
+cells, real                    cells of the grid, counted row by row; ``real`` without the dummy entry at the end
 capacity, block                entries of a list of cells; entries that are handled at once
-lines, side, steps             lines of sight, or rays; those of one side of a square; cells along each
-entries                        entries of a table of range maxima
+lines, steps                   lines of sight, or lines of the grid; cells along a line, a ray or a path
+side, entries                  lines of one side of a square, or pixels of a disc; entries of a table of maxima
 
 Task
 Z                              states of the task automaton (DFA)
@@ -21,17 +22,35 @@ P                              propositions
 E                              edges (z', z'') of the automaton that a high-level action can attempt
 C                              outcome classes (stay, cube): what an estimator is asked for
 M                              conditions: the C classes first, then the conditions that several cubes make up
-K                              cubes of a condition, at most
+K                              cubes of a condition, at most; in training, samples of one view
 
 Planning
-S, S1                          subgoals; node ``S`` of a planning problem is the robot's own cell
+S, S1                          subgoals; location ``S`` of a planning problem is the robot's own cell
 A                              actions, ``S * E + 1``: ``s * E + e``, and last the finish action
+N                              nodes of a search graph, or any number of things of one kind
+NZ                             nodes times states
+B                              rows of a batch
+D                              depth: actions of one simulation
+R, L1                          rows of a table of guesses; lengths of a chain of failures, 0 among them
+V                              words of a bit set over product states; in learning, panoramas in memory
+n                              flags, or words of a packed row
+slots                          entries of a hash table
 Q, T                           sources and targets of distances
-shared                         Q, or 1 where all sources share the entry
+shared, lanes                  Q, or 1 where all sources share the entry; Q
 active, keys, ends             cells where the automaton's state can change; with the sources; with the targets
 to                             states that a move may lead to
 horizon1                       product states of a path: its moves and the source
-=============================  ===========================================================================
+
+Pictures and estimators
+rows, columns                  of a panorama; a column is a bearing
+G                              views of a training batch
+F                              features of a place in a panorama
+feature_rows, feature_columns  rows and columns of a panorama's features
+bands, columns_out             bands of rows of a panorama; columns of a result where they are fewer
+patch_rows, patch_columns      rows and columns of the patch around a subgoal
+packed, pixels                 bands as channels; values of a patch in one vector
+k                              samples chosen from more
+=============================  ======================================================================================
 
 Costs are ``float32`` in the unit of ``World.resolution`` (cells where it is 1). Unreachable is ``inf``.
 Masks are True where an entry is real, False where it is padding.

@@ -12,11 +12,12 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from potlp_jax.cli import app
-from potlp_jax.environments.families import FAMILIES
+from potlp_jax.cli import app, completion
+from potlp_jax.environments.families import FAMILIES, NAMED
 from potlp_jax.environments.registry import make
-from potlp_jax.environments.splits import world_key
-from potlp_jax.errors import WorldError
+from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.errors import PotlpError, WorldError
+from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
 from potlp_jax.trials.record import Outcome, load_trial
 
@@ -37,7 +38,7 @@ def _json(result):
 def recorded(tmp_path_factory) -> Path:
     """A trial of the toy environment with everything that `potlp run` writes."""
     folder = tmp_path_factory.mktemp("run")
-    result = _potlp("run", "toy", "-t", "2", "--policy", "oracle", "--seed", "3", "--out", folder, *FAST)
+    result = _potlp("run", "toy", "-t", "2", "--policy", "oracle", "--world", "3", "--out", folder, *FAST)
     assert result.exit_code == 0, result.output
     return folder
 
@@ -105,7 +106,7 @@ def test_max_positive_literals_reaches_the_task():
         (("run", "toy", "--task", "F dragon"), "dragon"),
         (("run", "toy", "--policy", "clever"), "known-map, baseline"),
         (("run", "toy", "--split", "holiday"), "validation"),
-        (("run", "toy", "--seed", "999999999999"), "--seed"),
+        (("run", "toy", "--world", "999999999999"), "--world"),
         (("compare", "toy", "--policies", "oracle,clever"), "clever"),
         (("run", "toy", "--policy", "potlp"), "no estimator is shipped for the propositions goal"),
         (("run", "firefighting", "--estimator", "nowhere.npz"), "nowhere.npz"),
@@ -122,7 +123,7 @@ def test_bad_input_is_one_message_and_exit_code_2(arguments, message):
 
 
 def test_bad_options_have_exit_code_2():
-    assert _potlp("run", "toy", "--seed", "-1").exit_code == 2
+    assert _potlp("run", "toy", "--world", "-1").exit_code == 2
     assert _potlp("compare", "toy", "--trials", "0").exit_code == 2
     assert _potlp("run").exit_code == 2
     assert _potlp("dance").exit_code == 2
@@ -142,23 +143,22 @@ def test_run_writes_record_picture_and_animation(recorded):
         assert animation.n_frames == len(trial.decisions) + 1
 
 
-@pytest.mark.parametrize("command", ["run", "compare"])
-def test_trials_have_the_key_of_their_world_in_a_sweep(monkeypatch, command):
+def test_a_trial_has_the_key_of_its_world_in_a_sweep(monkeypatch):
     keys = []
 
     def run_trial(world, task, policy, key, *rest, **named):
         keys.append(key)
         raise WorldError("seen")
 
-    monkeypatch.setattr(f"potlp_jax.cli.{command}.run_trial", run_trial)
-    _potlp(command, "toy", "--policies" if command == "compare" else "--policy", "baseline", "--seed", "3")
+    monkeypatch.setattr("potlp_jax.trials.loop.run_trial", run_trial)
+    _potlp("run", "toy", "--policy", "baseline", "--world", "3")
     assert (keys[0] == jax.random.fold_in(jax.random.key(0), 3)).all()
 
 
 def test_run_as_json_is_the_summary(recorded, tmp_path):
     data = _json(
         _potlp(
-            *("run", "toy", "-t", "2", "--policy", "oracle", "--seed", "3", "--out", tmp_path / "new"),
+            *("run", "toy", "-t", "2", "--policy", "oracle", "--world", "3", "--out", tmp_path / "new"),
             *("--no-animation", "--json", *FAST),
         )
     )
@@ -239,18 +239,41 @@ def test_compare_reports_pairs_and_writes_its_files(tmp_path):
     )
     data = _json(result)
     assert data == json.loads((tmp_path / "compare.json").read_text())
-    assert (data["worlds"], data["seeds"], data["redrawn"]) == (3, [0, 1, 2], 0)
-    assert [row["policy"] for row in data["satisfied"]["rows"]] == ["known-map", "baseline", "oracle"]
+    (cell,) = data["cells"]
+    assert (cell["worlds"], cell["world_numbers"], cell["redrawn"]) == (3, [0, 1, 2], 0)
+    assert [row["policy"] for row in cell["satisfied"]["rows"]] == ["known-map", "baseline", "oracle"]
     with (tmp_path / "trials.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 9
     oracle = [float(row["cost"]) for row in rows if row["policy"] == "oracle"]
-    assert data["charged"]["rows"][2]["mean_cost"] == pytest.approx(sum(oracle) / 3)
+    assert cell["charged"]["rows"][2]["mean_cost"] == pytest.approx(sum(oracle) / 3)
     # 20 (H + W) on the toy's 9 by 15 cells.
     assert {float(row["budget"]) for row in rows} == {480.0}
-    assert "how trials ended" in (tmp_path / "table.txt").read_text()
+    assert "3 of 3" in (tmp_path / "table.txt").read_text()
     assert Image.open(tmp_path / "scatter.png").size[0] > 400
-    assert "world 2" in result.stderr
+    assert "9 of 9 trials" in result.stderr
+
+
+def test_a_comparison_is_a_sweep_that_the_other_commands_show(tmp_path):
+    command = (
+        "compare",
+        "toy",
+        "-t",
+        "2",
+        "--policies",
+        "baseline",
+        "--trials",
+        "2",
+        "--world",
+        "4",
+        "--out",
+        tmp_path,
+    )
+    compared = _json(_potlp(*command, "--json"))
+    assert _json(_potlp("sweep", "show", tmp_path, "--json")) == compared
+    assert compared["cells"][0]["world_numbers"] == [4, 5]
+    longer = _json(_potlp(*command, "--json", "--trials", "3"))
+    assert longer["cells"][0]["world_numbers"] == [4, 5, 6]
 
 
 def test_impossible_worlds_are_redrawn(monkeypatch):
@@ -267,18 +290,18 @@ def test_impossible_worlds_are_redrawn(monkeypatch):
     monkeypatch.setattr(Toy, "generate", generate)
     assert ToyConfig().height == 9
     data = _json(_potlp("compare", "toy", "-t", "2", "--policies", "baseline", "--trials", "2", "--json"))
-    assert (data["seeds"], data["redrawn"]) == ([2, 3], 2)
+    assert (data["cells"][0]["world_numbers"], data["cells"][0]["redrawn"]) == ([2, 3], 2)
 
 
 def test_task_that_is_never_possible_fails(monkeypatch):
-    monkeypatch.setattr("potlp_jax.cli.compare.IMPOSSIBLE_IN_A_ROW", 3)
+    monkeypatch.setattr("potlp_jax.sweep.runner.IMPOSSIBLE_IN_A_ROW", 3)
     result = _potlp("compare", "toy", "--task", "!hazard U (goal & hazard)", "--policies", "baseline")
-    assert result.exit_code == 1
+    assert result.exit_code == 2
     assert "impossible in 3 worlds in a row" in result.stderr
 
 
 def test_unknown_environment_lists_the_known_ones():
-    with pytest.raises(WorldError, match="toy, firefighting, delivery, parcels, rooms"):
+    with pytest.raises(PotlpError, match="toy, firefighting, delivery, parcels, rooms"):
         make("castle")
 
 
@@ -307,10 +330,10 @@ def test_exit_codes_of_the_process():
 def test_interrupt_has_exit_code_130():
     interrupted = _process(
         "import signal, os, sys\n"
-        "import potlp_jax.cli.task as command\n"
+        "import potlp_jax.environments.tasks as tasks\n"
         # A process started in the background inherits that interrupts are ignored.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "command.show_task = lambda *args: os.kill(os.getpid(), signal.SIGINT)\n"
+        "tasks.read_task = lambda *args: os.kill(os.getpid(), signal.SIGINT)\n"
         "sys.argv = ['potlp', 'task', 'F a']\n"
         "from potlp_jax.cli import main\n"
         "main()\n"
@@ -319,11 +342,80 @@ def test_interrupt_has_exit_code_130():
     assert "Traceback" not in interrupted.stderr
 
 
-def test_help_loads_neither_pictures_nor_spot():
+LIGHT = """
+import sys
+slow = {'jax', 'numpy', 'scipy', 'matplotlib', 'spot', 'cv2', 'yaml'} & set(sys.modules)
+sys.exit(', '.join(slow) or 0)
+"""
+
+
+def test_importing_the_commands_loads_nothing_of_the_library():
+    # Every command's file, so that help and completion of each are quick.
     result = _process(
-        "import sys\n"
-        "import potlp_jax.cli\n"
-        "slow = {'matplotlib', 'spot', 'cv2'} & set(sys.modules)\n"
-        "sys.exit(', '.join(slow) or 0)\n"
+        "import importlib\n"
+        "from potlp_jax.cli.group import COMMANDS\n"
+        "for module in COMMANDS.values(): importlib.import_module(module)\n"
+        + LIGHT
+        + "sys.exit(', '.join(slow) or 0)\n"
     )
     assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("potlp ru", ["run"]),
+        ("potlp run fire", ["firefighting"]),
+        ("potlp run firefighting --task ", ["1", "2", "3", "4"]),
+        ("potlp run toy --policy o", ["optimistic", "oracle"]),
+        ("potlp run toy --split t", ["training", "test"]),
+        ("potlp compare toy --policies oracle,p", ["oracle,potlp"]),
+        ("potlp bench --environment del", ["delivery"]),
+        ("potlp sweep ex", ["export"]),
+    ],
+)
+def test_the_shell_is_told_what_may_follow(line, expected):
+    result = CliRunner().invoke(
+        app,
+        env={
+            "_POTLP_COMPLETE": "complete_bash",
+            "COMP_WORDS": line,
+            "COMP_CWORD": str(len(line.split(" ")) - 1),
+        },
+        prog_name="potlp",
+    )
+    assert result.stdout.split() == expected
+
+
+def test_completion_loads_nothing_of_the_library():
+    result = _process(
+        "import os\n"
+        "os.environ |= {'_POTLP_COMPLETE': 'complete_bash', 'COMP_WORDS': 'potlp run fire', 'COMP_CWORD': '2'}\n"
+        "from potlp_jax.cli import app\n"
+        "try: app(prog_name='potlp')\n"
+        "except SystemExit: pass\n" + LIGHT
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.split() == ["firefighting"]
+
+
+def test_completed_names_are_those_of_the_library():
+    assert tuple(Policy) == completion.POLICIES
+    assert tuple(Split) == completion.SPLITS
+    assert {name: tuple(make(name).tasks) for name in NAMED} == dict(completion.TASKS)
+
+
+@pytest.mark.parametrize("flag", ["--quiet", "--verbose"])
+def test_quiet_and_verbose_govern_what_is_said_on_stderr(flag):
+    result = _potlp(flag, "run", "toy", "-t", "2")
+    assert result.exit_code == 0
+    assert "satisfied" in result.stdout
+    if flag == "--quiet":
+        assert result.stderr == ""
+    else:
+        assert "no estimator is shipped for toy" in result.stderr
+        assert "decision 0" in result.stderr
+
+
+def test_quiet_still_tells_errors():
+    assert "castle" in _potlp("--quiet", "run", "castle").stderr

@@ -1,4 +1,4 @@
-"""What the documentation says is so: examples run, commands parse, paths and links exist, figures are those of the data.
+"""What the documentation says is true: examples run, commands parse, paths and links exist, figures are the data's.
 
 Examples are the fenced blocks of README and docs. A comment before a block says how it is tested, invisible to readers:
 

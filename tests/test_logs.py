@@ -16,9 +16,9 @@ from potlp_jax.cli import app
 from potlp_jax.environments.ros.places import Places, load_places
 from potlp_jax.errors import LogError, MapError, RecordError
 from potlp_jax.learning.dataset import decode, encode, finished_shards, read_dataset, samples_file, views_file
-from potlp_jax.learning.mistake_costs import WeightBounds
 from potlp_jax.learning.questions import TaskDistribution
-from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views, settled, survey
+from potlp_jax.learning.recording import Pose, Recorder, RecordingConfig, record_views, settled, survey
+from potlp_jax.learning.sample_weights import WeightBounds
 from potlp_jax.logs import writing
 from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
 from potlp_jax.logs.drive import Eyes
@@ -107,7 +107,7 @@ def test_a_dataset_from_a_bag_has_the_rows_of_the_simulator(bags, tmp_path, kind
     (count,) = collect_drives([drive], places_of(bags), tmp_path, "toy", "training", config)
     views, samples = pd.read_parquet(views_file(tmp_path, 0)), pd.read_parquet(samples_file(tmp_path, 0))
 
-    recorder = Recorder(0, ViewConfig(views_per_world=200, **settings), WeightBounds.of_map(*WORLD.shape, 1.0))
+    recorder = Recorder(0, RecordingConfig(views_per_world=200, **settings), WeightBounds.of_map(*WORLD.shape, 1.0))
     rng = np.random.default_rng([0, zlib.crc32(b"training"), 0])
     pool = [TaskDistribution(TOY.propositions).draw(rng) for _ in range(2)]
     record_views(recorder, WORLD, 0, _simulated_poses(), pool, rng, lambda pose: panorama_of(pose.step))

@@ -37,15 +37,20 @@ def episode(env, key):
 
 
 def shapes(tree):
-    return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree)
+    return [(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)]
+
+
+def shapes_of(function, *arguments):
+    """Of the leaves that a function would return; whole classes would have their annotations checked."""
+    return shapes(jax.eval_shape(lambda *arguments: jax.tree.leaves(function(*arguments)), *arguments))
 
 
 def test_types_are_the_same_at_every_step(env):
-    state, first = jax.eval_shape(env.reset, jax.random.key(0))
-    after, time_step = jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((), jnp.int32))
-    assert shapes(after) == shapes(state)
-    assert jax.tree.structure(after) == jax.tree.structure(state)
-    assert shapes(time_step) == shapes(first)
+    state, first = jax.jit(env.reset)(jax.random.key(0))
+    after, time_step = jax.jit(env.step)(state, jnp.int32(0))
+    assert shapes_of(env.reset, jax.random.key(0)) == shapes((state, first))
+    assert shapes_of(env.step, state, jnp.int32(0)) == shapes((state, first)) == shapes((after, time_step))
+    assert jax.tree.structure((after, time_step)) == jax.tree.structure((state, first))
     assert first.observation.action_mask.shape == (env.num_actions,)
 
 
@@ -71,8 +76,8 @@ def test_the_same_key_gives_the_same_episode_alone_and_in_a_batch(env):
     together = jax.jit(jax.vmap(lambda key: episode(env, key)[1]))(keys)
     alone = [jax.jit(lambda key: episode(env, key)[1])(key) for key in keys]
     for number, steps in enumerate(alone):
-        same = jax.tree.map(lambda one, batch, number=number: np.array_equal(one, batch[number]), steps, together)
-        assert all(jax.tree.leaves(same))
+        for one, batch in zip(jax.tree.leaves(steps), jax.tree.leaves(together), strict=True):
+            np.testing.assert_array_equal(one, batch[number])
 
 
 def _rewards_of_choices(env, world, actions):
@@ -124,3 +129,21 @@ def test_an_episode_that_its_budget_ends_is_truncated():
         state, time_step = jax.jit(tight.step)(state, jnp.int32(tight.num_actions - 1))
     assert OUTCOME_NAMES[int(time_step.extras["outcome"])] == "budget"
     assert float(time_step.discount) == 1.0
+
+
+def test_the_gymnasium_wrapper_passes_gymnasiums_own_check():
+    pytest.importorskip("gymnasium", reason="gymnasium is not installed: pip install 'potlp-jax[gym]'")
+    from gymnasium.utils.env_checker import check_env
+
+    from potlp_jax.rl.gym import GymTaskEnv
+
+    wrapped = GymTaskEnv(Toy(ToyConfig(height=7, width=11)), task=2, worlds=5)
+    check_env(wrapped)
+    observation, info = wrapped.reset(seed=3, options={"world": 1})
+    cost, ended = 0.0, False
+    while not ended:
+        action = wrapped.action_space.sample(mask=info["action_mask"].astype(np.int8))
+        observation, reward, terminated, truncated, info = wrapped.step(action)
+        assert observation in wrapped.observation_space
+        cost, ended = cost - reward, terminated or truncated
+    assert cost == pytest.approx(info["cost"], rel=1e-5) or info["outcome"] != "satisfied"

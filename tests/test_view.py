@@ -23,7 +23,7 @@ from potlp_jax.task.task import Task
 from potlp_jax.trials.record import NEVER_SEEN, ActionRecord, Decision, Outcome, Trial
 from potlp_jax.view.animation import frame_steps, save_animation
 from potlp_jax.view.automata import Automaton, draw_automaton
-from potlp_jax.view.comparisons import draw_scatter, loss_lines, outcome_table, savings_table
+from potlp_jax.view.comparisons import comparison_table, draw_scatter, remark_lines
 from potlp_jax.view.decisions import action_name, action_table, decision_to_dict, describe_decision, rank_actions
 from potlp_jax.view.maps import (
     FREE_SEEN,
@@ -474,10 +474,14 @@ def test_comparison_tables():
         },
         resamples=50,
     )
-    console = Console(width=80, record=True, file=io.StringIO())
-    console.print(savings_table(comparison.satisfied, "satisfied"))
-    console.print(outcome_table(comparison))
+    console = Console(width=110, record=True, file=io.StringIO())
+    console.print(comparison_table(comparison))
     lines = [line.split() for line in console.export_text().splitlines()]
-    assert ["oracle", "80.0%", "80.0", "..", "80.0%", "40.0%", "40.0", "±", "0.0%", "12.0"] in lines
-    assert ["oracle", "2", "1"] in lines
-    assert loss_lines(comparison) == ["oracle: 1 trials with tree overflow (left out of the first table)"]
+    # The stuck trial is charged its budget of 100: (60 - 124) / (60 - 30) of what could be saved.
+    figures = ["2", "of", "3", "12.0", "80.0%", "80.0", "..", "80.0%", "40.0%", "40.0", "±", "0.0%", "-213.3%"]
+    assert ["oracle", *figures] in lines
+    remarks = remark_lines(comparison)
+    assert remarks[0].startswith("Costs and savings are of the 2 worlds")
+    assert "oracle: 1 stuck" in remarks
+    assert "oracle: 1 trials with tree overflow, left out of costs and savings" in remarks
+    assert remarks[-1].startswith("2 worlds are few")

@@ -39,12 +39,16 @@ def tree_memory(problem: PlanningProblem, config: SearchConfig) -> TreeMemory:
     Args:
       problem: an unbatched problem; only its shapes matter.
       config: settings of the search; ``simulations`` and ``tree_capacity`` decide.
+
+    Returns:
+      Bytes by array.
     """
 
     def fields_of_tree(problem: PlanningProblem) -> dict[str, jax.Array]:
         _, tree = search_tree(problem, jax.random.key(0), config)
         return {field.name: getattr(tree, field.name) for field in dataclasses.fields(tree)}
 
+    # Shapes are followed through the search without running it. The key needs no values either.
     fields = jax.eval_shape(fields_of_tree, problem)
     arrays = {name: math.prod(field.shape) * field.dtype.itemsize for name, field in fields.items()}
     return TreeMemory(arrays=arrays, nodes=config.capacity)

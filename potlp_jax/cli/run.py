@@ -1,60 +1,89 @@
 """``potlp run``: one trial, its record, picture and animation."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from potlp_jax.cli.inputs import (
-    default_policy,
-    make_world,
-    read_environment_task,
-    read_policy,
-    read_split,
-    read_trained_estimator,
-    trial_config,
+from potlp_jax.cli.group import Command, command_app
+from potlp_jax.cli.options import (
+    Environment,
+    EstimatorFile,
+    Json,
+    PolicyName,
+    Simulations,
+    SplitName,
+    TaskName,
+    WorldNumber,
 )
-from potlp_jax.cli.output import FAILED, console, output_folder, print_json, progress_bar
-from potlp_jax.environments.registry import make
-from potlp_jax.trials.loop import run_trial, trial_key
-from potlp_jax.trials.record import Outcome, Trial
-from potlp_jax.types import Status
-from potlp_jax.view.animation import save_animation
-from potlp_jax.view.maps import draw_trial
-from potlp_jax.view.style import save_figure
+from potlp_jax.cli.output import FAILED, console, make_folder, print_json, progress_bar
 
-RECORD = "trial.json"
+if TYPE_CHECKING:
+    from potlp_jax.trials.record import Trial
+
+app = command_app()
 
 
+@app.command(
+    "run",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp run toy --task 1[/cyan]
+
+[cyan]potlp run firefighting --task 3 --world 7 --out out/fire[/cyan]
+
+[cyan]potlp run firefighting --task "!fire U exit" --policy baseline --json[/cyan]
+
+[dim]Ends with exit code 1 if the task was not satisfied.[/dim]
+""",
+)
 def run_one(
-    environment: str,
-    task_name: str,
-    policy_name: str | None,
-    seed: int,
-    split_name: str | None,
-    out: Path | None,
-    animation: bool,
-    simulations: int | None,
-    estimator: Path | None,
-    json: bool,
+    environment: Environment,
+    task: TaskName = "1",
+    policy: PolicyName = None,
+    world: WorldNumber = 0,
+    split: SplitName = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for trial.json, trial.png and trial.gif.")
+    ] = None,
+    animation: Annotated[bool, typer.Option(help="Make the animation, the slowest of the three files.")] = True,
+    simulations: Simulations = None,
+    estimator: EstimatorFile = None,
+    json: Json = False,
 ) -> None:
-    """Run a trial and leave with exit code 1 if it did not end satisfied."""
+    """Run one trial: one world, one task, one policy."""
+    from potlp_jax.cli.inputs import (
+        default_policy,
+        make_world,
+        read_policy,
+        read_split,
+        read_trained_estimator,
+        trial_config,
+    )
+    from potlp_jax.environments.registry import make
+    from potlp_jax.environments.tasks import environment_task
+    from potlp_jax.trials.loop import run_trial, trial_key
+    from potlp_jax.trials.record import Outcome
+
     generator = make(environment)
-    split = read_split(split_name, generator)
-    policy = default_policy(generator) if policy_name is None else read_policy(policy_name)
+    chosen_split = read_split(split, generator)
+    chosen_policy = default_policy(generator) if policy is None else read_policy(policy)
     trained = read_trained_estimator(estimator)
-    task = read_environment_task(generator, task_name)
-    world = make_world(generator, split, seed)
-    folder = output_folder(out)
+    asked = environment_task(generator, task)
+    made = make_world(generator, chosen_split, world)
+    folder = None if out is None else make_folder(out)
     with progress_bar() as progress:
         progress.add_task("running the trial (the first decision compiles the planner)", total=None)
         trial = run_trial(
-            world,
-            task,
-            policy,
-            trial_key(seed),
+            made,
+            asked,
+            chosen_policy,
+            trial_key(world),
             trial_config(simulations, generator),
-            environment=f"{environment}/{split}",
-            seed=seed,
+            environment=f"{environment}/{chosen_split}",
+            seed=world,
             estimator=trained,
         )
     files = [] if folder is None else _write(trial, folder, animation)
@@ -66,7 +95,12 @@ def run_one(
         raise typer.Exit(FAILED)
 
 
-def _write(trial: Trial, folder: Path, animation: bool) -> list[Path]:
+def _write(trial: "Trial", folder: Path, animation: bool) -> list[Path]:
+    from potlp_jax.cli.inputs import RECORD
+    from potlp_jax.view.animation import save_animation
+    from potlp_jax.view.maps import draw_trial
+    from potlp_jax.view.style import save_figure
+
     files = [folder / RECORD, folder / "trial.png"]
     trial.save(files[0])
     save_figure(draw_trial(trial), files[1])
@@ -80,7 +114,10 @@ def _write(trial: Trial, folder: Path, animation: bool) -> list[Path]:
     return files
 
 
-def _print(trial: Trial, files: list[Path]) -> None:
+def _print(trial: "Trial", files: list[Path]) -> None:
+    from potlp_jax.trials.record import Outcome
+    from potlp_jax.types import Status
+
     out = console()
     colour = "green" if trial.outcome is Outcome.SATISFIED else "red"
     out.print(f"[bold {colour}]{trial.outcome.value}[/]  cost {trial.cost:.2f}")

@@ -1,26 +1,52 @@
 """``potlp task``: what a formula means."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import typer
 from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
-from potlp_jax.cli.inputs import read_task
+from potlp_jax.cli.group import Command, command_app
+from potlp_jax.cli.options import Formula, Json, Propositions
 from potlp_jax.cli.output import console, print_json
-from potlp_jax.view.automata import Automaton, draw_automaton
-from potlp_jax.view.style import save_figure
+
+app = command_app()
 
 
+@app.command(
+    "task",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp task "F goal"[/cyan]
+
+[cyan]potlp task "(!fire U extinguisher) & F fire" --propositions fire,extinguisher,exit --svg task.svg[/cyan]
+
+[cyan]potlp task automaton.hoa --json[/cyan]
+""",
+)
 def show_task(
-    formula: str, propositions: str | None, max_positive_literals: int | None, svg: Path | None, json: bool
+    formula: Formula,
+    propositions: Propositions = None,
+    max_positive_literals: Annotated[
+        int | None, typer.Option(min=0, help="Leave out ways that need more propositions to hold in one place.")
+    ] = None,
+    svg: Annotated[Path | None, typer.Option("--svg", help="Draw the automaton (.svg, .png or .pdf).")] = None,
+    json: Json = False,
 ) -> None:
-    """Print the automaton of a formula, and draw it if asked to."""
-    names = None if propositions is None else [name.strip() for name in propositions.split(",") if name.strip()]
-    task = read_task(formula, names, max_positive_literals)
+    """Show a task as an automaton: states, transitions, and the outcomes that have to be estimated."""
+    from potlp_jax.cli.inputs import read_names
+    from potlp_jax.environments.tasks import read_task
+
+    task = read_task(formula, read_names(propositions), max_positive_literals)
     description = task.describe()
     if svg is not None:
+        from potlp_jax.view.automata import Automaton, draw_automaton
+        from potlp_jax.view.style import save_figure
+
         save_figure(draw_automaton(Automaton.from_description(description), task.text), svg)
     if json:
         print_json(description)

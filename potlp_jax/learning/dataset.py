@@ -181,6 +181,11 @@ def decode(image: bytes) -> UInt8[np.ndarray, "rows columns 3"]:
     return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
 
 
+def writer_versions() -> dict[str, str]:
+    """Versions of the libraries that encode the images and write the files."""
+    return {"pyarrow": pa.__version__, "opencv": cv2.__version__}
+
+
 def views_file(folder: Path | str, shard: int) -> Path:
     """The file of a shard's views."""
     return Path(folder) / f"views-{shard:05d}.parquet"

@@ -55,7 +55,7 @@ def load_estimator(path: Path | str) -> tuple[Params, NetworkConfig, dict[str, A
             arrays = {name: file[name] for name in file.files}
         header = json.loads(arrays.pop(_HEADER).tobytes().decode())
     except FileNotFoundError as error:
-        raise CheckpointError(f"there is no estimator {path}: train one (python -m train.fit)") from error
+        raise CheckpointError(f"there is no estimator {path}: train one (potlp fit)") from error
     except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
         raise CheckpointError(f"{path} is not an estimator, or is damaged ({error}): get it again") from error
     if not isinstance(header, dict) or header.get("format") != ESTIMATOR_FORMAT:

@@ -15,7 +15,6 @@ map, as the planner's dead ends do: otherwise an agent would learn that the chea
 import dataclasses
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -261,8 +260,3 @@ class TaskEnv:
             # After the end there is nothing to choose.
             action_mask=self._action_mask(situation) & progress.running,
         )
-
-
-def shape_of(env: TaskEnv) -> Any:
-    """Shapes and types of a state and a time step, without making one."""
-    return jax.eval_shape(env.reset, jax.random.key(0))

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import jax
 
-from potlp_jax.environments.base import Generator
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, world_key
+from potlp_jax.environments.tasks import environment_task
 from potlp_jax.errors import WorldError
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, read_estimator
 from potlp_jax.planning.policies import Policy
@@ -62,6 +62,9 @@ class Sweep:
     def __init__(self, specification: Specification, folder: Path) -> None:
         self.specification = specification
         self.store = Store(folder / RESULTS)
+        # Every policy visits the worlds of a block; the objects are the sweep's own, so that sweeps share nothing.
+        self._generator = lru_cache(maxsize=None)(make)
+        self._world = lru_cache(maxsize=4 * BLOCK)(self._make_world)
         self.store.agree({"specification": specification.to_dict(), "estimator": self._estimator_identity()})
 
     @property
@@ -154,12 +157,12 @@ class Sweep:
         config = self.specification.config
         trained = self._trained(environment) if policy is Policy.POTLP else None
         for item, trial in self._trials(items, environment, policy):
-            world = _world(environment, self.specification.split.value, item.world)
+            world = self._world(environment, item.world)
             yield batch_row(item, trial, world, self._key(item.world), config, versions(trained))
 
     def _trials(self, items: Iterable[Item], environment: str, policy: Policy) -> Iterator[tuple[Item, Finished]]:
         def start(item: Item) -> Start:
-            world = _world(environment, self.specification.split.value, item.world)
+            world = self._world(environment, item.world)
             return Start(world, self._tasks[environment, item.task][1], self._key(item.world), name=item)
 
         trained = self._trained(environment) if policy is Policy.POTLP else None
@@ -172,7 +175,7 @@ class Sweep:
         policy = Policy(item.policy)
         task, arrays = self._tasks[item.environment, item.task]
         return run_trial(
-            _world(item.environment, self.specification.split.value, item.world),
+            self._world(item.environment, item.world),
             task,
             policy,
             self._key(item.world),
@@ -183,6 +186,10 @@ class Sweep:
             estimator=self._trained(item.environment) if policy is Policy.POTLP else None,
         )
 
+    def _make_world(self, environment: str, number: int) -> World:
+        generator = self._generator(environment)
+        return generator.generate(world_key(self.specification.split, number, generator.name))
+
     def _key(self, world: int) -> jax.Array:
         """Of all trials in a world: it makes no world, and folded by name it serves planning and sensing."""
         return trial_key(world, self.specification.seed)
@@ -191,7 +198,7 @@ class Sweep:
     def _tasks(self) -> dict[tuple[str, str], tuple[Task, TaskArrays]]:
         """Tasks by environment and formula, padded per environment to one size: one compilation serves all."""
         tasks = {
-            (cell.environment, cell.task): Task.of_formula(cell.task, _generator(cell.environment).propositions)
+            (cell.environment, cell.task): environment_task(self._generator(cell.environment), cell.task)
             for cell in self.specification.cells
         }
         sizes: dict[str, TaskSizes] = {}
@@ -205,7 +212,7 @@ class Sweep:
         return None if path is None else read_estimator(path)
 
     def _trained(self, environment: str) -> TrainedEstimator:
-        return estimator_for(_generator(environment).propositions, self._estimator)
+        return estimator_for(self._generator(environment).propositions, self._estimator)
 
     def _estimator_identity(self) -> str | None:
         """Of the network, so that a store never mixes two. Raises CheckpointError where there is none for a task."""
@@ -287,15 +294,3 @@ def _work(specification: Specification, folder: Path, core: int | None) -> None:
             return
         if not sweep.step():
             time.sleep(WAIT)
-
-
-@lru_cache(maxsize=8)
-def _generator(environment: str) -> Generator:
-    return make(environment)
-
-
-@lru_cache(maxsize=4 * BLOCK)
-def _world(environment: str, split: str, world: int) -> World:
-    """The worlds of a block, which every policy visits."""
-    generator = _generator(environment)
-    return generator.generate(world_key(split, world, generator.name))

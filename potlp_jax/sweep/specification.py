@@ -21,20 +21,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from potlp_jax.codec import config_from_dict, json_copy, with_settings
+from potlp_jax.codec import config_from_dict, json_copy, read_settings, settings_file, with_settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
-from potlp_jax.errors import SpecificationError, WorldError
+from potlp_jax.environments.tasks import environment_task
+from potlp_jax.errors import SpecificationError, TaskError, WorldError
 from potlp_jax.planning.policies import Policy
-from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """One cell of the sweep's grid: ``worlds`` trials of every policy. ``task`` is a formula."""
+    """One cell of the sweep's grid: ``worlds`` trials of every policy. ``task`` is a formula or a ``.hoa`` file."""
 
     environment: str
     task: str
@@ -97,25 +95,15 @@ def configuration_hash(config: TrialConfig) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def read_specification(path: Path) -> Specification:
-    """Read and check a specification.
+def read_specification(given: str | Path) -> Specification:
+    """Read and check a specification: a file, or the name of one that is shipped (``potlp_jax/sweep/data``).
 
     Raises:
-        SpecificationError: the file or one of its entries is wrong.
-        ConfigurationError: a setting is.
+        ConfigurationError: there is no such file, or one of its entries is wrong.
         TaskError, WorldError: a formula or an environment is.
     """
-    return specification_from_dict(_read_yaml(path), str(path), path.parent)
-
-
-def _read_yaml(path: Path) -> Mapping[str, Any]:
-    try:
-        data = yaml.safe_load(path.read_text("utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise SpecificationError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(data, Mapping):
-        raise SpecificationError(f"{path}: give a mapping with environments, tasks, policies and worlds")
-    return data
+    path = settings_file(given, "potlp_jax.sweep")
+    return specification_from_dict(read_settings(path), str(path), path.parent)
 
 
 _REQUIRED = ("environments", "tasks", "policies", "worlds")
@@ -194,15 +182,13 @@ def _split(name: Any, environments: Sequence[str], where: str) -> Split:
 
 
 def _formula(environment: str, task: Any, where: str) -> str:
-    """The formula of a task that is given by number, or as a formula. Raises for formulas that are no task."""
+    """A task by number as its formula, any other (a formula, a ``.hoa`` file) as it is. Raises for what is no task."""
     generator = make(environment)
-    text = str(task)
-    formula = generator.tasks.get(text, text)
-    if text.isdecimal() and formula == text:
-        known = ", ".join(generator.tasks) or "none"
-        raise SpecificationError(f"{where}: tasks: {environment} has no task {text}; it has: {known}")
-    Task.of_formula(formula, generator.propositions)
-    return formula
+    try:
+        environment_task(generator, str(task))
+    except TaskError as error:
+        raise SpecificationError(f"{where}: tasks: {error}") from error
+    return generator.tasks.get(str(task), str(task))
 
 
 def _common_config(environments: Sequence[str], where: str) -> TrialConfig:

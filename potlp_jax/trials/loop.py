@@ -5,6 +5,7 @@ The loop knows a ``Robot`` only; the simulator is one, and a real robot is anoth
 
 import dataclasses
 import importlib.metadata
+import logging
 from collections import Counter
 
 import jax
@@ -25,6 +26,8 @@ from potlp_jax.trials.record import ActionRecord, Decision, Outcome, Trial
 from potlp_jax.trials.robot import DIAGONAL, Robot, SimulatedRobot, Stop, as_cell
 from potlp_jax.types import NO_ACTION
 from potlp_jax.world.grid import BeliefMap, World
+
+logger = logging.getLogger(__name__)
 
 STUCK_REPEATS: int = 3
 """Decisions in the same cell, state and map after which a trial counts as stuck."""
@@ -169,6 +172,7 @@ class Loop:
         looks = _looks_of(self._estimator, move)
         self.decisions.append(_decision_record(move, index, len(self.path) - 1, cell, self.states[-1], key, looks))
         self.status |= int(move.status)
+        logger.debug("decision %d in cell %s, automaton state %d", index, cell, self.states[-1])
         return move
 
     def _advance(self, belief: BeliefMap, move: Move) -> None:

@@ -4,6 +4,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int32, UInt8
 
 from potlp_jax.codec import config_from_dict
@@ -85,6 +86,12 @@ def panorama_at(trial: Trial, decision: Decision, config: TrialConfig | None = N
         raise ValueError("the trial's camera was disturbed: its panoramas cannot be made again without the trial's key")
     cell = jnp.asarray(decision.cell, jnp.int32)
     return photograph(trial.world, cell, jax.random.key(0), config.camera, config.disturbance)
+
+
+def panoramas_of(trial: Trial) -> dict[int, UInt8[np.ndarray, "rows columns 3"]]:
+    """What the camera saw at the decisions whose panoramas were used, by number; none for policies that do not look."""
+    looks = sorted({look for decision in trial.decisions for look in decision.looks})
+    return {look: np.asarray(panorama_at(trial, trial.decisions[look])) for look in looks}
 
 
 @partial(jax.jit, static_argnames=("config",))

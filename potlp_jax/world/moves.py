@@ -134,7 +134,7 @@ def step_length(before: Int32[Array, "*batch 2"], after: Int32[Array, "*batch 2"
     return jnp.where(jnp.all(before != after, axis=-1), DIAGONAL, 1.0).astype(jnp.float32)
 
 
-def step_lengths(path: Path) -> Float64[np.ndarray, " moves"]:
+def step_lengths(path: Path) -> Float64[np.ndarray, " steps"]:
     """Length of each move of a path; empty for a path of one cell."""
     cells = np.asarray(path)
     return np.where(np.all(cells[1:] != cells[:-1], axis=1), DIAGONAL, 1.0)

@@ -26,9 +26,10 @@ from potlp_jax.environments.base import Generator
 from potlp_jax.environments.campus.delivery import DeliveryConfig
 from potlp_jax.environments.campus.furnishing import NO_ROOM, PARCELS, Floor, FurnishConfig, Kind, Placement, furnish
 from potlp_jax.environments.options import parse_options
+from potlp_jax.environments.ros.cleaning import CleanMap, clean_map
 from potlp_jax.environments.ros.map_files import load_map
 from potlp_jax.environments.ros.places import Region, load_regions
-from potlp_jax.environments.ros.ros_map import NARROW_DOORS, CleanMap, clean_map
+from potlp_jax.environments.ros.ros_map import NARROW_DOORS
 from potlp_jax.environments.splits import PARCELS_PREFIX
 from potlp_jax.errors import MapError, MapWarning
 from potlp_jax.world.camera import CameraConfig

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32
 from scipy import ndimage
 
+from potlp_jax.environments.ros.cleaning import CleanMap
 from potlp_jax.environments.ros.map_files import GridFrame, OccupancyMap
 from potlp_jax.environments.ros.places import Point, component_labels
-from potlp_jax.environments.ros.ros_map import CleanMap
 
 WIDEST = 1.5
 """Metres from which on a way from one part of a building to another is no passage but open space."""

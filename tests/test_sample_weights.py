@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from potlp_jax.learning.mistake_costs import WeightBounds, loss_weights
+from potlp_jax.learning.sample_weights import WeightBounds, loss_weights
 from potlp_jax.planning.estimates import Estimates
 
 BOUNDS = WeightBounds(low=2.0, high=50.0)
