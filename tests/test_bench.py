@@ -220,11 +220,11 @@ def test_importing_the_package_leaves_the_cache_off(tmp_path):
 
 
 CACHED = """
-import json, jax
 from potlp_jax.cache import enable_compilation_cache
+folder = enable_compilation_cache()
+import json, jax
 hits = []
 jax.monitoring.register_event_listener(lambda event, **_: hits.append(event.endswith("/cache_hits")))
-folder = enable_compilation_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig

@@ -18,7 +18,6 @@ planners' time is divided by the rows. Writes ``regret.json``, ``regret.md`` and
 import argparse
 import functools
 import hashlib
-import importlib.util
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -31,6 +30,7 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 
+from eval.bench.opponents import installed
 from potlp_jax.bench.problems import FAMILIES, SUBGOAL_COUNTS, Split, family_problem
 from potlp_jax.planning.exact.api import ProblemTooLargeError, bound_exact, solve_exact
 from potlp_jax.planning.problem import PlanningProblem
@@ -230,7 +230,6 @@ PLANNERS: dict[str, Callable[..., Iterator[Answer]]] = {
     "pomdp-py": pomdp_py,
     "mctx": mctx,
 }
-NEEDS = {"numba": ["numba"], "pomdp-py": ["numba", "pomdp_py"], "mctx": ["mctx"]}
 FEW = {"pomdp-py": 6}
 """Instances of a planner too slow for all."""
 LARGEST = {"ours": 1000, "authors_code": 1000, "pomdp-py": 1000, "mctx": 1000}
@@ -413,11 +412,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
         parsed.families, parsed.subgoals, parsed.instances = ["two"], [4], 6
         parsed.budgets, parsed.split = [30, 300], "tuning"
     parsed.budgets = sorted(parsed.budgets)
-    for name in list(parsed.planners):
-        missing = [module for module in NEEDS.get(name, ()) if importlib.util.find_spec(module) is None]
-        if missing:
-            print(f"{name} is left out: {', '.join(missing)} is not installed (extra 'bench')")
-            parsed.planners.remove(name)
+    parsed.planners = installed(parsed.planners)
     return parsed
 
 

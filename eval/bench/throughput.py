@@ -16,7 +16,6 @@ and the batch, with the exponents of a fit in double-logarithmic scale. Writes J
 
 import argparse
 import functools
-import importlib.util
 import json
 import platform
 import statistics
@@ -31,6 +30,7 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 
+from eval.bench.opponents import installed
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions, search
 from potlp_jax.planning.search.graph import SearchConfig, SearchMode
@@ -236,7 +236,6 @@ PROGRAMS: dict[str, Callable[[PlanningProblem, int], Prepared]] = {
     "pomdp-py": _pomdp_py,
     "numba": _numba,
 }
-NEEDS = {"numba": ["numba"], "pomdp-py": ["numba", "pomdp_py"], "mctx": ["mctx"]}
 MOST_ROWS = {"mctx": 64, "pomdp-py": 1, "numba": 1}
 """Batches beyond which a program is not asked: one tree at a time, or more than its rate is worth waiting for."""
 
@@ -332,11 +331,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parsed = parser.parse_args(arguments)
     if parsed.quick:
         parsed.batches, parsed.simulations, parsed.repeats = [1, 16], 100, 1
-    for name in list(parsed.programs):
-        missing = [module for module in NEEDS.get(name, ()) if importlib.util.find_spec(module) is None]
-        if missing:
-            print(f"{name} is left out: {', '.join(missing)} is not installed (extra 'bench')")
-            parsed.programs.remove(name)
+    parsed.programs = installed(parsed.programs)
     return parsed
 
 
