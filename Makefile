@@ -5,13 +5,13 @@ PYTHON ?= $(shell for name in python3.12 python3.11 python3; do \
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint site clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" && $(PYTHON) -c '$(SUPPORTED)' \
 	  || { echo "potlp-jax needs Python 3.11 or 3.12; name one: make PYTHON=/path/to/python3.11 demo"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev,docs]'
 	@touch $@
 
 demo: $(VENV)/installed  ## Fire-fighting task 2 in five worlds: a table, both policies in world 2 side by side, an animation
@@ -27,6 +27,9 @@ lint: $(VENV)/installed  ## Style, format and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+
+site: $(VENV)/installed  ## The documentation, in out/site; warnings are errors
+	$(BIN)/mkdocs build --strict --quiet
 
 clean:
 	rm -rf $(VENV) out
