@@ -66,7 +66,7 @@ def run_bench(
     from potlp_jax.bench.planner import make_scene, make_world, measure_search
     from potlp_jax.bench.problems import FAMILIES
     from potlp_jax.bench.timing import environment as describe_environment
-    from potlp_jax.cli.inputs import trial_config
+    from potlp_jax.cli.inputs import setting_changes, trial_config
     from potlp_jax.environments.registry import make
     from potlp_jax.learning.estimator import estimator_for
 
@@ -76,7 +76,7 @@ def run_bench(
         fail(f"unknown family {family!r}; choose from: {', '.join(FAMILIES)}")
     # Before anything starts XLA, which counts the cores once.
     _pin(core)
-    decision = trial_config(simulations).decision
+    decision = trial_config(setting_changes(simulations=simulations)).decision
     rows: dict[str, list[Any]] = {}
     with progress_bar() as progress:
         bar = progress.add_task("compiling and measuring", total=None)

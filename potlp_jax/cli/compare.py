@@ -15,6 +15,7 @@ from potlp_jax.cli.options import (
     Environment,
     EstimatorName,
     Json,
+    SearchName,
     Simulations,
     SplitName,
     TaskName,
@@ -64,6 +65,7 @@ def compare_policies(
         typer.Option("--out", "-o", help="Folder for the sweep, compare.json, trials.csv, scatter.png and table.txt."),
     ] = None,
     simulations: Simulations = None,
+    search: SearchName = None,
     estimator: EstimatorName = None,
     camera: CameraName = None,
     processes: Annotated[int, typer.Option(min=1, help="Workers, each on a core of its own.")] = 1,
@@ -74,7 +76,7 @@ def compare_policies(
     json: Json = False,
 ) -> None:
     """Compare policies in the same worlds, with the share of attainable savings and its uncertainty."""
-    from potlp_jax.cli.inputs import default_policy, read_names, read_split
+    from potlp_jax.cli.inputs import default_policy, read_names, read_split, setting_changes
     from potlp_jax.environments.registry import make
     from potlp_jax.sweep.specification import specification_from_dict
 
@@ -90,7 +92,7 @@ def compare_policies(
         "worlds": trials,
         "split": read_split(split, generator).value,
         "first_world": world,
-        "settings": _settings(simulations, camera),
+        "settings": setting_changes(simulations=simulations, search=search, camera=camera),
     }
     if estimator is not None:
         entries["estimator"] = estimator
@@ -113,12 +115,6 @@ def compare_policies(
     if out is not None:
         console().print(f"wrote {', '.join(file.name for file in files)} in {out}", markup=False)
         console().print(f"next: potlp report {out}", markup=False, style="dim")
-
-
-def _settings(simulations: int | None, camera: str | None) -> dict[str, Any]:
-    """What the options change of the settings that the environment calls for."""
-    search = {} if simulations is None else {"decision": {"search": {"simulations": simulations}}}
-    return search if camera is None else {**search, "camera": {"renderer": camera}}
 
 
 def _run(specification: "Specification", folder: Path, processes: int) -> "Results":

@@ -25,6 +25,7 @@ TASKS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 """Numbers of the tasks of the environments that need no file."""
 
 POLICIES = ("known-map", "baseline", "optimistic", "oracle", "potlp")
+SEARCHES = ("best-first", "uct")
 SPLITS = ("calibration", "training", "validation", "test")
 
 
@@ -62,6 +63,11 @@ def complete_recipe(incomplete: str) -> list[str]:
     """Shipped recipes."""
     folder = Path(str(resources.files("potlp_jax.recipes"))) / "data"
     return _starting([path.stem for path in sorted(folder.glob("*.yaml"))], incomplete)
+
+
+def complete_search(incomplete: str) -> list[str]:
+    """Names of the searches of policies that search."""
+    return _starting(SEARCHES, incomplete)
 
 
 def complete_split(incomplete: str) -> list[str]:

@@ -46,7 +46,7 @@ def export_task(
     json: Json = False,
 ) -> None:
     """Export the planner as programs of plain arrays that run with jax alone."""
-    from potlp_jax.cli.inputs import read_names, trial_config
+    from potlp_jax.cli.inputs import read_names, setting_changes, trial_config
     from potlp_jax.export import MANIFEST, ExportConfig, export_planner
     from potlp_jax.task.reading import read_task
 
@@ -55,7 +55,7 @@ def export_task(
     config = ExportConfig(
         grid=None if height is None or width is None else (height, width),
         subgoals=subgoals,
-        decision=trial_config(simulations).decision,
+        decision=trial_config(setting_changes(simulations=simulations)).decision,
         batch=_read_batch(batch),
         platforms=_read_platforms(platforms),
     )

@@ -3,13 +3,15 @@
 Imports the library, so commands import this module inside of their functions.
 """
 
-import dataclasses
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+from potlp_jax.cli.completion import SEARCHES
 from potlp_jax.cli.output import fail
+from potlp_jax.codec import with_settings
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split, default_split, world_key
 from potlp_jax.learning.estimator import TrainedEstimator, named_estimator
@@ -90,24 +92,30 @@ def make_world(generator: Generator, split: Split, number: int) -> World:
     return generator.generate(world_key(split, number, generator.name))
 
 
-def trial_config(simulations: int | None, generator: Generator | None = None, camera: str | None = None) -> TrialConfig:
-    """What the options change of the settings of a trial.
+def setting_changes(
+    *, simulations: int | None = None, search: str | None = None, camera: str | None = None
+) -> dict[str, Any]:
+    """What the options change of the settings of a trial, as a sweep's file would say it.
 
     Args:
-        simulations: per decision; None: the default.
-        generator: its worlds say what the other settings are; None: the defaults.
+        simulations: per decision; None: as the search has by default.
+        search: ``best-first`` or ``uct``; None: the first.
         camera: name of a renderer; None: the shipped one.
 
     Returns:
-        The settings.
+        Nested settings for ``trial_config``, or for a sweep's ``settings``.
     """
+    if search is not None and search not in SEARCHES:
+        fail(f"unknown search {search!r}; choose from: {', '.join(SEARCHES)}")
+    searching = {name: value for name, value in (("kind", search), ("simulations", simulations)) if value is not None}
+    changes: dict[str, Any] = {"decision": {"search": searching}} if searching else {}
+    return changes if camera is None else {**changes, "camera": {"renderer": camera}}
+
+
+def trial_config(changes: Mapping[str, Any], generator: Generator | None = None) -> TrialConfig:
+    """Settings of a trial: what the generator's worlds call for (None: the defaults), with some of them changed."""
     config = TrialConfig() if generator is None else trial_config_for(generator)
-    if camera is not None:
-        config = dataclasses.replace(config, camera=dataclasses.replace(config.camera, renderer=camera))
-    if simulations is None:
-        return config
-    search = dataclasses.replace(config.decision.search, simulations=simulations)
-    return dataclasses.replace(config, decision=dataclasses.replace(config.decision, search=search))
+    return with_settings(config, changes)
 
 
 @contextmanager

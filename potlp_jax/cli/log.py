@@ -11,7 +11,7 @@ from rich.table import Table
 
 from potlp_jax.cli.completion import complete_policy
 from potlp_jax.cli.group import Command, command_app
-from potlp_jax.cli.options import EstimatorName, Json, OpenPage, Simulations, TrialFile
+from potlp_jax.cli.options import EstimatorName, Json, OpenPage, SearchName, Simulations, TrialFile
 from potlp_jax.cli.output import FAILED, console, fail, make_folder, open_page, print_json, progress_bar
 from potlp_jax.cli.view import PAGE
 
@@ -228,6 +228,7 @@ def replay_log(
         ),
     ] = None,
     simulations: Simulations = None,
+    search: SearchName = None,
     estimator: EstimatorName = None,
     map_topic: MapTopic = None,
     image_topic: ImageTopic = None,
@@ -245,7 +246,7 @@ def replay_log(
     _check_rosbags()
     import jax
 
-    from potlp_jax.cli.inputs import RECORD, read_estimator, trial_config
+    from potlp_jax.cli.inputs import RECORD, read_estimator, setting_changes, trial_config
     from potlp_jax.logs.log import LogConfig
     from potlp_jax.logs.replaying import replay
     from potlp_jax.logs.working_grid import GridConfig
@@ -264,6 +265,7 @@ def replay_log(
         camera_yaw=camera_yaw,
         vertical_field=vertical_field,
     )
+    trial_settings = trial_config(setting_changes(simulations=simulations, search=search))
     drive = _read_drive(bag, labels, config, GridConfig(resolution, radius))
     asked = read_task(drive.tasks.get(task, task), drive.propositions)
     trained = read_estimator(estimator)
@@ -271,7 +273,7 @@ def replay_log(
     folder = make_folder(out)
     with progress_bar() as progress:
         progress.add_task("deciding along the drive (the first decision compiles)", total=None)
-        trial, panoramas = replay(drive, asked, chosen, jax.random.key(0), trial_config(simulations), trained)
+        trial, panoramas = replay(drive, asked, chosen, jax.random.key(0), trial_settings, trained)
     files = [folder / RECORD, folder / "trial.png", folder / PAGE]
     trial.save(files[0])
     save_figure(draw_trial(trial), files[1])

@@ -9,6 +9,7 @@ from potlp_jax.cli.completion import (
     complete_environment,
     complete_policy,
     complete_recipe,
+    complete_search,
     complete_split,
     complete_task,
 )
@@ -61,6 +62,15 @@ SplitName = Annotated[
 WorldNumber = Annotated[int, typer.Option("--world", "-w", min=0, help="Number of the world in the split.")]
 Simulations = Annotated[
     int | None, typer.Option("--simulations", min=1, help="Simulations per decision of policies that search.")
+]
+SearchName = Annotated[
+    str | None,
+    typer.Option(
+        "--search",
+        help="best-first (the default) or uct, the search as published; of policies that search.",
+        show_default=False,
+        autocompletion=complete_search,
+    ),
 ]
 EstimatorName = Annotated[
     str | None,

@@ -13,6 +13,7 @@ from potlp_jax.cli.options import (
     EstimatorName,
     Json,
     PolicyName,
+    SearchName,
     Simulations,
     SplitName,
     TaskName,
@@ -71,6 +72,7 @@ def run_one(
     ] = None,
     animation: Annotated[bool, typer.Option(help="Make the animation, the slowest of the three files.")] = True,
     simulations: Simulations = None,
+    search: SearchName = None,
     estimator: EstimatorName = None,
     camera: CameraName = None,
     json: Json = False,
@@ -81,6 +83,7 @@ def run_one(
         make_world,
         read_estimator,
         read_split,
+        setting_changes,
         trial_config,
     )
     from potlp_jax.environments.registry import make
@@ -95,7 +98,7 @@ def run_one(
     trained = read_estimator(estimator)
     asked = generator.task(task)
     made = make_world(generator, chosen_split, world)
-    config = trial_config(simulations, generator, camera)
+    config = trial_config(setting_changes(simulations=simulations, search=search, camera=camera), generator)
     folder = None if out is None else make_folder(out)
     with progress_bar() as progress:
         progress.add_task("running the trial (the first decision compiles the planner)", total=None)
