@@ -71,10 +71,11 @@ def run_bench(
     from potlp_jax.learning.estimator import estimator_for
 
     chosen = _read_parts(parts)
+    # All words are read before anything is measured: measuring takes minutes.
     counts = _read_batches(batches)
     if family not in FAMILIES:
         fail(f"unknown family {family!r}; choose from: {', '.join(FAMILIES)}")
-    # Before anything starts XLA, which counts the cores once.
+    # Before anything starts XLA, which counts the cores once and makes a thread for each.
     _pin(core)
     decision = trial_config(setting_changes(simulations=simulations)).decision
     rows: dict[str, list[Any]] = {}
@@ -217,6 +218,7 @@ def _distance_table(rows: "list[DistanceRow]") -> Table:
 def _phase_table(title: str, rows: "list[PhaseRow]") -> Table:
     table = _table(title, "phase", "run", "per second", "working memory", "trace", "compile")
     for row in rows:
+        # None where the backend does not report what memory a program takes.
         memory = row.timing.memory
         table.add_row(
             row.phase,

@@ -224,6 +224,7 @@ def show_estimator(checkpoint: EstimatorArgument, json: Json = False) -> None:
 
 
 def _fovea(reach: int) -> str:
+    # Estimators without a fovea see the panorama at one resolution.
     if not reach:
         return "nothing"
     from potlp_jax.learning.fovea import ABOVE, BAND, BELOW
@@ -239,7 +240,7 @@ def _rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [
         ("propositions", ", ".join(network["propositions"])),
         ("panorama", " × ".join(map(str, network["image_shape"])) + " pixels"),
-        ("looked at closely", _fovea(network["fovea"])),
+        ("fovea", _fovea(network["fovea"])),
         ("file", f"{description['bytes'] / 1e6:.2f} MB, {description['parameters']:,} parameters"),
         (
             "arithmetic",

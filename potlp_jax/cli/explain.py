@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+# More would not fit: every node at the first depth has as many below it.
 BREADTH: int = 4
 """Actions per node in the picture of a tree."""
 
@@ -81,6 +82,7 @@ def _read_decision(name: str) -> "tuple[Trial, Decision]":
         fail(f"{name!r} names no decision; write FOLDER:INDEX or FILE:INDEX, such as out/trial.json:0")
     path, index = Path(match[1]), int(match[2])
     trial = load_trial(record_file(path))
+    # Indices are those of the record, from 0, as on the page and in the animation.
     if index >= len(trial.decisions):
         count = len(trial.decisions)
         known = f"decisions 0 to {count - 1}" if count else "no decisions"

@@ -50,6 +50,7 @@ def export_task(
     from potlp_jax.export import MANIFEST, ExportConfig, export_planner
     from potlp_jax.task.reading import read_task
 
+    # A map has both sides or none: with one the other would have to be guessed.
     if (height is None) != (width is None):
         fail("--height and --width go together: the whole decision needs both, the search alone neither")
     config = ExportConfig(
@@ -68,6 +69,7 @@ def export_task(
             files = export_planner(task, folder, config)
         except ModuleNotFoundError as error:
             fail(str(error), FAILED)
+    # Shown from the file rather than from memory: it is what callers of the programs read.
     manifest = json_format.loads((folder / MANIFEST).read_text("utf-8"))
     if json:
         print_json({"files": [str(file) for file in files], "manifest": manifest})

@@ -42,12 +42,14 @@ ImageTopic = Annotated[
 BaseFrame = Annotated[
     str | None, typer.Option("--base-frame", help="The robot's frame; default: the odometry's child, or base_link.")
 ]
+# Thresholds of nav_msgs/OccupancyGrid, with the defaults of nav2_map_server: between them a cell is unknown.
 Free = Annotated[int, typer.Option("--free", help="Occupancy, in percent, up to which a cell is free.")]
 Occupied = Annotated[int, typer.Option("--occupied", help="Occupancy, in percent, from which it is an obstacle.")]
 Resolution = Annotated[
     float | None, typer.Option("--resolution", help="Metres a cell of the planner; default: 0.2, or the map's.")
 ]
 Radius = Annotated[float, typer.Option("--radius", help="The robot's radius in metres, by which obstacles grow.")]
+# What a bag may not say: where the camera looks, and how much of the sphere a picture covers.
 CameraYaw = Annotated[
     float | None,
     typer.Option(
@@ -156,6 +158,7 @@ def logs_to_dataset(
     from potlp_jax.logs.log import LogConfig
     from potlp_jax.logs.working_grid import GridConfig
 
+    # `office.places.yaml` are the places of office.
     name = labels.name.split(".")[0] if environment is None else environment
     collecting = LogCollectConfig(views_per_world=views, seed=seed, held_out=HELD_OUT.get(name, ()))
     config = LogConfig(
@@ -273,6 +276,7 @@ def replay_log(
     folder = make_folder(out)
     with progress_bar() as progress:
         progress.add_task("deciding along the drive (the first decision compiles)", total=None)
+        # The key matters to the search uct alone, and is fixed so that a log gives the same decisions every time.
         trial, panoramas = replay(drive, asked, chosen, jax.random.key(0), trial_settings, trained)
     files = [folder / RECORD, folder / "trial.png", folder / PAGE]
     trial.save(files[0])
@@ -325,6 +329,7 @@ def write_log(
     chosen = by_name if kind is None else BagFormat(kind)
     if (chosen is BagFormat.ROS1) != (out.suffix == ".bag"):
         fail(f"--out {out}: a ROS 1 bag is a file that ends in .bag, and a ROS 2 bag a folder that does not")
+    # A bag has no propositions; without the labels beside it, it could not be read back as the same trial.
     labels = out.with_suffix(".labels.yaml")
     count = write_trial(load_trial(record_file(trial)), out, chosen, labels, height)
     console().print(f"wrote {out}: {count} messages", markup=False)
@@ -342,6 +347,7 @@ def _print_inspection(found: dict[str, Any]) -> None:
     for name in ("messages", "a second", "gaps", "longest"):
         table.add_column(name, justify="right")
     for topic in found["topics"]:
+        # A latched map has one message, and so neither rate nor gaps: empty cells, not zeros.
         rate, gaps = topic["rate"], topic["gaps"]
         table.add_row(
             topic["name"],

@@ -48,6 +48,7 @@ def write_report(
 
     with open_store(folder) as store:
         facts = store.facts()
+    # A browser goes by the name: a page called .htm or .txt would be shown as text, or not at all.
     page = out or folder / PAGE
     if page.suffix != ".html":
         fail(f"--out {page}: give a name that ends in .html")

@@ -141,6 +141,7 @@ def _why_infeasible(generator: "Generator", split: "Split", task: "Task", config
 
     if is_possible(world):
         return "with the whole map the task is possible in this world: the policy went where it cannot be satisfied"
+    # As many as tell a task that is impossible everywhere from a few unlucky worlds.
     following = range(world + 1, min(world + WORLDS_TRIED, MAX_INDEX) + 1)
     other = next((number for number in following if is_possible(number)), None)
     if other is None:

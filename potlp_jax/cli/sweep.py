@@ -115,6 +115,7 @@ class _Reporter:
     """Progress on stderr: a bar on a terminal, otherwise a line now and then; with the rate and the time remaining."""
 
     def __init__(self) -> None:
+        # Of the monotonic clock: a clock that is set while a sweep runs must not change the rate.
         self._start, self._done_before, self._last_line = time.monotonic(), -1, 0.0
         self._bar = progress_bar()
         self._task: Any = None
@@ -132,6 +133,7 @@ class _Reporter:
         if self._bar.disable and (finished or now - self._last_line >= SECONDS_BETWEEN_LINES):
             self._last_line = now
             logger.info(f"{progress.done} of {progress.total} trials{text}")
+        # A bar that is left running would keep the terminal's cursor hidden.
         if finished:
             self._bar.stop()
 
