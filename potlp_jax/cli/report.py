@@ -54,7 +54,7 @@ def write_report(
         fail(f"--out {page}: give a name that ends in .html")
     # The sweep of the store itself, whatever the file that began it says by now.
     sweep = Sweep(specification_from_store(facts["specification"]), folder)
-    policies = [policy.value for policy in sweep.specification.policies]
+    policies = list(sweep.specification.policies)
     cells: list[Cell] = []
     rows: list[Row] = []
     with progress_bar() as progress:
