@@ -33,15 +33,8 @@ logger = logging.getLogger(__name__)
 WORLDS_TRIED: int = 20
 """Worlds in which to look for one where the task is possible, after one where it is not."""
 
-_SHOWN = {
-    "task": "task",
-    "environment": "environment",
-    "world": "seed",  # the record's word for a world's number
-    "policy": "policy",
-    "steps": "steps",
-    "decisions": "decisions",
-    "fallbacks": "fallbacks",
-}
+# In this order, below the outcome.
+_SHOWN = ("task", "environment", "world", "policy", "steps", "decisions", "fallbacks")
 
 app = command_app()
 
@@ -176,8 +169,8 @@ def _print(trial: "Trial", files: list[Path]) -> None:
     colour = "green" if trial.outcome is Outcome.SATISFIED else "red"
     out.print(f"[bold {colour}]{trial.outcome.value}[/]  cost {trial.cost:.2f}")
     summary = trial.summary()
-    for label, name in _SHOWN.items():
-        out.print(f"{label:12} {summary[name]}", markup=False)
+    for name in _SHOWN:
+        out.print(f"{name:12} {summary[name]}", markup=False)
     if trial.status:
         flags = ", ".join(status_names(trial.status)).replace("_", " ")
         out.print(f"{'status':12} {flags}", markup=False)
