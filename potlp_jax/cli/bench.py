@@ -37,7 +37,7 @@ app = command_app()
 
 [cyan]potlp bench --parts perception --environment firefighting --world 1[/cyan] - what the camera and the network add
 
-[dim]Compiled anew for every measurement: the cache of compiled programs is left out.[/dim]
+[dim]Every measurement compiles anew, without the cache of compiled programs.[/dim]
 """,
 )
 def run_bench(

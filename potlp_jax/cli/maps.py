@@ -109,7 +109,7 @@ def write_clean_map(
     start: Start = None,
     json: Json = False,
 ) -> None:
-    """Write the grid on which the robot moves, where all else is an obstacle, as a ROS map."""
+    """Write the grid on which the robot moves, where everything else is an obstacle, as a ROS map."""
     from potlp_jax.environments.ros.cleaning import clean_map
     from potlp_jax.environments.ros.map_files import load_map
     from potlp_jax.environments.ros.map_writer import save_map

@@ -32,7 +32,7 @@ def show_task(
     formula: Formula,
     propositions: Propositions = None,
     max_positive_literals: Annotated[
-        int | None, typer.Option(min=0, help="Leave out ways that need more propositions to hold in one place.")
+        int | None, typer.Option(min=0, help="Leave out cubes that need more propositions to hold at one cell.")
     ] = None,
     svg: Annotated[Path | None, typer.Option("--svg", help="Draw the automaton (.svg, .png or .pdf).")] = None,
     json: Json = False,

@@ -86,7 +86,7 @@ def remark_lines(comparison: Comparison) -> list[str]:
             lines.append(f"{policy}: {', '.join(others)}")
     lines += loss_lines(comparison)
     if 0 < satisfied.pairs < FEW_WORLDS:
-        lines.append(f"{satisfied.pairs} worlds are few: the interval says how little they settle.")
+        lines.append(f"{satisfied.pairs} worlds are few: the interval says how far the share may be off.")
     return lines
 
 
@@ -102,7 +102,7 @@ def loss_lines(comparison: Comparison) -> list[str]:
 
 
 def policy_styles(policies: Sequence[str]) -> Mapping[str, tuple[str, str, str]]:
-    """Colour, marker and line of each policy: told apart without colour too."""
+    """Colour, marker and line of each policy: distinguishable without colour too."""
     return {
         policy: (
             STATE_COLOURS[index % len(STATE_COLOURS)],
