@@ -116,6 +116,7 @@ def _run(
     first = next(starts, None)
     if first is None:
         return
+    # The first one is looked at for its shapes and is then run like the others.
     starts = chain([first], starts)
     views, shared = None, asked
     if isinstance(asked, TrainedEstimator):
@@ -133,9 +134,12 @@ def _run(
         occupied = [slot for slot, start in enumerate(held) if start is not None]
         if not occupied:
             return
+        # One call to the device runs all slots until one of them ends: as few round trips as there are trials.
         began = time.perf_counter()
         slots = _run_until_one_ends(slots, shared, setup=setup)
+        # The only thing read back in every round; the rest only of slots that have ended.
         ended = ~np.asarray(slots[1].tally.running)
+        # Slots run in one program: each is charged an equal share.
         seconds[occupied] += (time.perf_counter() - began) / len(occupied)
         for slot in occupied:
             start = held[slot]
@@ -175,6 +179,7 @@ def _finished(start: Start, progress: Progress, slot: int, seconds: float) -> Fi
 
 def _empty_slots(first: Start, views: Views | None, setup: Setup, count: int) -> tuple[Scene, Progress]:
     """Slots without trials, of the shape of ``first``."""
+    # Any trial gives the shapes; its values never run, for the slot is marked empty.
     scene, progress = begin(first.world, first.arrays, first.key, views, setup=setup)
     progress = dataclasses.replace(progress, tally=dataclasses.replace(progress.tally, outcome=jnp.int8(EMPTY)))
     return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], count, axis=0), (scene, progress))
@@ -191,6 +196,7 @@ def _fill(
     *,
     setup: Setup,
 ) -> tuple[Scene, Progress]:
+    # Donated: the arrays of all slots are changed in place instead of copied for each new trial.
     new = begin(world, arrays, key, views, setup=setup)
     return jax.tree.map(lambda leaf, entry: leaf.at[slot].set(entry), slots, new)
 
@@ -198,6 +204,7 @@ def _fill(
 @partial(jax.jit, static_argnames="setup", donate_argnums=0)
 def _run_until_one_ends(slots: tuple[Scene, Progress], asked: Asked, *, setup: Setup) -> tuple[Scene, Progress]:
     scene, progress = slots
+    # Until fewer run than at the beginning: then a slot is free, and the host gives it a trial.
     running = jnp.sum(progress.tally.running)
 
     def all_still_run(now: Progress) -> Bool[Array, ""]:

@@ -22,6 +22,7 @@ class TrialConfig:
     sensor: SensorConfig = SensorConfig()
     camera: CameraConfig = CameraConfig()
     disturbance: Disturbance = Disturbance()
+    # docs/model.md section 7.
     replan_distance: float = 4.0
     budget_factor: float = 20.0
     revealed: bool = False

@@ -87,6 +87,7 @@ def _recorded_index(move: Move, action: int) -> int | None:
     """Index of an action in the task's own arrays: records do not depend on how a trial padded its edges."""
     if action == NO_ACTION or move.search is None:
         return None
+    # Padded edges lengthen each subgoal's row of actions; finish, after the last row, is renumbered likewise.
     edge_mask = np.asarray(move.search.problem.task.edge_mask)
     subgoal, edge = divmod(action, len(edge_mask))
     return subgoal * int(np.sum(edge_mask)) + edge

@@ -90,6 +90,7 @@ def estimator_of(
     Raises:
         CheckpointError: a trained estimator knows other propositions, or none is shipped for these.
     """
+    # The shipped one is looked up late, so that policies which ask nothing need none.
     asked = asked_of(policy, given)
     if policy is Policy.POTLP and (asked is None or isinstance(asked, TrainedEstimator)):
         return estimator_for(propositions, asked)
@@ -126,6 +127,7 @@ def first_estimator(
     Raises:
         PotlpError: the policy is ``oracle`` and nobody knows the true map.
     """
+    # The oracle is PO-TLP with the answers that the map itself gives (docs/model.md section 8).
     if policy is Policy.ORACLE:
         if world is None:
             raise PotlpError("policy oracle asks the true map: give it as world, or choose another policy")
@@ -170,8 +172,10 @@ class Stop:
         Returns:
             True where a new decision is due. The end of the path is not looked at.
         """
+        # docs/model.md section 7, "Advance": each line below is one of its reasons to decide again.
         now = Knowledge.of(belief)
         replans = (now.cells > before.cells) & (travelled >= self.replan_distance)
+        # A proposition seen for the first time may be what the task is about: not to be passed by for four cells.
         surprised = (now.propositions & ~before.propositions) != 0
         pointless = self.is_frontier & ~is_beside(belief.unknown, target, beyond=True)
         return replans | surprised | pointless | (travelled >= self.budget)
@@ -218,6 +222,7 @@ def stop_of(move: Move, tally: "Tally", belief: BeliefMap, config: TrialConfig) 
     is_frontier = (move.kind == MoveKind.ACTION) | (move.kind == MoveKind.FRONTIER) | (move.kind == MoveKind.FALLBACK)
     return Stop(
         replan_distance=jnp.float32(config.replan_distance),
+        # In float32 on host and device alike, so that a leg ends on the same cell in a trial and in a batch.
         budget=budget(belief, config) - tally.travelled,
         is_frontier=is_frontier,
     )
@@ -225,6 +230,7 @@ def stop_of(move: Move, tally: "Tally", belief: BeliefMap, config: TrialConfig) 
 
 def budget(belief: BeliefMap, config: TrialConfig) -> Float32[Array, ""]:
     """Cells that may be travelled in a trial."""
+    # By the extent, not the array: padding a map gives nobody more to travel.
     return jnp.float32(config.budget_factor) * jnp.sum(belief.extent).astype(jnp.float32)
 
 
@@ -276,6 +282,7 @@ class Tally:
 
 def first_tally(belief: BeliefMap, cell: Int32[Array, "2"], task: TaskArrays) -> Tally:
     """Of a trial that has not begun: the letter of the robot's first cell is read."""
+    # The word begins with the letter of the first cell: a start may satisfy or violate the task.
     height, width = belief.cells.shape
     letter = belief.letters[cell[0], cell[1]]
     return Tally(
@@ -283,6 +290,7 @@ def first_tally(belief: BeliefMap, cell: Int32[Array, "2"], task: TaskArrays) ->
         straight=jnp.int32(0),
         diagonal=jnp.int32(0),
         known=jnp.int32(0),
+        # A byte will do: a trial is stuck after three.
         visits=jnp.zeros((height, width, task.transitions.shape[0]), jnp.int8),
         decisions=jnp.int32(0),
         fallbacks=jnp.int32(0),
@@ -325,6 +333,7 @@ def arrive(
     Returns:
         The tally with this visit counted and the outcome set.
     """
+    # Counted where decisions are taken, not along the path: a corridor may be passed as often as the task wants.
     here = (cell[0], cell[1], tally.state)
     known = count_known(belief)
     # A map that has changed is another situation: all visits begin anew.

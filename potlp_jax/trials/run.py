@@ -29,7 +29,8 @@ def run(
     Args:
         environment: a name that ``make`` knows, or a generator.
         task: number of one of the environment's tasks, a formula over its propositions, or a task.
-        policy: a name, or a function of one's own; default: ``potlp`` where an estimator is shipped for the environment, otherwise ``baseline``.
+        policy: a name, or a function of one's own; default: ``potlp`` where an estimator is shipped for the
+            environment, otherwise ``baseline``.
         world: number of the world in the split.
         split: default: that of the command line, ``validation`` (``test`` for real buildings).
         config: default: what the environment calls for.
