@@ -123,6 +123,7 @@ def _run(
         # Parameters are the same in all slots; what a robot has seen is its own.
         views, shared = asked.start(*first.world.shape).views, asked.params
     slots: tuple[Scene, Progress] = _empty_slots(first, views, setup, count)
+    # Which trial is in which slot is the host's matter; the device knows slots alone.
     held: list[Start | None] = [None] * count
     seconds = np.zeros(count)
     while True:
@@ -149,6 +150,7 @@ def _run(
 
 
 def _check_shapes(start: Start, first: Start) -> None:
+    # Another shape would compile anew in the middle of the batch, without a word: refused instead.
     for what, mine, other in (("world", start.world, first.world), ("task", start.arrays, first.arrays)):
         found, expected = ([leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (mine, other))
         if found != expected:

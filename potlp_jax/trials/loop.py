@@ -161,8 +161,8 @@ class _Loop:
                 return self._result(Outcome.UNFINISHED, belief)
             move = self._decide(belief, cell)
             leg = self._advance(belief, move)
-            # Without a move a simulated robot stays, and the task is infeasible. A robot in a log goes on, and there may
-            # be a move again later.
+            # Without a move a simulated robot stays, and the task is infeasible. A robot in a log goes on, and there
+            # may be a move again later.
             gave_up = int(move.kind) == MoveKind.NONE and not leg.cells and not leg.ended
 
     def _decide(self, belief: BeliefMap, cell: Cell) -> Move:

@@ -212,6 +212,7 @@ def belief_seen_by(world: World, first_seen: Int32[np.ndarray, "H W"], step: int
     truth = np.where(np.asarray(world.occupied), BeliefMap.OCCUPIED, BeliefMap.FREE)
     cells = np.where(seen, truth, BeliefMap.UNKNOWN)
     letters = np.where(seen, np.asarray(world.letters), 0)
+    # The extent is known from the start, whatever the padding: budget and dead ends are counted by it.
     height, width = (int(size) for size in world.extent)
     return belief_from_numpy(cells, letters, float(world.resolution), (height, width))
 
@@ -242,6 +243,7 @@ def _trial_from_dict(data: Mapping[str, Any]) -> Trial:
     values["propositions"] = tuple(data["propositions"])
     values["decisions"] = tuple(_decision_from_dict(decision) for decision in data["decisions"])
     values["first_seen"] = unpack_array(data["first_seen"])
+    # Lists become tuples throughout: records are compared, and used as keys.
     values["world"] = world_from_dict(data["world"])
     return Trial(**values)
 
@@ -267,6 +269,7 @@ def _decision_from_dict(data: Mapping[str, Any]) -> Decision:
 def _action_from_dict(data: Mapping[str, Any]) -> ActionRecord:
     values = dict(data)
     values["cell"] = None if data["cell"] is None else tuple(data["cell"])
+    # Infinite costs are written as text, which ``float`` reads back.
     for name in ("success_probability", "success_cost", "failure_cost", "distance", "q_value"):
         values[name] = float(data[name])
     return ActionRecord(**values)

@@ -114,10 +114,12 @@ def panorama_at(trial: Trial, decision: Decision, config: TrialConfig | None = N
 
 def panoramas_of(trial: Trial) -> dict[int, UInt8[np.ndarray, "rows columns 3"]]:
     """What the camera saw at the decisions whose panoramas were used, by number; none where a policy takes none."""
+    # Several subgoals, and several decisions, share a panorama: each is rendered once.
     numbers = sorted({number for decision in trial.decisions for number in decision.observations})
     return {number: np.asarray(panorama_at(trial, trial.decisions[number])) for number in numbers}
 
 
+# Compiled like the decision itself, so that rounding is the same and equal plans stay equal.
 @partial(jax.jit, static_argnames=("config",))
 def _replayed_problem(
     belief: BeliefMap,

@@ -104,6 +104,7 @@ class SimulatedRobot:
         self._belief, self._first_seen, moved = follow(
             self._world, self._belief, self._first_seen, path, jnp.int32(self._steps), stop, self._config.sensor
         )
+        # The one number that the host needs of a leg; beliefs stay on the device.
         moved = int(moved)
         cells = np.asarray(path.cells)[1 : moved + 1]
         # Kept on the device: the next photograph and observation need it there.

@@ -34,6 +34,7 @@ decide once per change of the map, so that a second visit is already rare and a 
 OUTCOMES: tuple[Outcome, ...] = tuple(Outcome)
 """What ``Tally.outcome`` is an index into."""
 
+# Below every index, and an ``EMPTY`` slot below it: neither is mistaken for an outcome.
 RUNNING: int = -1
 """``Tally.outcome`` of a trial that goes on."""
 
@@ -177,6 +178,7 @@ class Stop:
         replans = (now.cells > before.cells) & (travelled >= self.replan_distance)
         # A proposition seen for the first time may be what the task is about: not to be passed by for four cells.
         surprised = (now.propositions & ~before.propositions) != 0
+        # Whatever was to be seen from the target has been seen on the way to it.
         pointless = self.is_frontier & ~is_beside(belief.unknown, target, beyond=True)
         return replans | surprised | pointless | (travelled >= self.budget)
 
@@ -257,6 +259,7 @@ class Tally:
     straight: Int32[Array, "*batch"]
     diagonal: Int32[Array, "*batch"]
     known: Int32[Array, "*batch"]
+    # A table, not a list of places: fixed in shape, so that it lives on the device.
     visits: Int8[Array, "*batch H W Z"]
     decisions: Int32[Array, "*batch"]
     fallbacks: Int32[Array, "*batch"]

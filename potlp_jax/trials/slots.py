@@ -187,6 +187,7 @@ def _search_together(scene: Scene, asked: Asked, setup: Setup, progress: Progres
         move = _phase(tally.running, partial(planned_move, config=decision), *considered, tally.intention)
         return advance(setup, progress, scene, move)
 
+    # Intentions come from the progress, not from the search: commitment is applied when the plan is carried out.
     return _each(act, dataclasses.replace(progress, views=views), scene, situation, problem, plans)
 
 
@@ -251,6 +252,7 @@ def _consider(
         progress.tally.state,
         scene.task,
     )
+    # Known when tracing: a policy without an estimator has no such phase in its program.
     estimates = None
     if _estimator(setup, asked, views, scene) is not None:
 
@@ -322,6 +324,7 @@ def _went(
     """After ``moved`` moves along the move's path."""
     # The simulated robot goes where the path does, so that moves and states are read from it.
     cells, tally = move.path.cells, progress.tally
+    # Over the whole path at once; moves that were not made are masked.
     diagonal = (step_length(cells[:-1], cells[1:]) > 1.0) & (jnp.arange(cells.shape[0] - 1) < moved)
     diagonals = jnp.sum(diagonal, dtype=jnp.int32)
     # What is written beyond the moves made is overwritten by the next ones.
