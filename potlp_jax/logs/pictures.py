@@ -62,7 +62,9 @@ def match_pictures(
     # Before the robot entered its first cell, or after its last pose, there is no cell to which a picture belongs.
     taken = [picture for picture in log.pictures if times[0] <= picture.time <= poses.times[-1]]
     if not taken:
-        notes.append("no picture: policies that look, and datasets, need a topic of type sensor_msgs/CompressedImage")
+        notes.append(
+            "no picture: policies that take panoramas, and datasets, need a topic of type sensor_msgs/CompressedImage"
+        )
         return {}, {}
     moments = np.array([picture.time for picture in taken])
     gap = int(log.config.longest_gap * SECOND)

@@ -116,7 +116,7 @@ def _run(
     first = next(starts, None)
     if first is None:
         return
-    # The first one is looked at for its shapes and is then run like the others.
+    # The first one gives the shapes and is then run like the others.
     starts = chain([first], starts)
     views, shared = None, asked
     if isinstance(asked, TrainedEstimator):

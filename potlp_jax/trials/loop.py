@@ -194,7 +194,7 @@ class _Loop:
         self._tally = _count_decision(self._tally, move)
         planned = np.asarray(move.path.cells)[1 : len(leg.cells) + 1]
         if leg.cells != tuple(as_cell(cell) for cell in planned):
-            # A robot that went elsewhere is not on its way to what was chosen.
+            # A robot that went elsewhere is not committed to what was chosen.
             self._tally = dataclasses.replace(self._tally, intention=Intention.none())
         self._enter(leg.cells)
         return leg

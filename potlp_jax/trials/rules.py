@@ -91,7 +91,7 @@ def estimator_of(
     Raises:
         CheckpointError: a trained estimator knows other propositions, or none is shipped for these.
     """
-    # The shipped one is looked up late, so that policies which ask nothing need none.
+    # The shipped one is read late, so that policies which ask nothing need none.
     asked = asked_of(policy, given)
     if policy is Policy.POTLP and (asked is None or isinstance(asked, TrainedEstimator)):
         return estimator_for(propositions, asked)
@@ -162,7 +162,7 @@ class Stop:
         target: Int32[Array, "2"],
         travelled: Float32[Array, ""],
     ) -> Bool[Array, ""]:
-        """Whether to stop here, on the way to ``target``. Pure, for host and device.
+        """Whether to stop here, before or at ``target``. Pure, for host and device.
 
         Args:
             before: what was known at the decision.
@@ -171,14 +171,14 @@ class Stop:
             travelled: cells since the decision.
 
         Returns:
-            True where a new decision is due. The end of the path is not looked at.
+            True where a new decision is due. That the path has ended is for the robot to know.
         """
         # docs/model.md section 7, "Advance": each line below is one of its reasons to decide again.
         now = Knowledge.of(belief)
         replans = (now.cells > before.cells) & (travelled >= self.replan_distance)
         # A proposition seen for the first time may be what the task is about: not to be passed by for four cells.
         surprised = (now.propositions & ~before.propositions) != 0
-        # Whatever was to be seen from the target has been seen on the way to it.
+        # Whatever was to be seen from the target has been seen from cells before it.
         pointless = self.is_frontier & ~is_beside(belief.unknown, target, beyond=True)
         return replans | surprised | pointless | (travelled >= self.budget)
 
@@ -251,7 +251,7 @@ class Tally:
         decisions: number of decisions.
         fallbacks: decisions that fell back on the nearest frontier.
         status: bits of ``Status`` of all decisions.
-        intention: what the robot is on its way to.
+        intention: the target that the robot is committed to.
         outcome: index into ``OUTCOMES``, or ``RUNNING``.
     """
 
