@@ -15,7 +15,7 @@ from potlp_jax.cli.output import console, fail, package_version, print_json, pro
 if TYPE_CHECKING:
     from potlp_jax.bench.planner import DistanceRow, PhaseRow, Scene, SearchRow
     from potlp_jax.learning.estimator import TrainedEstimator
-    from potlp_jax.planning.policies import DecisionConfig
+    from potlp_jax.planning.situation import DecisionConfig
 
 PARTS = ("search", "distances", "decision", "perception")
 

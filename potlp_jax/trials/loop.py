@@ -16,7 +16,8 @@ from jaxtyping import Int32, PRNGKeyArray
 from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator, identity_of, look
 from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimator
-from potlp_jax.planning.policies import Move, MoveKind, Policy, PolicyFunction, decide, named_policy, policy_name
+from potlp_jax.planning.move import Move, MoveKind
+from potlp_jax.planning.policies import Policy, PolicyFunction, decide, named_policy, policy_name
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials import rules
 from potlp_jax.trials.config import TrialConfig, config_in

@@ -10,7 +10,7 @@ from potlp_jax.learning.estimator import NetworkEstimator
 from potlp_jax.learning.memory import look_of_subgoals
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.history import ActionTerms
-from potlp_jax.planning.policies import Move, MoveKind
+from potlp_jax.planning.move import Move, MoveKind
 from potlp_jax.trials.record import ActionRecord, Decision
 from potlp_jax.types import NO_ACTION
 from potlp_jax.world.moves import Cell, as_cell

@@ -12,11 +12,12 @@ from potlp_jax.errors import CheckpointError, RecordError
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, look
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.estimates import Estimator, ask
-from potlp_jax.planning.policies import DecisionConfig, Policy, assess, planning_problem
+from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import Plan, search_tree
 from potlp_jax.planning.search.graph import Tree
 from potlp_jax.planning.search.uct import UctTree
+from potlp_jax.planning.situation import DecisionConfig, assess, planning_problem
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import LOG_PREFIX, Decision, Trial

@@ -22,18 +22,10 @@ from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.memory import Views, remember
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
 from potlp_jax.planning.estimates import Estimates, Estimator, ask
-from potlp_jax.planning.policies import (
-    Move,
-    MoveKind,
-    Policy,
-    PolicyFunction,
-    Situation,
-    assess,
-    planned_move,
-    planning_problem,
-    policy_function,
-)
+from potlp_jax.planning.move import Move, MoveKind
+from potlp_jax.planning.policies import Policy, PolicyFunction, planned_move, policy_function
 from potlp_jax.planning.search.api import plan_actions
+from potlp_jax.planning.situation import Situation, assess, planning_problem
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.robot import first_seen_at_start, follow, initial_belief, photograph
