@@ -104,6 +104,11 @@ class Status(IntFlag):
     """The memory of panoramas was full; one was dropped that still showed a frontier."""
 
 
+def status_names(status: int) -> tuple[str, ...]:
+    """The bits that are set, by name: what people and programs are shown instead of a number."""
+    return tuple(str(flag.name).lower() for flag in Status(status))
+
+
 def status_array(status: Status = Status.OK) -> UInt32[Array, ""]:
     """The bits as a device scalar."""
     # Through numpy: a Python integer would become int32, and strict dtype promotion refuses to mix the two.

@@ -5,7 +5,13 @@ from typing import Annotated
 
 import typer
 
-from potlp_jax.cli.completion import complete_environment, complete_policy, complete_split, complete_task
+from potlp_jax.cli.completion import (
+    complete_environment,
+    complete_policy,
+    complete_recipe,
+    complete_split,
+    complete_task,
+)
 
 Json = Annotated[bool, typer.Option("--json", help="Write JSON, and nothing else, to stdout.")]
 OpenPage = Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")]
@@ -16,7 +22,8 @@ Environment = Annotated[
     typer.Argument(
         metavar="ENV",
         help="[cyan]toy[/cyan], [cyan]firefighting[/cyan], [cyan]delivery[/cyan], [cyan]rooms[/cyan], "
-        "[cyan]map:FILE.yaml[/cyan] (ROS map) or [cyan]floorplan:FILE.xml[/cyan] (real floor plan, or a folder).",
+        "[cyan]map:FILE.yaml[/cyan] (ROS map), [cyan]floorplan:FILE.xml[/cyan] (real floor plan, or a folder), or "
+        "[cyan]module:attribute[/cyan] of an environment of your own.",
         autocompletion=complete_environment,
     ),
 ]
@@ -34,7 +41,8 @@ PolicyName = Annotated[
     typer.Option(
         "--policy",
         "-p",
-        help="potlp (the default where an estimator is shipped), known-map, baseline, optimistic or oracle.",
+        help="potlp (the default where an estimator is shipped), known-map, baseline, optimistic, oracle, or "
+        "module:attribute of a policy of your own.",
         show_default=False,
         autocompletion=complete_policy,
     ),
@@ -53,8 +61,18 @@ WorldNumber = Annotated[int, typer.Option("--world", "-w", min=0, help="Number o
 Simulations = Annotated[
     int | None, typer.Option("--simulations", min=1, help="Simulations per decision of policies that search.")
 ]
-EstimatorFile = Annotated[
-    Path | None, typer.Option("--estimator", help="Trained estimator for the policy potlp; default: the shipped one.")
+EstimatorName = Annotated[
+    str | None,
+    typer.Option(
+        "--estimator",
+        metavar="FILE|NAME",
+        help="What the policy potlp asks: a trained estimator's file, or module:attribute; default: the shipped one.",
+        show_default=False,
+    ),
+]
+CameraName = Annotated[
+    str | None,
+    typer.Option("--camera", metavar="NAME", help="module:attribute of a camera of your own.", show_default=False),
 ]
 
 # Tasks without an environment.
@@ -71,3 +89,22 @@ Propositions = Annotated[
 # What `potlp run` and `potlp sweep` wrote.
 TrialFile = Annotated[Path, typer.Argument(metavar="TRIAL", help="Folder or file that `potlp run --out` wrote.")]
 SweepFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a sweep, as --out named it.")]
+
+# What makes estimators.
+RecipeName = Annotated[
+    str | None,
+    typer.Option(
+        "--recipe",
+        "-r",
+        help="What makes an estimator: the name of a shipped recipe ([cyan]firefighting[/cyan], [cyan]delivery[/cyan], "
+        "[cyan]parcels[/cyan]) or a file of your own.",
+        autocompletion=complete_recipe,
+    ),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="NAME=VALUE", help="Change a setting, such as training.patience=10; may be repeated."
+    ),
+]
+Processes = Annotated[int, typer.Option("--processes", min=1, help="Collect in so many processes, each on a core.")]

@@ -20,6 +20,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
+from potlp_jax import plugins
+from potlp_jax.errors import PluginError
 from potlp_jax.planning.commitment import Intention, apply_commitment, intention_of
 from potlp_jax.planning.distances.paths import KnownPath, shortest_path
 from potlp_jax.planning.distances.product import (
@@ -35,11 +37,14 @@ from potlp_jax.planning.estimates import Estimates, Estimator, ask
 from potlp_jax.planning.history import ActionTerms, action_terms, initial_history
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import Plan, plan_actions
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig, UctConfig
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_ACTION, NO_STATE, Status, status_array, status_if
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
 from potlp_jax.world.grid import BeliefMap
+
+GROUP: str = "potlp_jax.policies"
+"""Entry points of this group are policies of other packages."""
 
 
 class Policy(StrEnum):
@@ -76,7 +81,7 @@ class DecisionConfig:
     its way turns to it; 0: at once, as published."""
 
     frontiers: FrontierConfig = FrontierConfig()
-    search: SearchConfig = SearchConfig()
+    search: SearchConfig | UctConfig = SearchConfig()
     dead_end_factor: float = 4.0
     commitment: float = 0.15
     path_horizon: int | None = None
@@ -195,7 +200,7 @@ def decide(
         config: settings; static.
 
     Returns:
-        The move.
+        The move; its path has length 0 where the target is out of reach.
 
     Raises:
         ValueError: the policy searches and there is no estimator.
@@ -252,17 +257,35 @@ def direct_move(situation: Situation, policy: Policy, config: DecisionConfig) ->
 
 
 def named_policy(policy: Policy | PolicyFunction | str) -> Policy | PolicyFunction:
-    """The policy of this name, or the function itself. Raises ValueError where there is none of the name."""
-    return Policy(policy) if isinstance(policy, str) else policy
+    """The policy of a name, or the function itself.
+
+    Args:
+        policy: a function; or the name of one of the library's policies; or ``module:attribute``, or an entry point in
+            the group ``potlp_jax.policies``, of a function.
+
+    Returns:
+        One of the library's policies, or a function.
+
+    Raises:
+        PluginError: there is none of the name, or it is no function.
+    """
+    if not isinstance(policy, str):
+        return policy
+    # ``known_map`` is as good as ``known-map``.
+    own = policy.strip().replace("_", "-")
+    if own in list(Policy):
+        return Policy(own)
+    found = plugins.load(policy, group=GROUP, kind="policy", known=list(Policy))
+    if not callable(found):
+        raise PluginError(f"policy {policy!r}: {type(found).__name__} is no function (PolicyFunction)")
+    return found
 
 
 def policy_name(policy: Policy | PolicyFunction) -> str:
     """What a policy is called in records: its name, or ``module:attribute`` of a function."""
     if isinstance(policy, Policy):
         return policy.value
-    # A callable object has no name of its own: that of its class says what it is.
-    named = policy if hasattr(policy, "__qualname__") else type(policy)
-    return f"{named.__module__}:{getattr(named, '__qualname__', '')}"
+    return plugins.reference_of(policy)
 
 
 def planning_problem(situation: Situation, estimates: Estimates, config: DecisionConfig) -> PlanningProblem:
@@ -472,7 +495,7 @@ def move_to(
         status: bits to report beside those of the subgoals.
 
     Returns:
-        The move.
+        The move; its path has length 0 where the target is out of reach.
     """
     goes = kind != MoveKind.NONE
     cell = jnp.where(goes, target_cell, situation.cell).astype(jnp.int32)

@@ -186,7 +186,9 @@ class Task:
             TaskError: as ``from_formula``.
         """
         for hoa in _shipped_hoa().values():
-            if read_hoa(hoa).name == text:
+            shipped = read_hoa(hoa)
+            # A shipped automaton may have propositions that its formula does not mention, and Sigma not contain.
+            if shipped.name == text and set(shipped.propositions) <= set(propositions):
                 return cls.from_hoa(hoa, propositions)
         return cls.from_formula(text, propositions)
 

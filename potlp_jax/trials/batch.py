@@ -24,7 +24,7 @@ from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy, PolicyFunction, named_policy
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.trials import rules
-from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.config import TrialConfig, config_in
 from potlp_jax.trials.record import Outcome
 from potlp_jax.trials.slots import EMPTY, Asked, Progress, Scene, Setup, begin, step
 from potlp_jax.world.grid import World
@@ -89,7 +89,7 @@ def run_batch(
     Args:
         starts: the trials. Asked for the next one whenever a slot is free, so that it may decide late.
         policy: one of the library's, or a function of one's own (``planning.policies.PolicyFunction``).
-        config: settings; by default those of ``TrialConfig``, whatever the worlds call for: all trials share them.
+        config: settings, which all trials share; by default what their worlds call for.
         slots: trials that run at a time.
         estimator: what the policy asks, as in ``run_trial``; ``potlp`` has no default here.
 
@@ -97,26 +97,28 @@ def run_batch(
         The trials in the order in which they end.
 
     Raises:
-        BatchError: a world or task has another shape than the first one, or ``potlp`` has no estimator.
+        BatchError: a world or task has another shape than the first one, its world is of a family with other
+            propositions or settings, or ``potlp`` has no estimator.
     """
     policy = named_policy(policy)
     if slots < 1:
         raise BatchError(f"slots is {slots}, must be at least 1")
     if policy is Policy.POTLP and estimator is None:
         raise BatchError("policy potlp needs an estimator (learning.estimator.estimator_for)")
-    config = rules.config_of(policy, TrialConfig() if config is None else config)
-    asked = rules.asked_of(policy, estimator)
-    network = asked.config if isinstance(asked, TrainedEstimator) else None
-    yield from _run(iter(starts), Setup(policy=policy, config=config, network=network), slots, asked)
-
-
-def _run(
-    starts: Iterator[Start], setup: Setup, count: int, asked: TrainedEstimator | Estimator | None
-) -> Iterator[Finished]:
+    starts = iter(starts)
     first = next(starts, None)
     if first is None:
         return
-    starts = chain([first], starts)
+    config = rules.config_of(policy, config_in(first.world, config))
+    asked = rules.asked_of(policy, estimator)
+    network = asked.config if isinstance(asked, TrainedEstimator) else None
+    yield from _run(first, starts, Setup(policy=policy, config=config, network=network), slots, asked)
+
+
+def _run(
+    first: Start, others: Iterator[Start], setup: Setup, count: int, asked: TrainedEstimator | Estimator | None
+) -> Iterator[Finished]:
+    starts = chain([first], others)
     views, shared = None, asked
     if isinstance(asked, TrainedEstimator):
         # Parameters are the same in all slots; what a robot has seen is its own.
@@ -145,6 +147,11 @@ def _run(
 
 
 def _check_shapes(start: Start, first: Start) -> None:
+    for what in ("propositions", "settings"):
+        mine, other = getattr(start.world, what), getattr(first.world, what)
+        # They are static parts of the arrays: JAX could not put both into one batch, and would say so obscurely.
+        if mine != other:
+            raise BatchError(f"trial {start.name!r}: its world has the {what} {mine}, the first of the batch {other}")
     for what, mine, other in (("world", start.world, first.world), ("task", start.arrays, first.arrays)):
         found, expected = ([leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (mine, other))
         if found != expected:

@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int32, PRNGKeyArray
 
-from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator, look
+from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator, identity_of, look
 from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Move, MoveKind, Policy, PolicyFunction, decide, named_policy, policy_name
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials import rules
-from potlp_jax.trials.config import TrialConfig, trial_config_for
+from potlp_jax.trials.config import TrialConfig, config_in
 from potlp_jax.trials.move_record import decision_of
 from potlp_jax.trials.record import Decision, Outcome, RunRecord, Trial
 from potlp_jax.trials.robot import Leg, Robot, SimulatedRobot
@@ -68,7 +68,7 @@ def run_trial(
         CheckpointError: the estimator knows other propositions than the task, or none is shipped for them.
     """
     policy = named_policy(policy)
-    config = rules.config_of(policy, trial_config_for(world) if config is None else config)
+    config = rules.config_of(policy, config_in(world, config))
     robot = SimulatedRobot(world, config, rules.sensing_key(key))
     asked = rules.estimator_of(policy, task.propositions, estimator)
     run = run_robot(robot, task, policy, key, config, arrays=arrays, estimator=asked, world=world)
@@ -267,7 +267,4 @@ def make_trial(
 def versions(estimator: TrainedEstimator | Estimator | None = None) -> dict[str, str]:
     """Versions of what a trial's figures depend on; with the estimator's identity where it asked one."""
     libraries = {name: importlib.metadata.version(name) for name in ("potlp-jax", "jax", "numpy")}
-    if estimator is None:
-        return libraries
-    identity = estimator.identity if isinstance(estimator, TrainedEstimator) else type(estimator).__qualname__
-    return libraries | {"estimator": identity}
+    return libraries if estimator is None else libraries | {"estimator": identity_of(estimator)}

@@ -3,7 +3,7 @@
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, default_split
-from potlp_jax.learning.estimator import TrainedEstimator, shipped_estimator
+from potlp_jax.learning.estimator import TrainedEstimator, named_estimator, shipped_estimator
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy, PolicyFunction
 from potlp_jax.task.task import Task
@@ -21,7 +21,7 @@ def run(
     *,
     split: Split | str | None = None,
     config: TrialConfig | None = None,
-    estimator: TrainedEstimator | Estimator | None = None,
+    estimator: TrainedEstimator | Estimator | str | None = None,
     seed: int = 0,
 ) -> Trial:
     """One trial, as ``potlp run ENVIRONMENT --task TASK --policy POLICY --world WORLD`` makes it.
@@ -29,18 +29,20 @@ def run(
     Args:
         environment: a name that ``make`` knows, or a generator.
         task: number of one of the environment's tasks, a formula over its propositions, or a task.
-        policy: a name, or a function of one's own; default: ``potlp`` where an estimator is shipped for the environment, otherwise ``baseline``.
+        policy: a name or a function (``planning.policies.named_policy``); default: ``potlp`` where an estimator is
+            shipped for the environment, otherwise ``baseline``.
         world: number of the world in the split.
         split: default: that of the command line, ``validation`` (``test`` for real buildings).
         config: default: what the environment calls for.
-        estimator: what the policy asks, as in ``run_trial``; default: the shipped one for ``potlp``.
+        estimator: what the policy ``potlp``, or a function, asks: an estimator, or the name of one
+            (``learning.estimator.named_estimator``); default: the shipped one.
         seed: of the trial's key, not of the world.
 
     Returns:
         The trial, finished: ``outcome``, ``cost``, ``path`` and every decision. The same arguments give the same one.
 
     Raises:
-        PluginError: there is no such environment.
+        PluginError: there is no such environment, policy or estimator.
         TaskError: there is no such task.
         WorldError: there is no such world.
         CheckpointError: no estimator is shipped for the task, or the one given is for other propositions.
@@ -55,7 +57,7 @@ def run(
         config,
         environment=f"{environment if isinstance(environment, str) else generator.name}/{chosen}",
         seed=world,
-        estimator=estimator,
+        estimator=named_estimator(estimator) if isinstance(estimator, str) else estimator,
     )
 
 
