@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from potlp_jax.trials.loop import run_robot as run_robot
     from potlp_jax.trials.loop import run_trial as run_trial
     from potlp_jax.trials.record import Outcome as Outcome
-    from potlp_jax.trials.record import Run as Run
+    from potlp_jax.trials.record import RunRecord as RunRecord
     from potlp_jax.trials.record import Trial as Trial
     from potlp_jax.trials.record import load_trial as load_trial
     from potlp_jax.trials.robot import Leg as Leg
@@ -116,7 +116,7 @@ __all__ = [  # noqa: RUF022 - by use, not by the alphabet
     "trial_config_for",
     "run_trial",
     "run_robot",
-    "Run",
+    "RunRecord",
     "Trial",
     "Outcome",
     "load_trial",
@@ -156,7 +156,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "trials.batch": ("Finished", "Start", "run_batch"),
     "trials.config": ("TrialConfig", "trial_config_for"),
     "trials.loop": ("run_robot", "run_trial"),
-    "trials.record": ("Outcome", "Run", "Trial", "load_trial"),
+    "trials.record": ("Outcome", "RunRecord", "Trial", "load_trial"),
     "trials.robot": ("Leg", "Robot"),
     "trials.rules": ("Stop",),
     "trials.run": ("run",),

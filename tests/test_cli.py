@@ -20,6 +20,7 @@ from potlp_jax.errors import PotlpError, WorldError
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
 from potlp_jax.trials.record import Outcome, load_trial
+from potlp_jax.trials.run import run
 
 # Few simulations: what is tested is the command line, not the planner.
 FAST = ("--simulations", "20")

@@ -248,8 +248,21 @@ def policy_function(policy: Policy | PolicyFunction) -> PolicyFunction:
         return policy
     if policy.searches:
         return search_move
-    direct = _optimistic if policy is Policy.OPTIMISTIC else _finish_or_frontier
-    return lambda situation, _estimates, _key, config, _intention: direct(situation, config)
+    return lambda situation, _estimates, _key, config, _intention: direct_move(situation, policy, config)
+
+
+def direct_move(situation: Situation, policy: Policy, config: DecisionConfig) -> Move:
+    """The move of a policy that does not search.
+
+    Args:
+        situation: known space, assessed from the robot's product state.
+        policy: ``optimistic``; every other one moves as the baseline does.
+        config: ``path_horizon`` is what matters here.
+
+    Returns:
+        The move; it has the kind NONE where there is none.
+    """
+    return _optimistic(situation, config) if policy is Policy.OPTIMISTIC else _finish_or_frontier(situation, config)
 
 
 def named_policy(policy: Policy | PolicyFunction | str) -> Policy | PolicyFunction:

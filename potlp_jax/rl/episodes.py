@@ -23,8 +23,7 @@ from jaxtyping import Array, Bool, Float32, Int8, Int32, PRNGKeyArray
 
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import Split
-from potlp_jax.planning.commitment import Intention
-from potlp_jax.planning.policies import Move, MoveKind, Policy, Situation, assess, move_to, policy_function
+from potlp_jax.planning.policies import Move, MoveKind, Policy, Situation, assess, direct_move, move_to
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 from potlp_jax.trials.record import Outcome
@@ -227,18 +226,13 @@ class TaskEnv:
         task = situation.task
         reached = jnp.isfinite(self._distances(situation)[:, task.edges[:, 0]]) & task.edge_mask[None, :]
         finishes = jnp.isfinite(situation.finish_cost)
-        explores = self._baseline(situation).kind != MoveKind.NONE
+        explores = direct_move(situation, Policy.BASELINE, self.config.decision).kind != MoveKind.NONE
         return jnp.concatenate([reached.reshape(-1), jnp.stack([finishes, explores])])
-
-    def _baseline(self, situation: Situation) -> Move:
-        """Finish where possible, otherwise to the nearest frontier. Draws nothing, so that any key will do."""
-        decide = policy_function(Policy.BASELINE)
-        return decide(situation, None, jax.random.key(0), self.config.decision, Intention.none())
 
     def _move(self, situation: Situation, action: Int32[Array, ""]) -> Move:
         """The move that carries out an action."""
         task, subgoals = situation.task, situation.subgoals
-        nearest = self._baseline(situation)
+        nearest = direct_move(situation, Policy.BASELINE, self.config.decision)
         goes = action < self._finish
         # Indices of the last two actions, and of any that do not exist, are clipped; what they look up is not used.
         subgoal, edge = jnp.divmod(jnp.clip(action, 0, self._finish - 1), self._edges)

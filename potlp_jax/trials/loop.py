@@ -21,7 +21,7 @@ from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials import rules
 from potlp_jax.trials.config import TrialConfig, config_in
 from potlp_jax.trials.move_record import decision_of
-from potlp_jax.trials.record import Decision, Outcome, Run, Trial
+from potlp_jax.trials.record import Decision, Outcome, RunRecord, Trial
 from potlp_jax.trials.robot import Leg, Robot, SimulatedRobot
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.moves import Cell, as_cell, path_length
@@ -85,7 +85,7 @@ def run_robot(
     arrays: TaskArrays | None = None,
     estimator: TrainedEstimator | Estimator | None = None,
     world: World | None = None,
-) -> Run:
+) -> RunRecord:
     """Drive a robot, a simulated or a real one, until the task is satisfied or cannot go on.
 
     Args:
@@ -144,7 +144,7 @@ class _Loop:
         self._states: list[int] = [int(self._tally.state)]
         self._decisions: list[Decision] = []
 
-    def run(self) -> Run:
+    def run(self) -> RunRecord:
         """Loop until the task is satisfied or cannot go on."""
         gave_up, leg = False, Leg(cells=())
         while True:
@@ -212,8 +212,8 @@ class _Loop:
             diagonal=jnp.int32(diagonal),
         )
 
-    def _result(self, outcome: Outcome, belief: BeliefMap) -> Run:
-        return Run(
+    def _result(self, outcome: Outcome, belief: BeliefMap) -> RunRecord:
+        return RunRecord(
             outcome=outcome,
             cost=path_length(self._path) * float(belief.resolution),
             path=tuple(self._path),
@@ -225,7 +225,7 @@ class _Loop:
 
 
 def make_trial(
-    run: Run,
+    run: RunRecord,
     task: Task,
     policy: Policy | PolicyFunction,
     config: TrialConfig,
@@ -250,7 +250,7 @@ def make_trial(
         The trial.
     """
     return Trial(
-        **{field.name: getattr(run, field.name) for field in dataclasses.fields(Run)},
+        **{field.name: getattr(run, field.name) for field in dataclasses.fields(RunRecord)},
         first_seen=first_seen,
         world=world,
         task_text=task.text,

@@ -119,7 +119,7 @@ class Decision:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Run:
+class RunRecord:
     """What a robot did for a task: all that is known of it without the true map.
 
     Attributes:
@@ -142,7 +142,7 @@ class Run:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Trial(Run):
+class Trial(RunRecord):
     """A finished trial: a run, with the true map and all that it was made with.
 
     Attributes:

@@ -108,9 +108,9 @@ def panorama_at(trial: Trial, decision: Decision, config: TrialConfig | None = N
 
 
 def panoramas_of(trial: Trial) -> dict[int, UInt8[np.ndarray, "rows columns 3"]]:
-    """What the camera saw at the decisions whose panoramas were used, by number; none for policies that do not look."""
-    used = sorted({number for decision in trial.decisions for number in decision.observations})
-    return {number: np.asarray(panorama_at(trial, trial.decisions[number])) for number in used}
+    """What the camera saw at the decisions whose panoramas were used, by number; none where a policy takes none."""
+    numbers = sorted({number for decision in trial.decisions for number in decision.observations})
+    return {number: np.asarray(panorama_at(trial, trial.decisions[number])) for number in numbers}
 
 
 @partial(jax.jit, static_argnames=("config",))
