@@ -7,7 +7,7 @@
     split: validation              # optional, as are all below
     first_world: 0
     estimator: out/fit/estimator.npz
-    settings:                      # any field of TrialConfig; others are what the environment calls for
+    settings:                      # any field of TrialConfig; the other fields are what the environment calls for
       replan_distance: 4
       decision: {search: {simulations: 300}}
 
@@ -92,6 +92,7 @@ def specification_from_store(data: Mapping[str, Any]) -> Specification:
 
 def configuration_hash(config: TrialConfig) -> str:
     """Twelve hexadecimal digits that tell settings apart."""
+    # 48 bits: among a million settings the chance that two share a hash is 0.2 %.
     text = json.dumps(json_copy(dataclasses.asdict(config)), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
@@ -112,7 +113,21 @@ _OPTIONAL = ("split", "first_world", "estimator", "settings", "seed")
 
 
 def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = Path()) -> Specification:
-    """Check the entries of a specification; ``where`` names it in messages, ``folder`` is where its files are."""
+    """Check the entries of a specification.
+
+    Args:
+        data: the entries, as in the file.
+        where: names the specification in messages.
+        folder: what names of files are relative to.
+
+    Returns:
+        The specification, with tasks as formulas and known map and baseline among the policies.
+
+    Raises:
+        SpecificationError: an entry is missing, unknown or wrong.
+        ConfigurationError: a setting is.
+    """
+    # Unknown entries first: a misspelt one is then named, rather than the right one reported as missing.
     for name in data:
         if name not in (*_REQUIRED, *_OPTIONAL):
             raise SpecificationError(f"{where}: unknown entry {name!r}; known: {', '.join((*_REQUIRED, *_OPTIONAL))}")
@@ -127,6 +142,7 @@ def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = 
         for environment in environments
         for task in _list(data, "tasks", where)
     ]
+    # Task 1 and its formula are the same cell; run twice, its rows would overwrite each other.
     for cell in cells:
         if cells.count(cell) > 1:
             raise SpecificationError(f"{where}: {cell.environment} with {cell.task!r} is there twice")
@@ -157,12 +173,14 @@ _EXAMPLES = {"environments": "firefighting", "tasks": "1, 2", "policies": "basel
 
 def _number(data: Mapping[str, Any], name: str, least: int, where: str, default: int | None = None) -> int:
     value = data.get(name, default)
+    # To Python, True is a whole number; in a file it is a mistake.
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= MAX_INDEX:
         raise SpecificationError(f"{where}: {name}: give a whole number of at least {least}, found {value!r}")
     return value
 
 
 def _policies(names: list[Any], where: str) -> tuple[str, ...]:
+    # Savings are measured between these two, so they run whether named or not.
     found = [Policy.KNOWN_MAP.value, Policy.BASELINE.value]
     for name in map(str, names):
         try:
@@ -195,6 +213,7 @@ def _split(name: Any, environments: Sequence[str], where: str) -> Split:
 def _formula(environment: str, task: Any, where: str) -> str:
     """A task by number as its formula, any other (a formula, a ``.hoa`` file) as it is. Raises for what is no task."""
     generator = make(environment)
+    # Compiled here only to be checked, so that a wrong task ends the command and not a worker.
     try:
         generator.task(task)
     except TaskError as error:
@@ -204,6 +223,7 @@ def _formula(environment: str, task: Any, where: str) -> str:
 
 def _common_config(environments: Sequence[str], where: str) -> TrialConfig:
     """What all environments call for."""
+    # Cells of one sweep are shown in one table, so that their settings must not differ without being named.
     configs = {name: trial_config_for(make(name)) for name in environments}
     first = configs[environments[0]]
     for name, config in configs.items():

@@ -17,6 +17,7 @@ from jaxtyping import Int32
 
 from potlp_jax.codec import finite_or_text
 from potlp_jax.errors import RecordError
+from potlp_jax.types import status_names
 from potlp_jax.world.grid import (
     BeliefMap,
     World,
@@ -182,7 +183,7 @@ class Trial(RunRecord):
             "task": self.task_text,
             "environment": self.environment,
             "seed": self.seed,
-            "status": self.status,
+            "status": list(status_names(self.status)),
         }
 
     def to_dict(self) -> dict[str, Any]:

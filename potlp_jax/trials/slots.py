@@ -286,13 +286,13 @@ def advance(setup: Setup, progress: Progress, scene: Scene, move: Move) -> Progr
     """Follow a move's path until the next decision is due, and see whether the trial ends there.
 
     Args:
-        setup: settings; static.
+        setup: of the batch; static.
         progress: of one slot.
         scene: of the slot.
-        move: the decision.
+        move: what was decided.
 
     Returns:
-        The progress there; unchanged where the trial is not running.
+        The progress; unchanged where the trial is not running.
     """
     config = setup.config
     stop = stop_of(move, progress.tally, progress.belief, config)

@@ -8,6 +8,7 @@ from rich.table import Table
 
 from potlp_jax.codec import finite_or_null
 from potlp_jax.trials.record import ActionRecord, Decision, Trial
+from potlp_jax.types import status_names
 
 
 def rank_actions(decision: Decision) -> list[ActionRecord]:
@@ -64,6 +65,6 @@ def describe_decision(trial: Trial, decision: Decision) -> str:
 
 
 def decision_to_dict(decision: Decision) -> dict[str, Any]:
-    """JSON-able values of a decision, actions by expected cost; what is infinite becomes None."""
+    """JSON-able values of a decision, actions by expected cost; what is infinite becomes None, status bits names."""
     ranked = dataclasses.replace(decision, actions=tuple(rank_actions(decision)))
-    return finite_or_null(dataclasses.asdict(ranked))
+    return finite_or_null({**dataclasses.asdict(ranked), "status": list(status_names(decision.status))})
