@@ -43,9 +43,6 @@ from potlp_jax.types import NO_ACTION, NO_STATE, Status, status_array, status_if
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
 from potlp_jax.world.grid import BeliefMap
 
-GROUP: str = "potlp_jax.policies"
-"""Entry points of this group are policies of other packages."""
-
 
 class Policy(StrEnum):
     """The planners that a trial can run (docs/model.md section 8)."""
@@ -284,7 +281,7 @@ def named_policy(policy: Policy | PolicyFunction | str) -> Policy | PolicyFuncti
     own = policy.strip().replace("_", "-")
     if own in list(Policy):
         return Policy(own)
-    found = plugins.load(policy, group=GROUP, kind="policy", known=list(Policy))
+    found = plugins.load(policy, group=plugins.POLICIES, kind="policy", known=list(Policy))
     if not callable(found):
         raise PluginError(f"policy {policy!r}: {type(found).__name__} is no function (PolicyFunction)")
     return found
