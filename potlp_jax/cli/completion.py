@@ -10,8 +10,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from potlp_jax.environments.families import GROUP, NAMED, PREFIXED
-from potlp_jax.plugins import entry_points
+from potlp_jax import plugins
+from potlp_jax.environments.families import NAMED, PREFIXED
 
 TASKS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -30,7 +30,7 @@ SPLITS = ("calibration", "training", "validation", "test")
 
 def complete_environment(incomplete: str) -> list[str]:
     """Names of environments, those that other installed packages declare among them."""
-    return _starting([*NAMED, *PREFIXED, *entry_points(GROUP)], incomplete)
+    return _starting([*NAMED, *PREFIXED, *plugins.entry_points(plugins.ENVIRONMENTS)], incomplete)
 
 
 def complete_task(ctx: Any, incomplete: str) -> list[str]:
@@ -42,14 +42,14 @@ def complete_task(ctx: Any, incomplete: str) -> list[str]:
 
 
 def complete_policy(incomplete: str) -> list[str]:
-    """Names of policies."""
-    return _starting(POLICIES, incomplete)
+    """Names of policies, those that other installed packages declare among them."""
+    return _starting(_policies(), incomplete)
 
 
 def complete_policies(incomplete: str) -> list[str]:
     """Names of policies after those that are there already, joined by commas."""
     *before, last = incomplete.split(",")
-    return [",".join([*before, name]) for name in _starting(POLICIES, last) if name not in before]
+    return [",".join([*before, name]) for name in _starting(_policies(), last) if name not in before]
 
 
 def complete_recipe(incomplete: str) -> list[str]:
@@ -61,6 +61,10 @@ def complete_recipe(incomplete: str) -> list[str]:
 def complete_split(incomplete: str) -> list[str]:
     """Names of splits."""
     return _starting(SPLITS, incomplete)
+
+
+def _policies() -> list[str]:
+    return [*POLICIES, *plugins.entry_points(plugins.POLICIES)]
 
 
 def _starting(words: Sequence[str], incomplete: str) -> list[str]:
