@@ -24,6 +24,7 @@ def make(name: str) -> Generator:
         if name.startswith(prefix):
             return plugins.load(reference, group=plugins.ENVIRONMENTS, kind="environment")(name)
     found = plugins.load(NAMED.get(name, name), group=plugins.ENVIRONMENTS, kind="environment", known=FAMILIES)
+    # A class or a function makes one; an object is one.
     generator = found() if callable(found) else found
     if not isinstance(generator, Generator):
         raise PluginError(
