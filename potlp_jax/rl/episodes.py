@@ -227,7 +227,7 @@ class TaskEnv:
     def _distances(self, situation: Situation) -> Float32[Array, "S Z"]:
         """To each subgoal in each state, inf where there is no way; padded subgoals included."""
         subgoals = situation.subgoals
-        # Masked subgoals point at cell (0, 0), which is a wall.
+        # Masked subgoals point at cell (0, 0), whatever is there.
         found = situation.distances[subgoals.cells[:, 0], subgoals.cells[:, 1]]
         return jnp.where(subgoals.mask[:, None], found, jnp.inf)
 
