@@ -22,8 +22,8 @@ def thermal(world: potlp_jax.World, cell: Int32[Array, "2"], config: CameraConfi
     """Grey levels of the usual picture without texture: bright is warm."""
     plain = render(world, cell, dataclasses.replace(config, renderer="", texture=0.0))
     # Luminance after ITU-R BT.601.
-    grey = jnp.sum(plain.astype(jnp.float32) * jnp.array([0.299, 0.587, 0.114]), axis=2, keepdims=True)
-    return jnp.broadcast_to(grey.astype(jnp.uint8), plain.shape)
+    grey = plain.astype(jnp.float32) @ jnp.array([0.299, 0.587, 0.114])
+    return jnp.broadcast_to(grey[:, :, None].astype(jnp.uint8), plain.shape)
 
 
 def main() -> None:

@@ -12,11 +12,11 @@ from jaxtyping import PRNGKeyArray
 import potlp_jax
 from potlp_jax.environments.base import host_generators
 
-DOORS = 4
+DOORS = 6
 
 
 class Corridor(potlp_jax.Generator):
-    """A corridor with closets on one side; the exit is in one of them, a fire in another."""
+    """A corridor with closets along it, the exit in one and a fire in another; the robot starts in the middle."""
 
     name = "corridor"
     propositions = ("fire", "exit")
@@ -35,13 +35,13 @@ class Corridor(potlp_jax.Generator):
         letters = np.zeros(occupied.shape, np.int32)
         fire, way_out = rng.permutation(middles)[:2]
         letters[5, fire], letters[5, way_out] = 0b01, 0b10
-        return potlp_jax.make_world(occupied, letters, (1, 1))
+        return potlp_jax.make_world(occupied, letters, (1, 2 * DOORS))
 
 
 def main() -> None:
-    """The baseline looks into closet after closet; the oracle goes to the right one."""
+    """The baseline explores one side and then the other; the oracle takes the right one."""
     for policy in ("baseline", "oracle"):
-        costs = [potlp_jax.run(Corridor(), policy=policy, world=number).cost for number in range(3)]
+        costs = [potlp_jax.run(Corridor(), policy=policy, world=number).cost for number in range(4)]
         print(f"{policy}: {', '.join(f'{cost:.1f}' for cost in costs)}")
 
 

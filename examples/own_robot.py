@@ -7,11 +7,11 @@ three cells at a time. Only what it reports is known to the planner.
 import jax
 import numpy as np
 from jaxtyping import Array, UInt8
-from potlp_jax.trials.rules import Stop
 
 import potlp_jax
 from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.trials.robot import Leg
+from potlp_jax.trials.rules import Stop
 
 FLOOR = """
   ###############

@@ -46,7 +46,7 @@ class ProblemError(PotlpError):
 
 
 class ProblemTooLargeError(PotlpError):
-    """The problem has more states than the exact solver was allowed to look at."""
+    """The problem has more states than the exact solver was allowed to explore."""
 
 
 class NetworkError(PotlpError):

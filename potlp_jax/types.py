@@ -44,7 +44,7 @@ horizon1                       product states of a path: its moves and the sourc
 Pictures and estimators
 rows, columns                  of a panorama; a column is a bearing
 G                              views of a training batch
-F                              features of a place in a panorama
+F                              features of a position in a panorama
 feature_rows, feature_columns  rows and columns of a panorama's features
 bands, columns_out             bands of rows of a panorama; columns of a result where they are fewer
 patch_rows, patch_columns      rows and columns of the patch around a subgoal
@@ -104,9 +104,14 @@ class Status(IntFlag):
     """The memory of panoramas was full; one was dropped that still showed a frontier."""
 
 
+def status_names(status: int) -> tuple[str, ...]:
+    """The bits that are set, by name: what people and programs are shown instead of a number."""
+    return tuple(str(flag.name).lower() for flag in Status(status))
+
+
 def status_array(status: Status = Status.OK) -> UInt32[Array, ""]:
     """The bits as a device scalar."""
-    # By way of numpy: a Python integer would become int32, and strict dtype promotion refuses to mix the two.
+    # Through numpy: a Python integer would become int32, and strict dtype promotion refuses to mix the two.
     return jnp.asarray(np.uint32(int(status)))
 
 

@@ -1,6 +1,7 @@
 """The command line: what it prints and writes, exit codes, and where its output goes."""
 
 import csv
+import gzip
 import json
 import subprocess
 import sys
@@ -16,10 +17,14 @@ from potlp_jax.cli import app, completion
 from potlp_jax.environments.families import FAMILIES, NAMED
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.environments.toy import Toy
 from potlp_jax.errors import PotlpError, WorldError
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
 from potlp_jax.trials.record import Outcome, load_trial
+from potlp_jax.trials.run import run
+
+ROOT = Path(__file__).parents[1]
 
 # Few simulations: what is tested is the command line, not the planner.
 FAST = ("--simulations", "20")
@@ -168,6 +173,18 @@ def test_run_as_json_is_the_summary(recorded, tmp_path):
     assert not (tmp_path / "new" / "trial.gif").exists()
 
 
+def test_one_call_from_python_makes_the_trial_of_the_command_line():
+    data = _json(_potlp("run", "toy", "-t", "2", "--policy", "baseline", "--world", "4", "--json"))
+    assert {**run("toy", 2, "baseline", 4).summary(), "files": []} == data
+
+
+def test_environments_and_policies_of_others_are_run_by_their_names():
+    names = ("examples.own_environment:Corridor", "--policy", "examples.own_policy:largest_frontier")
+    data = _json(_potlp("run", *names, "--camera", "examples.own_camera:thermal", "--json"))
+    assert (data["environment"], data["policy"]) == (f"{names[0]}/validation", names[2])
+    assert data["outcome"] == "satisfied"
+
+
 def test_without_an_estimator_the_default_policy_is_the_baseline():
     result = _potlp("run", "toy", "-t", "2")
     assert result.exit_code == 0
@@ -187,6 +204,31 @@ def test_task_that_is_not_satisfied_has_exit_code_1():
     result = _potlp("run", "toy", "--task", "!hazard U (goal & hazard)", "--policy", "baseline", "--json")
     assert result.exit_code == 1
     assert json.loads(result.stdout)["outcome"] == "infeasible"
+
+
+def _goals_behind_the_hazard(monkeypatch, possible):
+    """Toy worlds whose second task is possible in these numbers alone: elsewhere no cell is a goal."""
+    plain = Toy.draw
+
+    def draw(self, key):
+        world = plain(self, key)
+        keys = [world_key("validation", number, "toy") for number in possible]
+        return world if any((key == own).all() for own in keys) else world.replace(letters=world.letters * 0)
+
+    monkeypatch.setattr(Toy, "draw", draw)
+
+
+def test_an_infeasible_trial_says_whether_the_world_is_at_fault(monkeypatch):
+    _goals_behind_the_hazard(monkeypatch, {3})
+    result = _potlp("run", "toy", "-t", "2", "--policy", "baseline", "--world", "1")
+    assert result.exit_code == 1
+    assert "with the whole map it is impossible too: try --world 3" in result.stderr
+
+
+def test_a_task_that_no_world_allows_is_to_be_checked(monkeypatch):
+    monkeypatch.setattr("potlp_jax.cli.run.WORLDS_TRIED", 2)
+    result = _potlp("run", "toy", "--task", "!hazard U (goal & hazard)", "--policy", "baseline")
+    assert "as in the 2 worlds that follow: check the task" in result.stderr
 
 
 def test_out_that_is_a_file_is_refused(tmp_path):
@@ -276,19 +318,32 @@ def test_a_comparison_is_a_sweep_that_the_other_commands_show(tmp_path):
     assert longer["cells"][0]["world_numbers"] == [4, 5, 6]
 
 
+def test_the_trials_in_one_world_are_drawn_side_by_side(tmp_path):
+    command = ("compare", "toy", "-t", "2", "--policies", "optimistic", "--trials", "2", "--json")
+    _json(_potlp(*command, "--out", tmp_path, "--picture", "1"))
+    with Image.open(tmp_path / "world-1.png") as picture:
+        assert picture.size[0] > 400
+    assert "the worlds compared are 0, 1" in _potlp(*command, "--out", tmp_path, "--picture", "9").stderr
+    assert "--picture needs --out" in _potlp(*command, "--picture", "1").stderr
+
+
+def test_the_demo_quotes_the_results():
+    """The Makefile's figures of task 2, from the trials of Table I."""
+    with gzip.open(ROOT / "docs" / "results" / "table1" / "rows.csv.gz", "rt", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["task"] == make("firefighting").tasks["2"]]
+    costs = {policy: {row["world"]: float(row["cost"]) for row in rows if row["policy"] == policy} for policy in Policy}
+    saved = [costs[Policy.BASELINE][world] - cost for world, cost in costs[Policy.POTLP].items()]
+    # Moves cost 1 or 1.414; what differs by less than a thousandth differs by rounding.
+    less, same = sum(cost > 1e-3 for cost in saved), sum(abs(cost) <= 1e-3 for cost in saved)
+    claim = f"Over {len(saved)} worlds PO-TLP costs less than the baseline in {less / len(saved):.0%}"
+    assert (
+        claim.replace("%", " %") + f" and the same in {100 * same / len(saved):.1f} %"
+        in (ROOT / "Makefile").read_text()
+    )
+
+
 def test_impossible_worlds_are_redrawn(monkeypatch):
-    from potlp_jax.environments.toy import Toy, ToyConfig
-
-    plain = Toy.generate
-
-    def generate(self, key):
-        """The goal of every world but the third and fourth is where the robot cannot go without the hazard."""
-        world = plain(self, key)
-        seeds = [world_key("validation", seed, "toy") for seed in (2, 3)]
-        return world if any((key == seed).all() for seed in seeds) else world.replace(letters=world.letters * 0)
-
-    monkeypatch.setattr(Toy, "generate", generate)
-    assert ToyConfig().height == 9
+    _goals_behind_the_hazard(monkeypatch, {2, 3})
     data = _json(_potlp("compare", "toy", "-t", "2", "--policies", "baseline", "--trials", "2", "--json"))
     assert (data["cells"][0]["world_numbers"], data["cells"][0]["redrawn"]) == ([2, 3], 2)
 
@@ -330,10 +385,10 @@ def test_exit_codes_of_the_process():
 def test_interrupt_has_exit_code_130():
     interrupted = _process(
         "import signal, os, sys\n"
-        "import potlp_jax.environments.tasks as tasks\n"
+        "import potlp_jax.task.reading as reading\n"
         # A process started in the background inherits that interrupts are ignored.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "tasks.read_task = lambda *args: os.kill(os.getpid(), signal.SIGINT)\n"
+        "reading.read_task = lambda *args: os.kill(os.getpid(), signal.SIGINT)\n"
         "sys.argv = ['potlp', 'task', 'F a']\n"
         "from potlp_jax.cli import main\n"
         "main()\n"

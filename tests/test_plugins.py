@@ -8,10 +8,26 @@ from potlp_jax import plugins
 from potlp_jax.environments.families import FAMILIES
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.toy import Toy
-from potlp_jax.errors import PluginError
+from potlp_jax.errors import CheckpointError, PluginError
+from potlp_jax.learning.estimator import named_estimator
+from potlp_jax.planning.policies import Policy, named_policy
+from potlp_jax.sweep.runner import RESULTS, run_sweep
+from potlp_jax.sweep.specification import specification_from_dict, specification_from_store
+from potlp_jax.sweep.store import Store
+from potlp_jax.trials.run import run
 
 MODULE = """
+import jax.numpy as jnp
 from potlp_jax.environments.toy import Toy, ToyConfig
+from potlp_jax.planning.estimates import Estimates
+from potlp_jax.planning.policies import Policy, policy_function
+
+def nearest(situation, estimates, key, config, intention):
+    return policy_function(Policy.BASELINE)(situation, estimates, key, config, intention)
+
+def guess(belief, subgoals, task):
+    ones = jnp.ones((subgoals.mask.shape[0], task.class_mask.shape[0]))
+    return Estimates(success_probability=0.5 * ones, success_cost=ones, failure_cost=ones)
 
 class Small(Toy):
     name = "small"
@@ -82,4 +98,46 @@ def test_errors_say_what_is_wrong(name, message):
 
 def test_references_are_told_from_names_and_files():
     assert plugins.is_reference("package.module:Class.method")
-    assert not any(map(plugins.is_reference, ("toy", "a file.npz", "C:\\maps\\x.npz", "map:office.yaml", "out/x:y/z")))
+    assert not any(map(plugins.is_reference, ("toy", "a file.npz", "C:\\maps\\x.npz", "out/x:y/z", "/maps/x.yaml")))
+
+
+def test_a_policy_is_a_function_by_name(elsewhere):
+    trial = run("foreign_worlds:Small", policy="foreign_worlds:nearest", world=2)
+    baseline = run("foreign_worlds:Small", policy="baseline", world=2)
+    assert (trial.outcome, trial.path) == (baseline.outcome, baseline.path)
+    assert (trial.policy, trial.environment) == ("foreign_worlds:nearest", "foreign_worlds:Small/validation")
+    assert named_policy("known_map") is Policy.KNOWN_MAP
+    with pytest.raises(PluginError, match="unknown policy 'clever'; choose one of: known-map, baseline"):
+        named_policy("clever")
+    with pytest.raises(PluginError, match="int is no function"):
+        named_policy("foreign_worlds:number")
+
+
+def test_an_estimator_is_a_function_by_name_or_a_file(elsewhere):
+    trial = run("toy", policy="potlp", world=1, estimator="foreign_worlds:guess")
+    assert trial.outcome == "satisfied"
+    assert trial.versions["estimator"] == "foreign_worlds:guess"
+    assert {action.success_probability for action in trial.decisions[0].actions if action.subgoal is not None} == {0.5}
+    with pytest.raises(PluginError, match="int is no function of belief"):
+        named_estimator("foreign_worlds:number")
+    with pytest.raises(CheckpointError, match=r"missing\.npz"):
+        named_estimator("missing.npz")
+
+
+def test_workers_of_a_sweep_find_environments_and_policies_by_the_same_names(elsewhere):
+    entries = {
+        "environments": ["foreign_worlds:Small"],
+        "tasks": [1],
+        "policies": ["foreign_worlds:nearest"],
+        "worlds": 3,
+    }
+    specification = specification_from_dict(entries, "sweep")
+    run_sweep(specification, elsewhere / "out", processes=2)
+    store = Store(elsewhere / "out" / RESULTS)
+    assert specification_from_store(store.facts()["specification"]) == specification
+    costs = {policy: {} for policy in specification.policies}
+    for row in store.rows():
+        costs[row.item.policy][row.item.world] = row.cost
+    store.close()
+    assert len(costs["baseline"]) == 3
+    assert costs["foreign_worlds:nearest"] == costs["baseline"]

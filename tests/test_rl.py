@@ -9,7 +9,8 @@ from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.toy import Toy, ToyConfig
 from potlp_jax.rl.episodes import OUTCOME_NAMES, StepType, TaskEnv
 from potlp_jax.trials.config import TrialConfig
-from potlp_jax.trials.loop import run_trial, trial_key
+from potlp_jax.trials.loop import run_trial
+from potlp_jax.trials.rules import trial_key
 
 STEPS = 12
 

@@ -18,12 +18,12 @@ from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning import policies
 from potlp_jax.planning.policies import DecisionConfig, MoveKind, Policy, decide
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig
 from potlp_jax.task.task import Task, TaskSizes
 from potlp_jax.trials import loop as trial_module
 from potlp_jax.trials import robot
 from potlp_jax.trials.config import TrialConfig
-from potlp_jax.trials.loop import Loop, run_trial
+from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import Outcome, load_trial
 from potlp_jax.trials.replay import replay_decision
 from potlp_jax.trials.robot import Leg, SimulatedRobot
@@ -318,12 +318,14 @@ def test_a_robot_that_goes_elsewhere_is_on_its_way_to_nothing():
 
     for follower, stays in ((StayingRobot(), True), (robot, False)):
         estimator = TrueMapEstimator(world=world)
-        loop = Loop(follower, task, task.padded(SIZES), Policy.ORACLE, estimator, jax.random.key(0), CONFIG)
+        loop = trial_module._Loop(
+            follower, task, task.padded(SIZES), Policy.ORACLE, estimator, jax.random.key(0), CONFIG
+        )
         move = loop._decide(*robot.observe())
-        assert int(move.intention.state) == int(task.dfa.transitions[task.dfa.initial, loop.word[0]])
+        assert int(move.intention.state) == int(loop._tally.state)
         loop._advance(robot.observe()[0], move)
         expected = NO_STATE if stays else int(move.intention.state)
-        assert int(loop._intention.state) == expected
+        assert int(loop._tally.intention.state) == expected
 
 
 def test_an_oracle_without_estimator_is_refused():

@@ -373,11 +373,11 @@ def test_a_decision_that_keeps_on_says_what_was_better(trial):
     actions = (_action(0, 9.0), _action(1, 8.5))
     keeping = dataclasses.replace(trial.decisions[0], actions=actions, choice=0, preferred=1)
     turning = dataclasses.replace(keeping, choice=1)
-    assert keeping.kept_from == actions[1]
+    assert keeping.overruled == actions[1]
     assert describe_decision(trial, keeping).endswith(f"kept although {action_name(actions[1])} is better")
     # Another choice than the cheapest is none that was kept: the mode of the authors takes the most visited action.
     for other in (turning, dataclasses.replace(keeping, preferred=0), dataclasses.replace(keeping, preferred=None)):
-        assert other.kept_from is None
+        assert other.overruled is None
         assert "kept" not in describe_decision(trial, other)
 
 

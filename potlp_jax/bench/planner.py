@@ -23,7 +23,7 @@ from potlp_jax.planning.estimates import Estimator, ask
 from potlp_jax.planning.policies import DecisionConfig, Move, Policy, Situation, assess, decide, planning_problem
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions, search
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.types import NO_STATE
 from potlp_jax.world.grid import BeliefMap, World
@@ -318,24 +318,26 @@ def measure_decision(
     )
     phases.measure("search", lambda problem, key: plan_actions(problem, key, config.search), problem, key)
 
-    # One program, in which XLA may share work between phases that the rows above count twice.
-    def whole(scene: Scene, key: Array) -> Move:
-        return decide(
-            scene.belief,
-            scene.cell,
-            scene.state,
-            scene.task,
-            scene.estimator,
-            key,
-            policy=policy,
-            config=config,
-        )
-
-    # The path's target is the whole decision's, so the whole is measured before the last phase and reported after it.
-    move = phases.measure("whole", whole, scene, key)
+    # One program, in which XLA may share work between phases that the rows above count twice. The path's target is the
+    # whole decision's, so the whole is measured before the last phase and reported after it.
+    move = phases.measure("whole", lambda scene, key: _decide(scene, key, policy, config), scene, key)
     phases.measure("path", lambda situation, move: _path(situation, move, config), situation, move)
     *parts, all_of_it, path = phases.rows
     return [*parts, path, all_of_it]
+
+
+def _decide(scene: Scene, key: Array, policy: Policy, config: DecisionConfig) -> Move:
+    """The whole decision in a scene."""
+    return decide(
+        scene.belief,
+        scene.cell,
+        scene.state,
+        scene.task,
+        scene.estimator,
+        key,
+        policy=policy,
+        config=config,
+    )
 
 
 def _path(situation: Situation, move: Move, config: DecisionConfig) -> Any:

@@ -164,7 +164,7 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
 * firefighting: task 1 of the fire-fighting building (Bradley et al. 2021, section V-A)
 * reuse: what was found once is needed again
 * random: co-safe formulas whose automata have 2 to 8 states
-* cubes: transitions that come about in several ways
+* cubes: transitions that have several cubes
 """
 
 

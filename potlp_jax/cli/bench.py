@@ -67,7 +67,6 @@ def run_bench(
     from potlp_jax.bench.timing import environment as describe_environment
     from potlp_jax.cli.inputs import trial_config
     from potlp_jax.environments.registry import make
-    from potlp_jax.environments.tasks import environment_task
     from potlp_jax.learning.estimator import estimator_for
 
     chosen = _read_parts(parts)
@@ -83,7 +82,7 @@ def run_bench(
             rows["search"] = [measure_search(family, subgoals, batch, decision.search, repeats) for batch in counts]
         if set(chosen) - {"search"}:
             progress.update(bar, description="exploring a world")
-            asked = environment_task(make(environment), task)
+            asked = make(environment).task(task)
             # First of all, so that a missing estimator is reported before anything long.
             trained = estimator_for(asked.propositions) if "perception" in chosen else None
             scene = make_scene(make_world(environment, size, world), asked)

@@ -10,8 +10,17 @@ from rich.console import Console
 
 from potlp_jax.cli.completion import complete_policies
 from potlp_jax.cli.group import Command, command_app
-from potlp_jax.cli.options import Environment, EstimatorFile, Json, Simulations, SplitName, TaskName, WorldNumber
-from potlp_jax.cli.output import console, make_folder, print_json, to_json
+from potlp_jax.cli.options import (
+    CameraName,
+    Environment,
+    EstimatorName,
+    Json,
+    Simulations,
+    SplitName,
+    TaskName,
+    WorldNumber,
+)
+from potlp_jax.cli.output import console, fail, make_folder, print_json, to_json
 from potlp_jax.cli.sweep import print_cell, run_reported
 
 if TYPE_CHECKING:
@@ -55,8 +64,13 @@ def compare_policies(
         typer.Option("--out", "-o", help="Folder for the sweep, compare.json, trials.csv, scatter.png and table.txt."),
     ] = None,
     simulations: Simulations = None,
-    estimator: EstimatorFile = None,
+    estimator: EstimatorName = None,
+    camera: CameraName = None,
     processes: Annotated[int, typer.Option(min=1, help="Workers, each on a core of its own.")] = 1,
+    picture: Annotated[
+        int | None,
+        typer.Option(min=0, metavar="WORLD", help="Draw the trials in this world side by side, in --out."),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Compare policies in the same worlds, with the share of attainable savings and its uncertainty."""
@@ -64,6 +78,8 @@ def compare_policies(
     from potlp_jax.environments.registry import make
     from potlp_jax.sweep.specification import specification_from_dict
 
+    if picture is not None and out is None:
+        fail("--picture needs --out, the folder in which the picture is written")
     generator = make(environment)
     entries: dict[str, Any] = {
         "environments": [environment],
@@ -72,15 +88,18 @@ def compare_policies(
         "worlds": trials,
         "split": read_split(split, generator).value,
         "first_world": world,
-        "settings": {} if simulations is None else {"decision": {"search": {"simulations": simulations}}},
+        "settings": _settings(simulations, camera),
     }
     if estimator is not None:
-        entries["estimator"] = str(estimator)
+        entries["estimator"] = estimator
     specification = specification_from_dict(entries, "compare")
     if out is not None:
         results = _run(specification, make_folder(out), processes)
-        _write(results, out)
+        files = _write(results, out)
+        if picture is not None:
+            files.append(_draw(specification, results, out, picture))
     else:
+        files = []
         with tempfile.TemporaryDirectory(prefix="potlp-compare-") as folder:
             results = _run(specification, Path(folder), processes)
     if json:
@@ -89,8 +108,14 @@ def compare_policies(
     (cell,) = results.cells
     print_cell(console(), cell, specification.split)
     if out is not None:
-        console().print(f"wrote compare.json, trials.csv, scatter.png and table.txt in {out}", markup=False)
+        console().print(f"wrote {', '.join(file.name for file in files)} in {out}", markup=False)
         console().print(f"next: potlp report {out}", markup=False, style="dim")
+
+
+def _settings(simulations: int | None, camera: str | None) -> dict[str, Any]:
+    """What the options change of the settings that the environment calls for."""
+    search = {} if simulations is None else {"decision": {"search": {"simulations": simulations}}}
+    return search if camera is None else {**search, "camera": {"renderer": camera}}
 
 
 def _run(specification: "Specification", folder: Path, processes: int) -> "Results":
@@ -102,26 +127,54 @@ def _run(specification: "Specification", folder: Path, processes: int) -> "Resul
         return read_results(store)
 
 
-def _write(results: "Results", folder: Path) -> None:
+def _write(results: "Results", folder: Path) -> list[Path]:
+    """The results for programs, for tables and for people; returns the files."""
     from potlp_jax.view.comparisons import draw_scatter
     from potlp_jax.view.style import save_figure
 
     (cell,) = results.cells
-    (folder / "compare.json").write_text(to_json(results.to_dict()) + "\n", "utf-8")
+    names = ("compare.json", "trials.csv", "scatter.png", "table.txt")
+    data, trials, scatter, table = (folder / name for name in names)
+    data.write_text(to_json(results.to_dict()) + "\n", "utf-8")
     split, policies = results.specification["split"], results.specification["policies"]
-    with (folder / "table.txt").open("w", encoding="utf-8") as file:
+    with table.open("w", encoding="utf-8") as file:
         print_cell(Console(file=file, width=150, highlight=False), cell, split)
-    _write_csv(cell, folder / "trials.csv")
+    _write_csv(cell, trials)
     title = f"{cell.environment}/{split}, task {cell.task}: {len(cell.pairs)} worlds"
-    save_figure(draw_scatter(cell.pairs, policies, title), folder / "scatter.png")
+    save_figure(draw_scatter(cell.pairs, policies, title), scatter)
+    return [data, trials, scatter, table]
+
+
+def _draw(specification: "Specification", results: "Results", folder: Path, world: int) -> Path:
+    """The baseline's and the other policies' trials in one world, run again, on one picture; returns its file."""
+    from potlp_jax.planning.policies import Policy
+    from potlp_jax.sweep.results import world_of
+    from potlp_jax.sweep.runner import Sweep
+    from potlp_jax.view.maps import draw_side_by_side
+    from potlp_jax.view.style import save_figure
+
+    (cell,) = results.cells
+    numbers = [world_of(pair) for pair in cell.pairs]
+    if world not in numbers:
+        fail(f"--picture {world}: the worlds compared are {', '.join(map(str, numbers))}")
+    sweep, pair = Sweep(specification, folder), cell.pairs[numbers.index(world)]
+    # The known map's path shows no exploration, which is what the picture is to compare.
+    trials = [sweep.trial(row.item) for policy, row in pair.items() if policy != Policy.KNOWN_MAP]
+    sweep.store.close()
+    file = folder / f"world-{world}.png"
+    save_figure(draw_side_by_side(trials), file)
+    return file
 
 
 def _write_csv(cell: "CellResults", file: Path) -> None:
     """A line for each trial; paths and versions are in what ``potlp sweep export`` writes."""
-    names = ("outcome", "cost", "steps", "decisions", "fallbacks", "status", "budget")
+    from potlp_jax.types import status_names
+
+    names = ("outcome", "cost", "steps", "decisions", "fallbacks", "budget")
     with file.open("w", encoding="utf-8", newline="") as opened:
         writer = csv.writer(opened)
-        writer.writerow(("world", "policy", *names))
+        writer.writerow(("world", "policy", *names, "status"))
         for pair in cell.pairs:
             for policy, row in pair.items():
-                writer.writerow((row.item.world, policy, *(getattr(row, name) for name in names)))
+                values = (getattr(row, name) for name in names)
+                writer.writerow((row.item.world, policy, *values, " ".join(status_names(row.status))))

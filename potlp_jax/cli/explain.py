@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from potlp_jax.cli.group import Command, command_app
-from potlp_jax.cli.options import EstimatorFile, Json
+from potlp_jax.cli.options import EstimatorName, Json
 from potlp_jax.cli.output import console, fail, print_json
 
 if TYPE_CHECKING:
@@ -49,15 +49,15 @@ def explain_decision(
         typer.Option("--out", "-o", help="Search again and draw the top of the tree (.png, .svg or .pdf)."),
     ] = None,
     depth: Annotated[int, typer.Option(min=1, max=5, help="Actions in a row in the picture of the tree.")] = 2,
-    estimator: EstimatorFile = None,
+    estimator: EstimatorName = None,
     json: Json = False,
 ) -> None:
     """Explain one decision: the actions that were weighed, their estimates and expected costs."""
-    from potlp_jax.cli.inputs import read_trained_estimator
+    from potlp_jax.cli.inputs import read_estimator
     from potlp_jax.view.decisions import action_table, decision_to_dict, describe_decision
 
     trial, found = _read_decision(decision)
-    files = [] if out is None else _draw(trial, found, out, depth=depth, estimator=read_trained_estimator(estimator))
+    files = [] if out is None else _draw(trial, found, out, depth=depth, estimator=read_estimator(estimator))
     if json:
         print_json({"trial": trial.summary(), **decision_to_dict(found)})
         return
@@ -108,9 +108,9 @@ def _draw(
         logger.warning("searching again chose another action than recorded: the versions of the software may differ")
     top = tree_top(problem, tree, depth=depth, width=BREADTH)
     save_figure(draw_tree(top, describe_decision(trial, decision), breadth=BREADTH), out)
-    if not decision.looks:
+    if not decision.observations:
         return [out]
-    seen = {look: np.asarray(panorama_at(trial, trial.decisions[look])) for look in decision.looks}
+    seen = {look: np.asarray(panorama_at(trial, trial.decisions[look])) for look in decision.observations}
     beside = out.with_name(f"{out.stem}-panoramas.png")
     save_figure(draw_panoramas(trial, decision, seen), beside)
     return [out, beside]

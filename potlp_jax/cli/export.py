@@ -46,8 +46,8 @@ def export_task(
 ) -> None:
     """Export the planner as programs of plain arrays that run with jax alone."""
     from potlp_jax.cli.inputs import read_names, trial_config
-    from potlp_jax.environments.tasks import read_task
     from potlp_jax.export import MANIFEST, ExportConfig, export_planner
+    from potlp_jax.task.reading import read_task
 
     if (height is None) != (width is None):
         fail("--height and --width go together: the whole decision needs both, the search alone neither")

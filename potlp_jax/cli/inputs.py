@@ -12,10 +12,12 @@ from pathlib import Path
 from potlp_jax.cli.output import fail
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split, default_split, world_key
-from potlp_jax.learning.estimator import TrainedEstimator, read_estimator, shipped_estimator
+from potlp_jax.learning.estimator import TrainedEstimator, named_estimator
+from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.runner import RESULTS
 from potlp_jax.sweep.store import Store
+from potlp_jax.trials import run
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 from potlp_jax.world.grid import World
 
@@ -35,27 +37,19 @@ def record_file(trial: Path) -> Path:
     return trial / RECORD if trial.is_dir() else trial
 
 
-def read_policy(name: str) -> Policy:
-    """A policy by name; ``known_map`` is as good as ``known-map``."""
-    try:
-        return Policy(name.strip().replace("_", "-"))
-    except ValueError:
-        fail(f"unknown policy {name.strip()!r}; choose from: {', '.join(Policy)}")
-
-
 def default_policy(generator: Generator) -> Policy:
     """PO-TLP where an estimator is shipped for the environment's propositions, otherwise the baseline, with a note."""
-    if shipped_estimator(generator.propositions) is not None:
-        return Policy.POTLP
-    logger.warning(
-        f"no estimator is shipped for {generator.name}: the policy is {Policy.BASELINE}; choose another with --policy"
-    )
-    return Policy.BASELINE
+    policy = run.default_policy(generator.propositions)
+    if policy is not Policy.POTLP:
+        logger.warning(
+            f"no estimator is shipped for {generator.name}: the policy is {policy}; choose another with --policy"
+        )
+    return policy
 
 
-def read_trained_estimator(path: Path | None) -> TrainedEstimator | None:
-    """An estimator from a file; None asks for the shipped one. Raises CheckpointError."""
-    return None if path is None else read_estimator(path)
+def read_estimator(name: str | None) -> TrainedEstimator | Estimator | None:
+    """An estimator by name; None asks for the shipped one. Raises CheckpointError or PluginError."""
+    return None if name is None else named_estimator(name)
 
 
 def read_split(name: str | None, generator: Generator) -> Split:
@@ -82,9 +76,20 @@ def make_world(generator: Generator, split: Split, number: int) -> World:
     return generator.generate(world_key(split, number, generator.name))
 
 
-def trial_config(simulations: int | None, generator: Generator | None = None) -> TrialConfig:
-    """What the generator's worlds call for, with another number of simulations if one is given."""
+def trial_config(simulations: int | None, generator: Generator | None = None, camera: str | None = None) -> TrialConfig:
+    """What the options change of the settings of a trial.
+
+    Args:
+        simulations: per decision; None: the default.
+        generator: its worlds say what the other settings are; None: the defaults.
+        camera: name of a renderer; None: the shipped one.
+
+    Returns:
+        The settings.
+    """
     config = TrialConfig() if generator is None else trial_config_for(generator)
+    if camera is not None:
+        config = dataclasses.replace(config, camera=dataclasses.replace(config.camera, renderer=camera))
     if simulations is None:
         return config
     search = dataclasses.replace(config.decision.search, simulations=simulations)

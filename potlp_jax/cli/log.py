@@ -11,7 +11,7 @@ from rich.table import Table
 
 from potlp_jax.cli.completion import complete_policy
 from potlp_jax.cli.group import Command, command_app
-from potlp_jax.cli.options import EstimatorFile, Json, OpenPage, Simulations, TrialFile
+from potlp_jax.cli.options import EstimatorName, Json, OpenPage, Simulations, TrialFile
 from potlp_jax.cli.output import FAILED, console, fail, make_folder, open_page, print_json, progress_bar
 from potlp_jax.cli.view import PAGE
 
@@ -225,7 +225,7 @@ def replay_log(
         ),
     ] = None,
     simulations: Simulations = None,
-    estimator: EstimatorFile = None,
+    estimator: EstimatorName = None,
     map_topic: MapTopic = None,
     image_topic: ImageTopic = None,
     base_frame: BaseFrame = None,
@@ -242,11 +242,12 @@ def replay_log(
     _check_rosbags()
     import jax
 
-    from potlp_jax.cli.inputs import RECORD, read_policy, read_trained_estimator, trial_config
-    from potlp_jax.environments.tasks import read_task
+    from potlp_jax.cli.inputs import RECORD, read_estimator, trial_config
     from potlp_jax.logs.log import LogConfig
     from potlp_jax.logs.replaying import replay
     from potlp_jax.logs.working_grid import GridConfig
+    from potlp_jax.planning.policies import named_policy, policy_name
+    from potlp_jax.task.reading import read_task
     from potlp_jax.view.maps import draw_trial
     from potlp_jax.view.replay_page import replay_page
     from potlp_jax.view.style import save_figure
@@ -262,8 +263,8 @@ def replay_log(
     )
     drive = _read_drive(bag, labels, config, GridConfig(resolution, radius))
     asked = read_task(drive.tasks.get(task, task), drive.propositions)
-    trained = read_trained_estimator(estimator)
-    chosen = _default_policy(drive, trained) if policy is None else read_policy(policy)
+    trained = read_estimator(estimator)
+    chosen = _default_policy(drive, trained) if policy is None else named_policy(policy)
     folder = make_folder(out)
     with progress_bar() as progress:
         progress.add_task("deciding along the drive (the first decision compiles)", total=None)
@@ -276,7 +277,8 @@ def replay_log(
         print_json({**trial.summary(), "files": [str(file) for file in files]})
     else:
         console().print(
-            f"{trial.outcome}: {len(trial.decisions)} decisions of {chosen} along {trial.cost:.2f} m", markup=False
+            f"{trial.outcome}: {len(trial.decisions)} decisions of {policy_name(chosen)} along {trial.cost:.2f} m",
+            markup=False,
         )
         for file in files:
             console().print(f"wrote {file}", markup=False)

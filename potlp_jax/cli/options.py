@@ -22,7 +22,8 @@ Environment = Annotated[
     typer.Argument(
         metavar="ENV",
         help="[cyan]toy[/cyan], [cyan]firefighting[/cyan], [cyan]delivery[/cyan], [cyan]rooms[/cyan], "
-        "[cyan]map:FILE.yaml[/cyan] (ROS map) or [cyan]floorplan:FILE.xml[/cyan] (real floor plan, or a folder).",
+        "[cyan]map:FILE.yaml[/cyan] (ROS map), [cyan]floorplan:FILE.xml[/cyan] (real floor plan, or a folder), or "
+        "[cyan]module:attribute[/cyan] of an environment of your own.",
         autocompletion=complete_environment,
     ),
 ]
@@ -40,7 +41,8 @@ PolicyName = Annotated[
     typer.Option(
         "--policy",
         "-p",
-        help="potlp (the default where an estimator is shipped), known-map, baseline, optimistic or oracle.",
+        help="potlp (the default where an estimator is shipped), known-map, baseline, optimistic, oracle, or "
+        "module:attribute of a policy of your own.",
         show_default=False,
         autocompletion=complete_policy,
     ),
@@ -59,8 +61,18 @@ WorldNumber = Annotated[int, typer.Option("--world", "-w", min=0, help="Number o
 Simulations = Annotated[
     int | None, typer.Option("--simulations", min=1, help="Simulations per decision of policies that search.")
 ]
-EstimatorFile = Annotated[
-    Path | None, typer.Option("--estimator", help="Trained estimator for the policy potlp; default: the shipped one.")
+EstimatorName = Annotated[
+    str | None,
+    typer.Option(
+        "--estimator",
+        metavar="FILE|NAME",
+        help="What the policy potlp asks: a trained estimator's file, or module:attribute; default: the shipped one.",
+        show_default=False,
+    ),
+]
+CameraName = Annotated[
+    str | None,
+    typer.Option("--camera", metavar="NAME", help="module:attribute of a camera of your own.", show_default=False),
 ]
 
 # Tasks without an environment.

@@ -39,7 +39,7 @@ def show_task(
 ) -> None:
     """Show a task as an automaton: states, transitions, and the outcomes that have to be estimated."""
     from potlp_jax.cli.inputs import read_names
-    from potlp_jax.environments.tasks import read_task
+    from potlp_jax.task.reading import read_task
 
     task = read_task(formula, read_names(propositions), max_positive_literals)
     description = task.describe()

@@ -19,7 +19,7 @@ from potlp_jax.learning.recording import (
     recording_metadata,
 )
 from potlp_jax.learning.sample_weights import WeightBounds
-from potlp_jax.logs.drive import Drive, Eyes
+from potlp_jax.logs.drive import Drive, PanoramaReader
 from potlp_jax.trials.loop import versions
 from potlp_jax.world.moves import step_lengths
 
@@ -64,7 +64,7 @@ def collect_drives(
     for number, drive in enumerate(drives):
         recorder = Recorder(number, config, WeightBounds(**metadata.weights))
         rng, pool = draws_of_world(config, split, number, tasks)
-        eyes = Eyes(drive, config.camera)
+        reader = PanoramaReader(drive, config.camera)
         record_views(
             recorder,
             drive.world,
@@ -72,7 +72,7 @@ def collect_drives(
             poses_of(drive),
             pool,
             rng,
-            lambda pose, eyes=eyes: eyes.panorama(pose.step),
+            lambda pose, reader=reader: reader.panorama(pose.step),
             drive.unexplored(),
         )
         write_shard(folder, number, recorder.views, recorder.samples, metadata)

@@ -21,7 +21,8 @@ from potlp_jax.planning.distances.paths import KnownPath, shortest_path
 from potlp_jax.planning.policies import Situation, assess
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
-from potlp_jax.trials.robot import SimulatedRobot, Stop
+from potlp_jax.trials.robot import SimulatedRobot
+from potlp_jax.trials.rules import Stop
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.moves import Cell, path_length

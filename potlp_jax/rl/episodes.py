@@ -23,15 +23,19 @@ from jaxtyping import Array, Bool, Float32, Int8, Int32, PRNGKeyArray
 
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import Split
-from potlp_jax.planning.policies import Move, MoveKind, Policy, Situation, assess, direct_move, move_to
+from potlp_jax.planning.commitment import Intention
+from potlp_jax.planning.policies import Move, MoveKind, Policy, Situation, assess, move_to, policy_function
 from potlp_jax.task.task import Task
-from potlp_jax.trials.batch_step import OUTCOMES, Progress, Rules, Scene, advance, begin
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 from potlp_jax.trials.record import Outcome
+from potlp_jax.trials.rules import OUTCOMES, RUNNING
+from potlp_jax.trials.slots import Progress, Scene, Setup, advance, begin
 from potlp_jax.world.grid import World
 
-OUTCOME_NAMES: Mapping[int, str] = {number: outcome.value for number, outcome in enumerate(OUTCOMES)}
-"""Outcomes by ``TimeStep.extras["outcome"]``; -1 is a running episode."""
+OUTCOME_NAMES: Mapping[int, str] = {RUNNING: "running"} | {
+    number: outcome.value for number, outcome in enumerate(OUTCOMES)
+}
+"""What ``TimeStep.extras["outcome"]`` says."""
 
 _INFEASIBLE, _SATISFIED, _BUDGET = (
     OUTCOMES.index(outcome) for outcome in (Outcome.INFEASIBLE, Outcome.SATISFIED, Outcome.BUDGET)
@@ -82,7 +86,7 @@ class TimeStep:
         reward: of the step just made; 0 on the first and after the last.
         discount: 0 where the episode has ended, 1 while it runs and where only the budget ended it (truncation).
         observation: on which the next action is based.
-        extras: ``cost`` travelled so far and ``outcome`` (``OUTCOME_NAMES``; -1 while the episode runs).
+        extras: ``cost`` travelled so far and ``outcome`` (``OUTCOME_NAMES``).
     """
 
     step_type: Int8[Array, "*batch"]
@@ -127,12 +131,14 @@ class TaskEnv:
             task: over the worlds' propositions.
             config: default: what the worlds call for.
         """
+        # Their static parts (propositions, settings) must agree, which jax.tree.map checks.
         self.worlds: World = jax.tree.map(lambda *leaves: jnp.stack(leaves), *worlds)
         self.task = task
         self.config: TrialConfig = trial_config_for(worlds[0]) if config is None else config
         self._edges = len(task.edges)
+        # What the planner calls A - 1: all pairs of a subgoal and an edge come first.
         self._finish = self.config.decision.frontiers.max_subgoals * self._edges
-        self._rules = Rules(policy=Policy.BASELINE, config=self.config, network=None)
+        self._setup = Setup(policy=Policy.BASELINE, config=self.config, network=None)
 
     @classmethod
     def of_family(
@@ -149,7 +155,11 @@ class TaskEnv:
             task: number of the family's task, a formula over its propositions, or a task.
             worlds: their numbers. All are made now and kept on the device.
             split: from which they are taken.
+
+        Returns:
+            The environment, with the settings that the family calls for.
         """
+        # Worlds are made on the host; what is compiled only picks one of them.
         made = [generator.world(index, split) for index in worlds]
         return cls(made, task if isinstance(task, Task) else generator.task(task))
 
@@ -166,7 +176,7 @@ class TaskEnv:
     def reset_in(self, world: World) -> tuple[EnvState, TimeStep]:
         """Begin an episode in this world. Its shape must be that of the others, for one compilation to serve all."""
         # A trial draws for its planner and its camera alone, and an episode has neither.
-        scene, progress = begin(world, self.task.arrays, jax.random.key(0), None, rules=self._rules)
+        scene, progress = begin(world, self.task.arrays, jax.random.key(0), None, setup=self._setup)
         state = self._assessed(scene, progress)
         # Even an episode that cannot be won has a first step, as dm_env has it.
         return state, self._time_step(state, jnp.int8(StepType.FIRST), jnp.float32(0.0))
@@ -182,21 +192,26 @@ class TaskEnv:
             The next state, and what the agent gets.
         """
         before = state.progress
-        progress = advance(self._rules, before, state.scene, self._move(state.situation, action))
+        progress = advance(self._setup, before, state.scene, self._move(state.situation, action))
         after = self._assessed(state.scene, progress)
         resolution = state.scene.world.resolution
-        reward = -(after.progress.travelled - before.travelled) * resolution
-        failed = before.running & ~after.progress.running & (after.progress.outcome != _SATISFIED)
+        # From counts of moves, so that the sum over an episode does not depend on how it was cut into legs.
+        reward = -(after.progress.tally.travelled - before.tally.travelled) * resolution
+        tally = after.progress.tally
+        failed = before.tally.running & ~tally.running & (tally.outcome != _SATISFIED)
         reward = reward - jnp.where(failed, self._dead_end_cost(state.scene), 0.0)
-        kind = jnp.where(after.progress.running, StepType.MID, StepType.LAST).astype(jnp.int8)
+        kind = jnp.where(tally.running, StepType.MID, StepType.LAST).astype(jnp.int8)
         return after, self._time_step(after, kind, reward)
 
     def _assessed(self, scene: Scene, progress: Progress) -> EnvState:
         """The state with known space assessed; where no action is left the task is infeasible."""
-        situation = assess(progress.belief, progress.cell, progress.state, scene.task, self.config.decision.frontiers)
-        nowhere = progress.running & ~jnp.any(self._action_mask(situation))
-        outcome = jnp.where(nowhere, jnp.int8(_INFEASIBLE), progress.outcome)
-        return EnvState(scene=scene, progress=dataclasses.replace(progress, outcome=outcome), situation=situation)
+        frontiers = self.config.decision.frontiers
+        situation = assess(progress.belief, progress.cell, progress.tally.state, scene.task, frontiers)
+        # Assessed once, for this observation and for the next move: distances are most of a step's work.
+        nowhere = progress.tally.running & ~jnp.any(self._action_mask(situation))
+        outcome = jnp.where(nowhere, jnp.int8(_INFEASIBLE), progress.tally.outcome)
+        tally = dataclasses.replace(progress.tally, outcome=outcome)
+        return EnvState(scene=scene, progress=dataclasses.replace(progress, tally=tally), situation=situation)
 
     def _dead_end_cost(self, scene: Scene) -> Float32[Array, ""]:
         size = jnp.sum(scene.world.extent).astype(jnp.float32)
@@ -212,13 +227,18 @@ class TaskEnv:
         task = situation.task
         reached = jnp.isfinite(self._distances(situation)[:, task.edges[:, 0]]) & task.edge_mask[None, :]
         finishes = jnp.isfinite(situation.finish_cost)
-        explores = direct_move(situation, Policy.BASELINE, self.config.decision).kind != MoveKind.NONE
+        explores = self._baseline(situation).kind != MoveKind.NONE
         return jnp.concatenate([reached.reshape(-1), jnp.stack([finishes, explores])])
+
+    def _baseline(self, situation: Situation) -> Move:
+        """Finish where possible, otherwise to the nearest frontier. Draws nothing, so that any key will do."""
+        decide = policy_function(Policy.BASELINE)
+        return decide(situation, None, jax.random.key(0), self.config.decision, Intention.none())
 
     def _move(self, situation: Situation, action: Int32[Array, ""]) -> Move:
         """The move that carries out an action."""
         task, subgoals = situation.task, situation.subgoals
-        nearest = direct_move(situation, Policy.BASELINE, self.config.decision)
+        nearest = self._baseline(situation)
         goes = action < self._finish
         # Indices of the last two actions, and of any that do not exist, are clipped; what they look up is not used.
         subgoal, edge = jnp.divmod(jnp.clip(action, 0, self._finish - 1), self._edges)
@@ -234,15 +254,16 @@ class TaskEnv:
         return move_to(situation, self.config.decision, kind, cell, target, jnp.float32(0.0))
 
     def _time_step(self, state: EnvState, step_type: Int8[Array, ""], reward: Float32[Array, ""]) -> TimeStep:
-        progress = state.progress
-        goes_on = progress.running | (progress.outcome == _BUDGET)
-        cost = progress.travelled * state.scene.world.resolution
+        tally = state.progress.tally
+        # A budget is no part of the task: what could still have been earned is not 0 (gymnasium calls it truncation).
+        goes_on = tally.running | (tally.outcome == _BUDGET)
+        cost = tally.travelled * state.scene.world.resolution
         return TimeStep(
             step_type=step_type,
             reward=reward,
             discount=goes_on.astype(jnp.float32),
             observation=self._observation(state),
-            extras={"cost": cost, "outcome": jnp.where(progress.running, jnp.int8(-1), progress.outcome)},
+            extras={"cost": cost, "outcome": tally.outcome},
         )
 
     def _observation(self, state: EnvState) -> Observation:
@@ -252,11 +273,12 @@ class TaskEnv:
             cells=progress.belief.cells,
             letters=progress.belief.letters,
             position=progress.cell,
-            state=progress.state,
+            state=progress.tally.state,
             subgoals=situation.subgoals.cells,
             subgoal_mask=situation.subgoals.mask,
+            # Networks do not take infinities; the mask says which entries mean something.
             distances=jnp.where(jnp.isfinite(distances), distances, 0.0),
             finish_distance=jnp.where(jnp.isfinite(finish), finish, 0.0),
             # After the end there is nothing to choose.
-            action_mask=self._action_mask(situation) & progress.running,
+            action_mask=self._action_mask(situation) & progress.tally.running,
         )

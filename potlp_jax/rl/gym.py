@@ -49,6 +49,7 @@ class GymTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         self._worlds, self._split = worlds, split
         asked = task if isinstance(task, Task) else self._generator.task(task)
         self.env = TaskEnv([self._generator.world(0, split)], asked)
+        # All worlds of a family have one shape, so that both are compiled once.
         self._reset, self._step = jax.jit(self.env.reset_in), jax.jit(self.env.step)
         self._state: EnvState | None = None
         self.action_space = spaces.Discrete(self.env.num_actions)
@@ -58,6 +59,8 @@ class GymTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         height, width = self.env.worlds.shape
         subgoals, states = self.env.config.decision.frontiers.max_subgoals, self.env.task.dfa.num_states
         longest = max(height, width) - 1
+        # No shortest path visits a product state twice, and no step is longer than a diagonal.
+        farthest = 1.5 * height * width * states * float(self.env.worlds.resolution[0])
 
         def box(low: float | int, high: float | int, *shape: int, dtype: Any = np.int32) -> spaces.Box:
             return spaces.Box(low, high, shape, dtype)
@@ -70,8 +73,8 @@ class GymTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
                 "state": box(0, states - 1),
                 "subgoals": box(0, longest, subgoals, 2),
                 "subgoal_mask": spaces.MultiBinary(subgoals),
-                "distances": box(0.0, np.inf, subgoals, states, dtype=np.float32),
-                "finish_distance": box(0.0, np.inf, dtype=np.float32),
+                "distances": box(0.0, farthest, subgoals, states, dtype=np.float32),
+                "finish_distance": box(0.0, farthest, dtype=np.float32),
                 "action_mask": spaces.MultiBinary(self.env.num_actions),
             }
         )
@@ -89,6 +92,7 @@ class GymTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             The first observation and ``info``.
         """
         super().reset(seed=seed)
+        # Drawn in any case, so that asking for a world does not shift what comes after.
         drawn = int(self.np_random.integers(self._worlds))
         index = drawn if options is None else int(options.get("world", drawn))
         self._state, time_step = self._reset(self._generator.world(index, self._split))
@@ -115,5 +119,5 @@ def _info(time_step: TimeStep) -> dict[str, Any]:
     return {
         "action_mask": np.asarray(time_step.observation.action_mask),
         "cost": float(time_step.extras["cost"]),
-        "outcome": OUTCOME_NAMES.get(number, "running"),
+        "outcome": OUTCOME_NAMES[number],
     }

@@ -74,11 +74,13 @@ def read_results(store: Store) -> Results:
 
 def world_of(pair: Pair) -> int:
     """The number of a pair's world."""
+    # All rows of a pair are of one world.
     return next(iter(pair.values())).item.world
 
 
 def pair_rows(rows: Sequence[Row], policies: Sequence[str]) -> list[Pair]:
     """The worlds in which every policy has a row, by number. A pair is there for all policies or for none."""
+    # Of an unfinished sweep some policies have no row yet in the last worlds; those worlds are not compared.
     by_world: dict[int, dict[str, Row]] = {}
     for row in rows:
         by_world.setdefault(row.item.world, {})[row.item.policy] = row
@@ -92,8 +94,16 @@ def pair_rows(rows: Sequence[Row], policies: Sequence[str]) -> list[Pair]:
 def compare_pairs(
     pairs: Sequence[Pair], policies: Sequence[str], clusters: Sequence[Hashable] | None = None
 ) -> Comparison:
-    """The paired comparison (docs/model.md, section 8). ``clusters`` names, for each pair, what it shares with others,
-    such as its building."""
+    """The paired comparison (docs/model.md, section 8).
+
+    Args:
+        pairs: worlds with the rows of at least these policies.
+        policies: in the order of the comparison.
+        clusters: names, for each pair, what it shares with others, such as its building; None: nothing.
+
+    Returns:
+        The comparison.
+    """
     results = {policy: [_result(pair[policy]) for pair in pairs] for policy in policies}
     return Comparison.from_results(results, clusters=clusters)
 

@@ -7,7 +7,7 @@
     split: validation              # optional, as are all below
     first_world: 0
     estimator: out/fit/estimator.npz
-    settings:                      # any field of TrialConfig; others are what the environment calls for
+    settings:                      # any field of TrialConfig; the other fields are what the environment calls for
       replan_distance: 4
       decision: {search: {simulations: 300}}
 
@@ -21,12 +21,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from potlp_jax import plugins
 from potlp_jax.codec import config_from_dict, json_copy, read_settings, settings_file, with_settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
-from potlp_jax.environments.tasks import environment_task
-from potlp_jax.errors import SpecificationError, TaskError, WorldError
-from potlp_jax.planning.policies import Policy
+from potlp_jax.errors import PluginError, SpecificationError, TaskError, WorldError
+from potlp_jax.learning.estimator import GROUP as ESTIMATORS
+from potlp_jax.planning.policies import Policy, named_policy
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 
 
@@ -44,20 +45,20 @@ class Specification:
 
     Attributes:
         cells: environments × tasks, in the order of the file.
-        policies: known map and baseline first.
+        policies: names (``planning.policies.named_policy``), known map and baseline first.
         worlds: worlds per cell in which the task is possible.
         split, first_world: from which worlds they are taken, in increasing order.
-        estimator: file of the trained network; None for the shipped one.
+        estimator: a name (``learning.estimator.named_estimator``); None for the shipped one.
         config: settings of every trial.
         seed: of the trials' keys (not of the worlds).
     """
 
     cells: tuple[Cell, ...]
-    policies: tuple[Policy, ...]
+    policies: tuple[str, ...]
     worlds: int
     split: Split = Split.VALIDATION
     first_world: int = 0
-    estimator: Path | None = None
+    estimator: str | None = None
     config: TrialConfig = TrialConfig()
     seed: int = 0
 
@@ -65,11 +66,11 @@ class Specification:
         """JSON-able; equal specifications give equal dictionaries."""
         return {
             "cells": [dataclasses.asdict(cell) for cell in self.cells],
-            "policies": [policy.value for policy in self.policies],
+            "policies": list(self.policies),
             "worlds": self.worlds,
             "split": self.split.value,
             "first_world": self.first_world,
-            "estimator": None if self.estimator is None else str(self.estimator),
+            "estimator": self.estimator,
             "settings": dataclasses.asdict(self.config),
             "seed": self.seed,
         }
@@ -79,11 +80,11 @@ def specification_from_store(data: Mapping[str, Any]) -> Specification:
     """The specification that ``Specification.to_dict`` wrote."""
     return Specification(
         cells=tuple(Cell(**cell) for cell in data["cells"]),
-        policies=tuple(Policy(name) for name in data["policies"]),
+        policies=tuple(data["policies"]),
         worlds=data["worlds"],
         split=Split(data["split"]),
         first_world=data["first_world"],
-        estimator=None if data["estimator"] is None else Path(data["estimator"]),
+        estimator=data["estimator"],
         config=config_from_dict(TrialConfig, data["settings"], "settings"),
         seed=data["seed"],
     )
@@ -91,6 +92,7 @@ def specification_from_store(data: Mapping[str, Any]) -> Specification:
 
 def configuration_hash(config: TrialConfig) -> str:
     """Twelve hexadecimal digits that tell settings apart."""
+    # 48 bits: among a million settings the chance that two share a hash is 0.2 %.
     text = json.dumps(json_copy(dataclasses.asdict(config)), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
@@ -111,7 +113,21 @@ _OPTIONAL = ("split", "first_world", "estimator", "settings", "seed")
 
 
 def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = Path()) -> Specification:
-    """Check the entries of a specification; ``where`` names it in messages, ``folder`` is where its files are."""
+    """Check the entries of a specification.
+
+    Args:
+        data: the entries, as in the file.
+        where: names the specification in messages.
+        folder: what names of files are relative to.
+
+    Returns:
+        The specification, with tasks as formulas and known map and baseline among the policies.
+
+    Raises:
+        SpecificationError: an entry is missing, unknown or wrong.
+        ConfigurationError: a setting is.
+    """
+    # Unknown entries first: a misspelt one is then named, rather than the right one reported as missing.
     for name in data:
         if name not in (*_REQUIRED, *_OPTIONAL):
             raise SpecificationError(f"{where}: unknown entry {name!r}; known: {', '.join((*_REQUIRED, *_OPTIONAL))}")
@@ -126,19 +142,20 @@ def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = 
         for environment in environments
         for task in _list(data, "tasks", where)
     ]
+    # Task 1 and its formula are the same cell; run twice, its rows would overwrite each other.
     for cell in cells:
         if cells.count(cell) > 1:
             raise SpecificationError(f"{where}: {cell.environment} with {cell.task!r} is there twice")
     estimator = data.get("estimator")
     if estimator is not None and not isinstance(estimator, str):
-        raise SpecificationError(f"{where}: estimator: give the name of a file, found {estimator!r}")
+        raise SpecificationError(f"{where}: estimator: give a file or module:attribute, found {estimator!r}")
     return Specification(
         cells=tuple(cells),
         policies=policies,
         worlds=_number(data, "worlds", 1, where),
         split=split,
         first_world=_number(data, "first_world", 0, where, default=0),
-        estimator=None if estimator is None else folder / estimator,
+        estimator=None if estimator is None else _estimator(estimator, folder),
         config=with_settings(_common_config(environments, where), data.get("settings", {}), f"{where}: settings"),
         seed=_number(data, "seed", 0, where, default=0),
     )
@@ -156,17 +173,29 @@ _EXAMPLES = {"environments": "firefighting", "tasks": "1, 2", "policies": "basel
 
 def _number(data: Mapping[str, Any], name: str, least: int, where: str, default: int | None = None) -> int:
     value = data.get(name, default)
+    # To Python, True is a whole number; in a file it is a mistake.
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= MAX_INDEX:
         raise SpecificationError(f"{where}: {name}: give a whole number of at least {least}, found {value!r}")
     return value
 
 
-def _policies(names: list[Any], where: str) -> tuple[Policy, ...]:
-    known = [policy.value for policy in Policy]
-    for name in names:
-        if name not in known:
-            raise SpecificationError(f"{where}: policies: unknown policy {name!r}; choose from: {', '.join(known)}")
-    return tuple(dict.fromkeys([Policy.KNOWN_MAP, Policy.BASELINE, *map(Policy, names)]))
+def _policies(names: list[Any], where: str) -> tuple[str, ...]:
+    # Savings are measured between these two, so they run whether named or not.
+    found = [Policy.KNOWN_MAP.value, Policy.BASELINE.value]
+    for name in map(str, names):
+        try:
+            policy = named_policy(name)
+        except PluginError as error:
+            raise SpecificationError(f"{where}: policies: {error}") from error
+        # Functions keep the name that was given: workers find them by it.
+        found.append(policy.value if isinstance(policy, Policy) else name)
+    return tuple(dict.fromkeys(found))
+
+
+def _estimator(name: str, folder: Path) -> str:
+    """A file beside the specification, or a name as it stands."""
+    beside = folder / name
+    return name if plugins.is_known(name, ESTIMATORS) and not beside.is_file() else str(beside)
 
 
 def _split(name: Any, environments: Sequence[str], where: str) -> Split:
@@ -184,8 +213,9 @@ def _split(name: Any, environments: Sequence[str], where: str) -> Split:
 def _formula(environment: str, task: Any, where: str) -> str:
     """A task by number as its formula, any other (a formula, a ``.hoa`` file) as it is. Raises for what is no task."""
     generator = make(environment)
+    # Compiled here only to be checked, so that a wrong task ends the command and not a worker.
     try:
-        environment_task(generator, str(task))
+        generator.task(task)
     except TaskError as error:
         raise SpecificationError(f"{where}: tasks: {error}") from error
     return generator.tasks.get(str(task), str(task))
@@ -193,6 +223,7 @@ def _formula(environment: str, task: Any, where: str) -> str:
 
 def _common_config(environments: Sequence[str], where: str) -> TrialConfig:
     """What all environments call for."""
+    # Cells of one sweep are shown in one table, so that their settings must not differ without being named.
     configs = {name: trial_config_for(make(name)) for name in environments}
     first = configs[environments[0]]
     for name, config in configs.items():

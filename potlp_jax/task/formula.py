@@ -26,7 +26,16 @@ _CARET_INDENT = 4
 
 
 def error_at(message: str, text: str, column: int) -> TaskError:
-    """An error that points into ``text``: ``column`` counts from 1, the caret stands under it."""
+    """An error that points into a text.
+
+    Args:
+        message: what is wrong.
+        text: one line.
+        column: where, counted from 1; the caret stands under it.
+
+    Returns:
+        The error, to be raised.
+    """
     return TaskError(f"{message} (column {column})\n  {text}\n  {' ' * (column - 1)}^")
 
 

@@ -40,7 +40,7 @@ class Condition:
     """What must be found beyond a subgoal for an attempt to succeed.
 
     Attributes:
-        stay: letters that may be read on the way.
+        stay: letters that may be read on the path.
         go: letters that end it.
         classes: indices of the outcome classes whose cubes make up ``go``, increasing.
     """
@@ -137,7 +137,7 @@ def find_outcomes(dfa: Dfa, max_positive_literals: int | None = None) -> Outcome
     known = {_letter_sets(condition): c for c, condition in enumerate(conditions)}
     edge_condition = []
     for edge in edges:
-        # Without ``max_positive_literals`` the union of the cubes is the guard; with it, what is left of the guard.
+        # Without ``max_positive_literals`` the union of the cubes is the guard; with it, what remains of the guard.
         classes = tuple(number[key] for key in edge.class_keys)
         condition = Condition(edge.stay, np.any([conditions[c].go for c in classes], axis=0), classes)
         index = known.setdefault(_letter_sets(condition), len(conditions))

@@ -134,7 +134,7 @@ class Task:
                 is a trap.
         """
         formula = parse_formula(text, propositions)
-        # By way of HOA text, so that formulas and files take one path and a shipped file is what Spot would deliver.
+        # Through HOA text, so that formulas and files take one path and a shipped file is what Spot would deliver.
         automaton = read_hoa(translate(formula))
         return cls._compile(text, formula.propositions, automaton, max_positive_literals)
 
@@ -186,7 +186,9 @@ class Task:
             TaskError: as ``from_formula``.
         """
         for hoa in _shipped_hoa().values():
-            if read_hoa(hoa).name == text:
+            shipped = read_hoa(hoa)
+            # A shipped automaton may have propositions that its formula does not mention, and Sigma not contain.
+            if shipped.name == text and set(shipped.propositions) <= set(propositions):
                 return cls.from_hoa(hoa, propositions)
         return cls.from_formula(text, propositions)
 
@@ -263,6 +265,7 @@ class Task:
 
     def describe(self) -> dict[str, Any]:
         """The task for people and programs; JSON-able. Guards are canonical covers in words."""
+        # Indices are those of the arrays, so that a planner's values can be looked up here.
         dfa = self.dfa
         return {
             "formula": self.text,
@@ -316,6 +319,7 @@ def stack_tasks(tasks: Sequence[Task], sizes: TaskSizes | None = None) -> TaskAr
     Raises:
         TaskError: no task, different propositions, or a task that does not fit.
     """
+    # Tasks of other propositions could be padded too, but a letter would mean different things from row to row.
     if not tasks:
         raise TaskError("there is no task to stack")
     for task in tasks:

@@ -1,9 +1,13 @@
 """Settings of a trial."""
 
 import dataclasses
+import warnings
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 from potlp_jax.codec import with_settings
 from potlp_jax.environments.base import Generator
+from potlp_jax.errors import PotlpWarning
 from potlp_jax.planning.policies import DecisionConfig
 from potlp_jax.world.camera import CameraConfig, Disturbance
 from potlp_jax.world.grid import World
@@ -28,5 +32,36 @@ class TrialConfig:
 
 
 def trial_config_for(source: World | Generator) -> TrialConfig:
-    """What trials in a world, or in the worlds of a family, call for."""
+    """The settings that trials in a world, or in the worlds of a family, call for: defaults but for ``settings``."""
     return with_settings(TrialConfig(), source.settings)
+
+
+def config_in(world: World, given: TrialConfig | None) -> TrialConfig:
+    """The settings of a trial in a world: those given, by default what the world calls for.
+
+    Warns:
+        PotlpWarning: the settings given have defaults where the world calls for something else. Twelve subgoals where
+            32 are needed end no trial and raise no error: they only make every planner worse.
+    """
+    if given is None:
+        return trial_config_for(world)
+    unheeded = list(_unheeded(world.settings, given, TrialConfig()))
+    if unheeded:
+        warnings.warn(
+            f"the world calls for {', '.join(unheeded)}, and the configuration has the defaults; begin with "
+            "trial_config_for(world) and change what you need",
+            PotlpWarning,
+            stacklevel=3,
+        )
+    return given
+
+
+def _unheeded(settings: Mapping[str, Any], given: Any, default: Any) -> Iterator[str]:
+    """Settings of which the defaults are given although something else is called for."""
+    for name, wanted in settings.items():
+        value, usual = getattr(given, name), getattr(default, name)
+        if isinstance(wanted, Mapping):
+            yield from (f"{name}.{entry}" for entry in _unheeded(wanted, value, usual))
+        elif value == usual != wanted:
+            # A value that is neither was chosen by somebody, who may know better than the world.
+            yield f"{name}={wanted}"

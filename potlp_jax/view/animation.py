@@ -210,7 +210,8 @@ def _draw_panel(panel: Axes, trial: Trial, decision: Decision | None, task: Task
         ]
         _panel_text(panel, lines)
         return
-    head = f"decision {decision.index + 1} of {len(trial.decisions)}   step {decision.step}   state {decision.state}"
+    # Decisions are numbered from 0, as in the record, on the page and for `potlp explain`.
+    head = f"decision {decision.index} of 0..{len(trial.decisions) - 1}   step {decision.step}   state {decision.state}"
     if not decision.actions:
         _panel_text(panel, [head, *textwrap.wrap(_KINDS.get(decision.kind, decision.kind), 80)])
         return

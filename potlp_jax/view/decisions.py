@@ -8,6 +8,7 @@ from rich.table import Table
 
 from potlp_jax.codec import finite_or_null
 from potlp_jax.trials.record import ActionRecord, Decision, Trial
+from potlp_jax.types import status_names
 
 
 def rank_actions(decision: Decision) -> list[ActionRecord]:
@@ -55,7 +56,7 @@ def action_table(trial: Trial, decision: Decision) -> Table:
 def describe_decision(trial: Trial, decision: Decision) -> str:
     """Where and when the decision was made, and what it led to, in one line."""
     went = "nowhere" if decision.target is None else f"cell {decision.target} in state {decision.target_state}"
-    better = decision.kept_from
+    better = decision.overruled
     kept = "" if better is None else f", kept although {action_name(better)} is better"
     return (
         f"decision {decision.index} of {trial.policy} (step {decision.step}): cell {decision.cell} in state "
@@ -64,6 +65,6 @@ def describe_decision(trial: Trial, decision: Decision) -> str:
 
 
 def decision_to_dict(decision: Decision) -> dict[str, Any]:
-    """JSON-able values of a decision, actions by expected cost; what is infinite becomes None."""
+    """JSON-able values of a decision, actions by expected cost; what is infinite becomes None, status bits names."""
     ranked = dataclasses.replace(decision, actions=tuple(rank_actions(decision)))
-    return finite_or_null(dataclasses.asdict(ranked))
+    return finite_or_null({**dataclasses.asdict(ranked), "status": list(status_names(decision.status))})

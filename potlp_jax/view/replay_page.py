@@ -106,7 +106,7 @@ def _decision(trial: Trial, decision: Decision) -> dict[str, Any]:
         "cell": list(decision.cell),
         "text": describe_decision(trial, decision),
         "subgoals": [list(cell) for cell in decision.subgoals],
-        "looks": list(decision.looks),
+        "observations": list(decision.observations),
         "path": [list(cell) for cell in decision.path],
         "actions": [
             {

@@ -28,7 +28,7 @@ class CameraConfig:
         far: floor nearer than this is spaced by ratios of distance, floor beyond it by angles.
         fold: rows over which the distance of near floor falls by a factor of e.
         eye_height, wall_height: of the camera, of the walls and the ceiling, above the floor.
-        texture: contrast of the textures, 0 (none) to 1; texture_reach: distance at which half of it is left on walls.
+        texture: contrast of the textures, 0 (none) to 1; texture_reach: distance at which half of it remains on walls.
         ambient: brightness of what has no light at all, 0 (black) to 1.
         ceiling_colour, smoke_colour: RGB in full light.
         renderer: what draws the picture: empty for ``world.renderer``, otherwise the name of a function of your own,

@@ -39,7 +39,7 @@ class Subgoals:
         mask: True on real subgoals; they come first.
         size: cells of the component; 0 where masked.
         distance: the distance that was given for the subgoal's cell; inf where masked.
-        component: index of the subgoal whose component the cell belongs to, else ``NO_SUBGOAL``.
+        component: index of the subgoal whose component the cell belongs to, or ``NO_SUBGOAL``.
         frontier: all cells of the frontier, also those of components that were not kept.
         status: ``SUBGOAL_OVERFLOW`` where there were more components than the array holds.
     """
@@ -124,7 +124,7 @@ def find_subgoals(
     grid = _label(_listed(frontier), width)
     size, subgoal = _summarise(grid, width)
     is_root = grid.parent[:-1] == jnp.arange(grid.parent.shape[0] - 1, dtype=jnp.int32)
-    # A sliver between two lines of sight is no place to go to, unless slivers are all there is.
+    # A sliver between two lines of sight is nowhere to go, unless slivers are all there is.
     some_large = jnp.max(size) >= config.min_size
     kept = is_root & ((size[:-1] >= config.min_size) | ~some_large)
     padded_distance = jnp.pad(distance, 1, constant_values=UNREACHABLE).ravel()

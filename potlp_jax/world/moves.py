@@ -155,3 +155,8 @@ def count_moves(path: Path) -> tuple[int, int]:
 def length_of(straight: int, diagonal: int) -> float:
     """Length of so many moves. From counts, so that it does not depend on the order of the moves."""
     return straight + diagonal * DIAGONAL
+
+
+def as_cell(cell: Int32[Array, "2"] | Int32[np.ndarray, "2"]) -> Cell:
+    """Row and column of an array as Python numbers."""
+    return int(cell[0]), int(cell[1])

@@ -8,7 +8,7 @@ the map it was taken.
 
 One ray a column is followed through the lattice of cells. Because the robot stands in the middle of a cell, the cells
 that a ray crosses, where it crosses them, and the piece of floor that a pixel shows are the same for every cell and
-world, relative to the robot: they are static tables (``_Rays``, ``_Planes``), and what is left for the device are
+world, relative to the robot: they are static tables (``_Rays``, ``_Planes``), and what remains for the device are
 gathers and one running product along the rays. Where a row or column looks is in ``camera``.
 
 References:
@@ -269,7 +269,7 @@ def _passed(optics: Int32[Array, "*shape"], length: Float32[Array, "*shape"]) ->
 def _pass_smoke(crossed: Int32[Array, "steps columns"], rays: _Rays) -> Int32[Array, "steps columns"]:
     """Where each ray enters each cell: the light that comes through and the glow of the smoke, see ``_pack_sight``."""
 
-    def cross(state, cell):
+    def cross(state: tuple[Array, Array], cell: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
         transmission, glow = state
         optics, length = cell
         after = transmission * _passed(optics, length)

@@ -139,13 +139,13 @@ def _reach(occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], lines: _Lines)
 
     # Most lines of an indoor map are stopped within some steps: following a block of steps at a time and stopping with
     # the last line costs what the view is deep, not what the range is.
-    def follow_block(carry):
+    def follow_block(carry: tuple[Array, Array]) -> tuple[Array, Array]:
         block, reach = carry
         step = block * _BLOCK + jnp.arange(_BLOCK, dtype=jnp.int32)[:, None]
         stopped = (codes[cells[block]] & blocking[block]) != 0
         return block + 1, jnp.minimum(reach, jnp.min(jnp.where(stopped, step, jnp.int32(steps)), axis=0))
 
-    def some_continue(carry):
+    def some_continue(carry: tuple[Array, Array]) -> Array:
         block, reach = carry
         # A line goes on where nothing has stopped it in the blocks before.
         return (block < blocks) & jnp.any(reach >= jnp.minimum(block * _BLOCK, steps))

@@ -94,11 +94,16 @@ def clean_map(
         start: metres (x, y) whose component is kept; None: the largest.
         source: the file that gives the start, for messages.
 
+    Returns:
+        The cells that can be reached, where they lie, and what was lost on the way.
+
     Raises:
         MapError: the resolution is finer than the map's, nothing is left free, or the start lies outside or is blocked.
     """
+    # Exact fractions: a cell of 0.2 m must be 4 pixels of 0.05 m, not 4.000000000000001.
     file, pixel = image_map.settings.file, image_map.settings.resolution
     ratio = _exact(file, "resolution", resolution) / pixel
+    # Finer cells would invent detail that the map does not have.
     if ratio < 1:
         raise MapError(file, "resolution", f"{resolution} m a cell is finer than the map's {float(pixel)} m a pixel")
     inflated = ~inflate(~image_map.free, _exact(file, "radius", radius) / pixel)
@@ -110,6 +115,7 @@ def clean_map(
             file, "", f"nothing is left free with cells of {resolution} m and a radius of {radius} m; make them smaller"
         )
     kept = _largest_component(free) if start is None else _component_of(start, free, frame, source)
+    # The first two are counted in pixels, the others in cells.
     area = FreeArea(
         *(float(pixels.sum()) * float(pixel) ** 2 for pixels in (image_map.free, inflated)),
         *(float(cells.sum()) * frame.resolution**2 for cells in (free, kept)),
@@ -120,11 +126,13 @@ def clean_map(
 def _exact(file: Path, field: str, number: float) -> Fraction:
     if not np.isfinite(number) or number < 0:
         raise MapError(file, field, f"{number} is not a finite number of metres, 0 or more")
+    # By its shortest text: 0.1 means one tenth, not the nearest binary fraction.
     return Fraction(str(number))
 
 
 def inflate(blocked: Bool[np.ndarray, "H W"], pixels: Fraction) -> Bool[np.ndarray, "H W"]:
     """Obstacles and all whose centre is within a radius, in pixels, of an obstacle's centre."""
+    # Padded, because what is beyond the image counts as an obstacle, too.
     distance = np.asarray(ndimage.distance_transform_edt(~np.pad(blocked, 1, constant_values=True)))[1:-1, 1:-1]
     # Squared distances between centres are integers, so that the comparison can be exact.
     return np.rint(distance**2) <= int(pixels * pixels)
@@ -133,10 +141,18 @@ def inflate(blocked: Bool[np.ndarray, "H W"], pixels: Fraction) -> Bool[np.ndarr
 def resample(
     pixels: Shaped[np.ndarray, "H W"], ratio: Fraction, reduce: np.ufunc = np.logical_or, beyond: bool | int = True
 ) -> Shaped[np.ndarray, "h w"]:
-    """Cells of ``ratio`` pixels, from the lower left corner: ``reduce`` of all pixels that share area with the cell.
+    """Cells of several pixels, from the lower left corner on.
 
-    Beyond the image every pixel is ``beyond``. By default: a cell is blocked if a pixel is, or is missing.
+    Args:
+        pixels: row 0 at the top.
+        ratio: pixels per cell, along each side.
+        reduce: makes a cell of all pixels that share area with it.
+        beyond: what every pixel beyond the image is.
+
+    Returns:
+        The cells, row 0 at the top. By default a cell is True (blocked) if one of its pixels is, or is missing.
     """
+    # Row 0 is the top of the map, and cells are counted from the bottom.
     upwards = _reduce_each(pixels[::-1], ratio, reduce, beyond)[::-1]
     return _reduce_each(upwards.T, ratio, reduce, beyond).T
 
@@ -144,6 +160,7 @@ def resample(
 def _reduce_each(
     pixels: Shaped[np.ndarray, "H W"], ratio: Fraction, reduce: np.ufunc, beyond: bool | int
 ) -> Shaped[np.ndarray, "h W"]:
+    # Rounded up: a last cell that is only partly in the image counts.
     count = -(-len(pixels) // ratio)
     spans = [(int(cell * ratio), int(-(-(cell + 1) * ratio // 1))) for cell in range(count)]
     # A last cell may reach over the image's edge.
@@ -153,6 +170,7 @@ def _reduce_each(
 
 
 def _largest_component(free: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    # Entry 0 counts what is not free.
     labels = component_labels(free)
     return labels == 1 + np.argmax(np.bincount(labels.ravel())[1:])
 
@@ -160,6 +178,7 @@ def _largest_component(free: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]
 def _component_of(
     start: Point, free: Bool[np.ndarray, "H W"], frame: GridFrame, source: str
 ) -> Bool[np.ndarray, "H W"]:
+    # A start in a wall is a mistake in the file: the nearest free cell is named, not taken.
     cell = frame.metres_to_cell(*start)
     inside = frame.contains(*cell)
     if not inside or not free[cell]:
@@ -182,6 +201,7 @@ def _cut_off(
     frame: GridFrame,
 ) -> tuple[CutOff, ...]:
     """Components of ``lost`` cells whose pixels are connected with those of the cells that are kept."""
+    # On the map's own pixels the robot gets there; only the size of the cells keeps it out.
     components = component_labels(inflated)
     numbers = components[_pixels_of(frame, pixels)]
     labels = component_labels(lost & (numbers == numbers[tuple(np.argwhere(kept)[0])]))
@@ -198,6 +218,7 @@ def _pixels_of(frame: GridFrame, pixels: GridFrame) -> tuple[Int[np.ndarray, "h 
 
     Both grids have the same lower left corner.
     """
+    # Rows count from the top in both grids, so heights are compared from the bottom, where both begin.
     ratio = frame.resolution / pixels.resolution
     up = ((frame.height - np.arange(frame.height) - 0.5) * ratio).astype(int)
     across = ((np.arange(frame.width) + 0.5) * ratio).astype(int)
@@ -207,6 +228,7 @@ def _pixels_of(frame: GridFrame, pixels: GridFrame) -> tuple[Int[np.ndarray, "h 
 
 def _middle(part: Bool[np.ndarray, "h w"], frame: GridFrame) -> Point:
     """Centre of the part's cell that is nearest to its centroid, in metres."""
+    # The centroid of a part that is bent around a corner may lie outside of it.
     cells = np.argwhere(part)
     row, col = cells[np.argmin(np.linalg.norm(cells - cells.mean(axis=0, keepdims=True), axis=1))].tolist()
     return frame.cell_to_metres(row, col)
@@ -214,6 +236,7 @@ def _middle(part: Bool[np.ndarray, "h w"], frame: GridFrame) -> Point:
 
 def _crop(kept: Bool[np.ndarray, "H W"], frame: GridFrame, area: FreeArea, cut_off: tuple[CutOff, ...]) -> CleanMap:
     rows, cols = np.flatnonzero(kept.any(axis=1)), np.flatnonzero(kept.any(axis=0))
+    # All kept cells, and one ring of obstacles: sensors and sweeps rely on a closed border.
     content = kept[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
     free = np.pad(content, 1)
     return CleanMap(free, frame.window(int(rows[0]) - 1, int(cols[0]) - 1, *free.shape), area, cut_off)

@@ -85,6 +85,7 @@ class RosMap(Generator):
         self.name = f"{PREFIX}{Path(config.file).stem}"
         self.propositions = places.names
         self.tasks = dict(places.tasks)
+        # Letters and cells do not depend on the key: they are made once, worlds differ in the start.
         self._letters = place_letters(places, self.clean.free, self.clean.frame)
         self._free_cells: Int32[np.ndarray, "N 2"] = np.argwhere(self.clean.free).astype(np.int32)
 
@@ -99,6 +100,7 @@ class RosMap(Generator):
 
     def draw(self, key: PRNGKeyArray) -> World:
         """The world with the start that the places fix, or with one drawn from all cells by key."""
+        # A start that the places give is part of the map; otherwise every cell is as likely.
         if self.places.start is not None:
             start = self.metres_to_cell(*self.places.start)
         else:
@@ -146,6 +148,7 @@ def _find_places(config: RosMapConfig, image_map: OccupancyMap) -> Places:
     if config.places is not None or file.is_file():
         return load_places(file)
     clean = clean_map(image_map, config.resolution, config.radius)
+    # The example in the message has two points that exist on this very map.
     cells = np.argwhere(clean.free)
     (x0, y0), (x1, y1) = (clean.frame.cell_to_metres(*map(int, cells[i])) for i in (0, -1))
     raise MapError(

@@ -1,4 +1,4 @@
-"""Product distances between a few cells by way of the cells whose letters matter.
+"""Product distances between a few cells through the cells whose letters matter.
 
 Most cells of a map carry a letter that changes no state. Distances over those cells alone do not depend on the state
 of the automaton, so that one grid per key cell serves all states: keys are the sources and the **active** cells, whose
@@ -123,7 +123,7 @@ def table_by_portals(
     target_cells: Int32[Array, "T 2"],
     arrivals: Callable[[Int32[Array, "keys 2"], Int32[Array, ""], Int32[Array, "ends 2"]], Float32[Array, "keys ends"]],
 ) -> tuple[Float32[Array, "Q T Z"], Float32[Array, " Q"]]:
-    """Costs in cells as ``product.distance_table`` gives them, by way of the active cells.
+    """Costs in cells as ``product.distance_table`` gives them, through the active cells.
 
     Args:
         transitions: the product.
@@ -153,7 +153,7 @@ def table_by_portals(
     # Real sources first: the loop runs over these alone.
     order = jnp.argsort(~real, stable=True)
 
-    def solve(number, table):
+    def solve(number: Array, table: tuple[Array, Array]) -> tuple[Array, Array]:
         source = order[number]
         from_start = jnp.where(usable, lengths[start_of[source]], jnp.inf)
         costs, finish = _costs_of_source(from_start, source_states[source], from_active, entering, accepting)
@@ -188,7 +188,7 @@ def _costs_of_source(
 
     # Bellman and Ford on (state, active cell): as many rounds as the longest shortest path has active cells, on arrays
     # of at most Z x 64 x 64. It ends because lengths are positive.
-    def relax(carry):
+    def relax(carry: tuple[Array, Array]) -> tuple[Array, Array]:
         best, _ = carry
         arrived = jnp.min(best[:, :, None] + from_active[None, :, :capacity], axis=1)
         better = jnp.minimum(best, _enter(jnp.minimum(arrived, first[:, :capacity]), entering[:capacity]))

@@ -5,10 +5,11 @@ a diagonal move needs both cells beside it free. Entering a cell in state ``z`` 
 
 Whole grids of distances are solved by frontal sweeps (``sweeping``). A table of costs between a few cells needs no
 sweep per state where few cells carry letters that matter (``portals``): the table of a fire-fighting decision takes 3
-to 5 ms that way instead of 20 to 25 (docs/results/planner.md).
+to 5 ms instead of 20 to 25 (docs/results/planner.md).
 """
 
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -85,7 +86,14 @@ def product_distances(
 # Under vmap the maps are solved one after the other: a batched loop goes on until its slowest row is done, and works on
 # arrays that no cache holds.
 @sequential_vmap
-def _product_distances(transitions, free, source_cells, source_states, resolution, wildcard):
+def _product_distances(
+    transitions: Int32[Array, "H W Z"],
+    free: Bool[Array, "H W"],
+    source_cells: Int32[Array, "Q 2"],
+    source_states: Int32[Array, " Q"],
+    resolution: Float32[Array, ""],
+    wildcard: Wildcard | None,
+) -> Float32[Array, "Q H W Z"]:
     sweeper = Sweeper(_layers_first(transitions), free, wildcard)
     solved = _map_sources(sweeper.solve, source_cells, source_states)
     return jnp.transpose(solved, (3, 1, 2, 0)) * resolution
@@ -103,7 +111,7 @@ def distance_table(
     """Costs from each source to each target, and to acceptance anywhere.
 
     The same distances as ``product_distances``, up to rounding, without its grids. Where few cells carry letters that
-    matter, they are found by way of those cells (``portals``), elsewhere by sweeps.
+    matter, they are found through those cells (``portals``), elsewhere by sweeps.
 
     Args:
         transitions: state after entering each cell from each state, as ``product_transitions`` gives it.
@@ -124,7 +132,15 @@ def distance_table(
 
 
 @sequential_vmap
-def _distance_table(transitions, free, accepting, source_cells, source_states, target_cells, resolution):
+def _distance_table(
+    transitions: Int32[Array, "H W Z"],
+    free: Bool[Array, "H W"],
+    accepting: Bool[Array, " Z"],
+    source_cells: Int32[Array, "Q 2"],
+    source_states: Int32[Array, " Q"],
+    target_cells: Int32[Array, "T 2"],
+    resolution: Float32[Array, ""],
+) -> tuple[Float32[Array, "Q T Z"], Float32[Array, " Q"]]:
     active = find_active_cells(transitions)
 
     def by_portals():
@@ -141,13 +157,20 @@ def _distance_table(transitions, free, accepting, source_cells, source_states, t
     return travel * resolution, finish * resolution
 
 
-def _table_by_sweeps(transitions, free, accepting, source_cells, source_states, target_cells):
+def _table_by_sweeps(
+    transitions: Int32[Array, "H W Z"],
+    free: Bool[Array, "H W"],
+    accepting: Bool[Array, " Z"],
+    source_cells: Int32[Array, "Q 2"],
+    source_states: Int32[Array, " Q"],
+    target_cells: Int32[Array, "T 2"],
+) -> tuple[Float32[Array, "Q T Z"], Float32[Array, " Q"]]:
     """``distance_table`` in cells, from the grids of all sources."""
     sweeper = Sweeper(_layers_first(transitions), free, None)
     rows, columns = target_cells[:, 0], target_cells[:, 1]
 
     # Each group of sources is reduced to its entries of the table at once: the grids of all would not fit the cache.
-    def solve(cells, states):
+    def solve(cells: Int32[Array, "Q 2"], states: Int32[Array, " Q"]) -> Float32[Array, "N Q"]:
         cost = sweeper.solve(cells, states)
         finish = jnp.min(jnp.where(accepting[:, None, None, None], cost, jnp.inf), axis=(0, 1, 2))
         return jnp.concatenate([cost[:, rows, columns].reshape(-1, cells.shape[0]), finish[None]])
@@ -171,7 +194,7 @@ def _neutral_arrivals(
     padded = jnp.pad(keys, ((0, -keys.shape[0] % size), (0, 0)))
     states = jnp.where(jnp.arange(padded.shape[0]) < count, 0, NO_STATE).astype(jnp.int32)
 
-    def solve_chunk(chunk, arrivals):
+    def solve_chunk(chunk: Array, arrivals: Array) -> Array:
         first = chunk * size
         cells = jax.lax.dynamic_slice_in_dim(padded, first, size)
         grid = sweeper.solve(cells, jax.lax.dynamic_slice_in_dim(states, first, size))[0]
@@ -205,7 +228,13 @@ def distances_per_source(
 
 
 @sequential_vmap
-def _distances_per_source(transitions, free, source_cells, source_states, resolution):
+def _distances_per_source(
+    transitions: Int32[Array, "Z H W Q"],
+    free: Bool[Array, "H W"],
+    source_cells: Int32[Array, "Q 2"],
+    source_states: Int32[Array, " Q"],
+    resolution: Float32[Array, ""],
+) -> Float32[Array, "Z H W Q"]:
     return Sweeper(transitions, free, None).solve(source_cells, source_states) * resolution
 
 
@@ -273,7 +302,11 @@ def _layers_first(transitions: Int32[Array, "H W Z"]) -> Int32[Array, "Z H W 1"]
     return jnp.moveaxis(transitions, -1, 0)[..., None]
 
 
-def _map_sources(solve, cells: Int32[Array, "Q 2"], states: Int32[Array, " Q"]) -> Array:
+def _map_sources(
+    solve: Callable[[Int32[Array, "Q 2"], Int32[Array, " Q"]], Array],
+    cells: Int32[Array, "Q 2"],
+    states: Int32[Array, " Q"],
+) -> Array:
     """Apply ``solve`` to ``SOURCES_AT_ONCE`` sources at a time; results carry the sources in the last axis.
 
     Real sources are gathered in front, so that empty ones cost nothing: they reach nothing, ``inf``.
@@ -290,7 +323,7 @@ def _map_sources(solve, cells: Int32[Array, "Q 2"], states: Int32[Array, " Q"]) 
     states = jnp.pad(states[order], (0, missing), constant_values=NO_STATE)
     real = jnp.sum(states != NO_STATE, dtype=jnp.int32)
 
-    def solve_chunk(chunk, solved):
+    def solve_chunk(chunk: Array, solved: Array) -> Array:
         first = chunk * size
         part = solve(
             jax.lax.dynamic_slice_in_dim(cells, first, size), jax.lax.dynamic_slice_in_dim(states, first, size)

@@ -80,7 +80,7 @@ class Sweeper:
         """Costs in cells from each source; all ``inf`` where its state is ``NO_STATE``."""
         return self._solve_padded(cells, states)[:, 1:-1, 1:-1]
 
-    def _solve_padded(self, cells, states):
+    def _solve_padded(self, cells: Int32[Array, "Q 2"], states: Int32[Array, " Q"]) -> Float32[Array, "Z H2 W2 Q"]:
         """As ``solve``, with the margin.
 
         The lowest state whose costs have changed is swept first: states are numbered breadth-first from the initial
@@ -92,7 +92,7 @@ class Sweeper:
         start = self._start(cells, states)
         dirty = jnp.any(states[None, :] == jnp.arange(count)[:, None], axis=1) & self.leads_on
 
-        def solve_layer(carry):
+        def solve_layer(carry: tuple[Array, Array]) -> tuple[Array, Array]:
             cost, dirty = carry
             state = jnp.argmax(dirty).astype(jnp.int32)
             layer = self._sweep_to_fixed_point(cost[state], state)
@@ -102,11 +102,11 @@ class Sweeper:
 
         return jax.lax.while_loop(lambda carry: jnp.any(carry[1]), solve_layer, (start, dirty))[0]
 
-    def _solve_one_state(self, cells, states):
+    def _solve_one_state(self, cells: Int32[Array, "Q 2"], states: Int32[Array, " Q"]) -> Float32[Array, "1 H2 W2 Q"]:
         """As ``_solve_padded`` where the automaton has one state, which no move leaves."""
         return self._sweep_to_fixed_point(self._start(cells, states)[0], jnp.int32(0))[None]
 
-    def _start(self, cells, states):
+    def _start(self, cells: Int32[Array, "Q 2"], states: Int32[Array, " Q"]) -> Float32[Array, "Z H2 W2 Q"]:
         """Costs before the first sweep: 0 at each source."""
         # A source in ``NO_STATE`` (-1) writes infinity into the last layer, where there was infinity before.
         count, height, width, _ = self.transitions.shape
@@ -125,7 +125,7 @@ class Sweeper:
         # falling diagonal falls, its rising one rises.
         columns = _Lines(jnp.swapaxes(enter, 0, 1), falling.T, rising.T, self.columns[state])
 
-        def sweep_round(carry):
+        def sweep_round(carry: tuple[Array, Array]) -> tuple[Array, Array]:
             before, _ = carry
             after = columns.sweep(jnp.swapaxes(rows.sweep(before), 0, 1))
             after = jnp.swapaxes(after, 0, 1)
@@ -155,7 +155,9 @@ class Sweeper:
         many = 2 * jnp.sum(self.changing_rows[state]) > self.changing_rows.shape[2]
         return jax.lax.cond(many, self._leave_everywhere, self._leave_by_line, cost, layer, state)
 
-    def _leave_everywhere(self, cost, layer, state):
+    def _leave_everywhere(
+        self, cost: Float32[Array, "Z H2 W2 Q"], layer: Float32[Array, "H2 W2 Q"], state: Int32[Array, ""]
+    ) -> tuple[Float32[Array, "Z H2 W2 Q"], Bool[Array, " Z"]]:
         """``_leave`` on the whole grid at once."""
         own = jnp.arange(cost.shape[0], dtype=jnp.int32)
         held = cost[:, 1:-1, 1:-1]
@@ -163,25 +165,27 @@ class Sweeper:
         after = jnp.where(self._leads(state, own), _smaller(arrival[None], held), held)
         return cost.at[:, 1:-1, 1:-1].set(after), jnp.any(after < held, axis=(1, 2, 3))
 
-    def _leave_by_line(self, cost, layer, state):
+    def _leave_by_line(
+        self, cost: Float32[Array, "Z H2 W2 Q"], layer: Float32[Array, "H2 W2 Q"], state: Int32[Array, ""]
+    ) -> tuple[Float32[Array, "Z H2 W2 Q"], Bool[Array, " Z"]]:
         """``_leave`` on the lines where such moves exist, one after the other: faster where they are few."""
         count, rows = self.changing_rows.shape[1:]
         width, sources = layer.shape[1] - 2, layer.shape[2]
         (changing,) = jnp.nonzero(self.changing_rows[state].reshape(-1), size=count * rows, fill_value=0)
         changing = changing.astype(jnp.int32)
 
-        def line(index):
+        def line(index: Array) -> tuple[Array, Array, Array]:
             to_state, row = changing[index] // rows, changing[index] % rows
             leads = self._leads(state, to_state[None], row)[0]
             return to_state, row, jnp.where(leads, self.links.arrival_in_row(layer, row), jnp.inf)
 
         # Two passes, one that reads costs and one that writes them: XLA copies the costs where one does both.
-        def compare(index, improved):
+        def compare(index: Array, improved: Array) -> Array:
             to_state, row, arrival = line(index)
             held = jax.lax.dynamic_slice(cost, (to_state, row + 1, 1, 0), (1, 1, width, sources))[0, 0]
             return improved.at[to_state].set(improved[to_state] | jnp.any(arrival < held))
 
-        def write(index, cost):
+        def write(index: Array, cost: Array) -> Array:
             to_state, row, arrival = line(index)
             held = jax.lax.dynamic_slice(cost, (to_state, row + 1, 1, 0), (1, 1, width, sources))
             return jax.lax.dynamic_update_slice(cost, _smaller(arrival[None, None], held), (to_state, row + 1, 1, 0))
@@ -279,10 +283,12 @@ class _Lines:
             first, end, lambda i, cost: self._update(cost, last - i, last - i + 2, self.below), cost
         )
 
-    def _update(self, cost, line, previous, links):
+    def _update(
+        self, cost: Float32[Array, "H2 W2 Q"], line: Array, previous: Array, links: tuple[Array, Array]
+    ) -> Float32[Array, "H2 W2 Q"]:
         """Line ``line`` from row ``previous`` of the padded costs."""
 
-        def row_of(array, index):
+        def row_of(array: Array, index: Array) -> Array:
             return jax.lax.dynamic_index_in_dim(array, index, 0, keepdims=False)
 
         # Moves along the line itself are left to the sweeps across it: within a line each cell would wait for the one

@@ -39,7 +39,7 @@ class ExactSolution:
       value: expected cost of the best action; 0 where the task is satisfied, the dead-end cost at a dead end.
       q_values: expected cost of each action, inf where it is not available.
       action: index of the best action (ties: lowest index), or ``NO_ACTION``.
-      states: nodes of the graph that were looked at.
+      states: nodes of the graph that were explored.
       status: ``ACCEPTING_ROOT``, ``DEAD_END`` or ``OK``.
       dead_end_part: what the cost of dead ends contributes to ``value`` under the best policy found.
     """
@@ -60,7 +60,7 @@ class Bounds:
       lower, upper: bounds on the value; equal up to rounding where ``exact``.
       q_lower, q_upper: bounds on the expected cost of each action, inf where it is not available.
       action: the action of least upper bound (ties: lowest index), or ``NO_ACTION``.
-      states: nodes of the graph that were looked at.
+      states: nodes of the graph that were explored.
       status: ``ACCEPTING_ROOT``, ``DEAD_END`` or ``OK``.
       exact: whether ``lower`` and ``upper`` are the optimum; bounds of other actions may still be loose.
       dead_end_part: what the cost of dead ends contributes under the policy that is best by the lower bounds, as far as

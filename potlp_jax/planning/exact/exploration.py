@@ -22,7 +22,7 @@ update, which passes over all nodes, must not be most of the work; so from 2,000
 _FORESIGHT = 10
 """Attempts of the policy that are followed between two updates of all bounds."""
 _CLOSING = 100
-"""The same when time runs out: more than any policy makes."""
+"""The same when time runs out: enough to follow nearly every history to its end."""
 _NEARLY = 30.0
 """Cost by which an attempt may seem worse than the best and still be expanded beside it; values of the benchmark's
 problems are some hundreds."""

@@ -28,7 +28,7 @@ class Relaxation:
     Below: in one state of the automaton (or those that paths lead to from it) every attempt can be made once at most;
     it costs no less than the cheapest path to its subgoal, shared by the attempts there, and succeeds with the largest
     probability that later knowledge may give it. With the order of attempts free, the best one is by ratio of cost to
-    probability, and the rollout ends when success leads on, the robot finishes, or nothing is left. Attempts that are
+    probability, and the rollout ends when success leads on, the robot finishes, or nothing remains. Attempts that are
     certain to stay available must be made before a dead end; others may be left out.
 
     Above: the dead end after as many of the longest steps as there are conditions to close.
@@ -71,11 +71,9 @@ class Relaxation:
                 after = tables.row_after_failure[rows, k]
                 largest[:, rows] = np.maximum(largest[:, rows], largest[:, after])
                 # A failure of edge k closes its own condition, so only those of other edges are asked for later.
-                other = np.arange(tables.most_edges) != k
-                least[:, rows[:, None], tables.state[rows][:, None], np.flatnonzero(other)[None]] = np.minimum(
-                    least[:, rows[:, None], tables.state[rows][:, None], np.flatnonzero(other)[None]],
-                    least[:, after[:, None], tables.state[rows][:, None], np.flatnonzero(other)[None]],
-                )
+                edges = (tables.state[rows][:, None], np.flatnonzero(np.arange(tables.most_edges) != k)[None])
+                now, later = (slice(None), rows[:, None], *edges), (slice(None), after[:, None], *edges)
+                least[now] = np.minimum(least[now], least[later])
             changed = not (np.array_equal(before[0], largest) and np.array_equal(before[1], least))
         return largest, least
 
@@ -135,13 +133,13 @@ class Relaxation:
                 stage = self._stages[target]
                 largest = self._largest_chance[:, rows][:, :, stage.edges[:, 0], stage.edges[:, 1]].max(axis=1)
                 least = self._least_chance[:, rows][:, :, stage.edges[:, 0], stage.edges[:, 1]].min(axis=1)
-                total, forced = self._total(stage, largest[None], least[None])
+                total, forced = self._stage_cost(stage, largest[None], least[None])
                 bounds = total[0], forced[0]
             for z, k in into:
                 own = np.flatnonzero(tables.state == z)
                 cost = cheapest[:, own, k].min(axis=1, initial=np.inf)
-                # After the success the robot leaves, and pays R_S, or tries on beyond the same subgoal, which saves the
-                # way in; where no attempt is forced, it may also be a dead end.
+                # After the success the robot leaves, and pays R_S, or tries on beyond the same subgoal, which saves a
+                # path to it; where no attempt is forced, it may also be a dead end.
                 if bounds is not None:
                     leave = np.maximum(bounds[0] - self._stages[target].pending_cost, 0.0) + np.where(
                         np.isfinite(cost), cost, 0.0
@@ -151,7 +149,7 @@ class Relaxation:
                 values[:, z, k] = np.where(np.isfinite(cost), cost, 0.0) + arrival
         return values
 
-    def _total(self, stage: "_Stage", largest: np.ndarray, least: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _stage_cost(self, stage: "_Stage", largest: np.ndarray, least: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Lower bound on the cost of a stage, ``[N]``, from probabilities ``[N, S, I]`` of its attempts; and whether
         some attempt must be made."""
         tables = self._tables
@@ -198,7 +196,7 @@ class Relaxation:
         zs, ks = stage.edges[:, 0], stage.edges[:, 1]
         entries = (subgoals[..., None], rows[..., None], zs[None, None], ks[None, None])
         largest, least = self._largest_chance[entries], self._least_chance[entries]
-        total, forced = self._total(stage, largest, least)
+        total, forced = self._stage_cost(stage, largest, least)
         nothing = ~(largest > 0).any(axis=(1, 2)) & np.isinf(stage.finish)
         leave = np.where(nothing[:, None], np.inf, np.maximum(total[:, None] - stage.pending_cost, 0.0))
         # Two bounds on the first attempt: what it costs by itself, and the stage less the path there that it saves.
