@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Int16, Int32, Key, PRNGKeyArray
 
 from potlp_jax.learning.estimator import NetworkEstimator
 from potlp_jax.learning.labels import TrueMapEstimator
-from potlp_jax.learning.memory import Views, remember
+from potlp_jax.learning.memory import PanoramaMemory, remember
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
 from potlp_jax.planning.estimates import Estimates, Estimator, ask
 from potlp_jax.planning.policies import (
@@ -90,7 +90,7 @@ class Progress:
     """
 
     belief: BeliefMap
-    views: Views | None
+    views: PanoramaMemory | None
     first_seen: Int32[Array, "*batch H W"]
     cell: Int32[Array, "*batch 2"]
     path: Int16[Array, "*batch L 2"]
@@ -113,7 +113,7 @@ class Setup:
 
 @partial(jax.jit, static_argnames="setup")
 def begin(
-    world: World, arrays: TaskArrays, key: PRNGKeyArray, views: Views | None, *, setup: Setup
+    world: World, arrays: TaskArrays, key: PRNGKeyArray, views: PanoramaMemory | None, *, setup: Setup
 ) -> tuple[Scene, Progress]:
     """A trial before its first decision; what is visible from the start is known.
 
@@ -236,7 +236,7 @@ def _zeros(leaf: Any) -> Array:
 
 def _consider(
     setup: Setup, asked: Asked, progress: Progress, scene: Scene
-) -> tuple[Views | None, Situation, Estimates | None, PRNGKeyArray]:
+) -> tuple[PanoramaMemory | None, Situation, Estimates | None, PRNGKeyArray]:
     """What every policy is given: the situation, and estimates where it asks for them."""
     running = progress.tally.running
     views = None if setup.network is None else _take_panorama(setup, setup.network, asked, progress, scene)
@@ -260,7 +260,9 @@ def _consider(
     return views, situation, estimates, decision_key(scene.planning, progress.tally.decisions)
 
 
-def _take_panorama(setup: Setup, network: NetworkConfig, asked: Asked, progress: Progress, scene: Scene) -> Views:
+def _take_panorama(
+    setup: Setup, network: NetworkConfig, asked: Asked, progress: Progress, scene: Scene
+) -> PanoramaMemory:
     """What is remembered after a panorama from here."""
     config, running = setup.config, progress.tally.running
     key = jax.random.fold_in(scene.sensing, progress.tally.steps)
@@ -273,12 +275,12 @@ def _take_panorama(setup: Setup, network: NetworkConfig, asked: Asked, progress:
     return remember(views, features, progress.belief, progress.cell)
 
 
-def _estimator(setup: Setup, asked: Asked, views: Views | None, scene: Scene) -> Estimator | None:
+def _estimator(setup: Setup, asked: Asked, views: PanoramaMemory | None, scene: Scene) -> Estimator | None:
     """What the policy asks in one slot."""
     if setup.policy is Policy.ORACLE:
         return TrueMapEstimator(world=scene.world)
     if setup.network is not None and views is not None:
-        return NetworkEstimator(params=asked, views=views, config=setup.network)
+        return NetworkEstimator(params=asked, memory=views, config=setup.network)
     return asked
 
 
