@@ -16,7 +16,7 @@ from potlp_jax.learning.estimator import (
     SURE,
     estimator_for,
     exclusive_chances,
-    observe,
+    observe_panorama,
     read_estimator,
     shipped_estimator,
 )
@@ -106,7 +106,7 @@ def test_answers_equal_the_network_asked_pair_by_pair(world, task, trained, reso
     world = dataclasses.replace(world, resolution=jnp.float32(resolution))
     belief = observe(BeliefMap.unobserved(world), world, world.start, NEAR.sensor)
     subgoals = find_subgoals(belief, belief.free, jnp.zeros(world.shape), FrontierConfig())
-    eyes = observe(trained.start(*world.shape), render(world, world.start), belief, world.start)
+    eyes = observe_panorama(trained.start(*world.shape), render(world, world.start), belief, world.start)
     estimates = eyes(belief, subgoals, task.arrays)
     network = EstimatorNetwork(trained.config)
     features = network.encode(trained.params, render(world, world.start))

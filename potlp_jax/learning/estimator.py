@@ -214,7 +214,7 @@ class TrainedEstimator:
         return NetworkEstimator(params=self.params, memory=empty, config=self.config)
 
 
-observe = jax.jit(NetworkEstimator.observe)
+observe_panorama = jax.jit(NetworkEstimator.observe)
 """``NetworkEstimator.observe`` compiled: one compilation per network and size of the map."""
 
 

@@ -8,16 +8,9 @@ import numpy as np
 
 from potlp_jax.environments.ros.places import Places
 from potlp_jax.errors import DatasetError, LogError
+from potlp_jax.learning import recording
 from potlp_jax.learning.dataset import DatasetMetadata, finished_shards, write_shard
 from potlp_jax.learning.questions import TaskDistribution
-from potlp_jax.learning.recording import (
-    Pose,
-    Recorder,
-    RecordingConfig,
-    draws_of_world,
-    record_views,
-    recording_metadata,
-)
 from potlp_jax.learning.sample_weights import WeightBounds
 from potlp_jax.logs.drive import Drive, PanoramaReader
 from potlp_jax.trials.loop import versions
@@ -25,18 +18,18 @@ from potlp_jax.world.moves import step_lengths
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class LogCollectConfig(RecordingConfig):
+class LogCollectConfig(recording.RecordingConfig):
     """What is recorded of each log: more views than of a simulated world, for there are few logs."""
 
     views_per_world: int = 200
 
 
-def poses_of(drive: Drive) -> Iterator[Pose]:
+def poses_of(drive: Drive) -> Iterator[recording.Pose]:
     """The poses of a drive at which there is a picture."""
     travelled = np.cumsum([0.0, *step_lengths(drive.path)]).tolist()
     for step, cell in enumerate(drive.path):
         if step in drive.pictures:
-            yield Pose(belief=drive.belief_at(step), cell=cell, step=step, travelled=travelled[step])
+            yield recording.Pose(belief=drive.belief_at(step), cell=cell, step=step, travelled=travelled[step])
 
 
 def collect_drives(
@@ -62,10 +55,10 @@ def collect_drives(
     metadata = _metadata(drives, places, environment, split, config)
     counts = []
     for number, drive in enumerate(drives):
-        recorder = Recorder(number, config, WeightBounds(**metadata.weights))
-        rng, pool = draws_of_world(config, split, number, tasks)
+        recorder = recording.Recorder(number, config, WeightBounds(**metadata.weights))
+        rng, pool = recording.draws_of_world(config, split, number, tasks)
         reader = PanoramaReader(drive, config.camera)
-        record_views(
+        recording.record_views(
             recorder,
             drive.world,
             number,
@@ -85,7 +78,7 @@ def _metadata(
 ) -> DatasetMetadata:
     resolution = float(drives[0].world.resolution)
     height, width = (max(drive.world.shape[axis] for drive in drives) for axis in (0, 1))
-    return recording_metadata(
+    return recording.recording_metadata(
         config,
         WeightBounds.of_map(height, width, resolution),
         versions(),

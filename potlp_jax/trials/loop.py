@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int32, PRNGKeyArray
 
-from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator, identity_of, observe
+from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator, identity_of, observe_panorama
 from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Move, MoveKind, Policy, PolicyFunction, decide, named_policy, policy_name
@@ -163,7 +163,7 @@ class _Loop:
         index = len(self._decisions)
         at, key = jnp.asarray(cell, jnp.int32), rules.decision_key(self._key, index)
         if isinstance(self._estimator, NetworkEstimator):
-            self._estimator = observe(self._estimator, self._robot.panorama(), belief, at)
+            self._estimator = observe_panorama(self._estimator, self._robot.panorama(), belief, at)
         move = _decide(
             belief,
             at,
