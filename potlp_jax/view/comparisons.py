@@ -8,13 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.box import SIMPLE_HEAD
 from rich.table import Table as RichTable
+from rich.text import Text
 
 from potlp_jax.sweep.results import Pair
 from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, SATISFIED, Comparison, PolicyRow, Table
-from potlp_jax.view.style import FAINT, INK, STATE_COLOURS, new_figure
-
-_MARKERS = "osD^vP*X"
-_LINES = ("-", "--", "-.", ":")
+from potlp_jax.view.style import FAINT, INK, PolicyStyle, new_figure, policy_styles
 
 
 def savings_table(table: Table, title: str) -> RichTable:
@@ -31,9 +29,16 @@ def savings_table(table: Table, title: str) -> RichTable:
     shown.add_column("policy", no_wrap=True)
     for name in ("attainable\nsavings", "95%\ninterval", "net\nsavings", "savings\nper trial", "mean\ncost"):
         shown.add_column(name, justify="right", no_wrap=True)
+    styles = policy_styles(row.policy for row in table.rows)
     for row in table.rows:
-        shown.add_row(row.policy, *_cells(row))
+        shown.add_row(_policy_name(row.policy, styles), *_cells(row))
     return shown
+
+
+def _policy_name(policy: str, styles: Mapping[str, PolicyStyle]) -> Text:
+    """In the colour that the policy has in pictures; ink is whatever the terminal writes in."""
+    colour = styles[policy].colour
+    return Text(policy, style="" if colour == INK else colour)
 
 
 def _cells(row: PolicyRow) -> tuple[str, ...]:
@@ -61,8 +66,9 @@ def outcome_table(comparison: Comparison) -> RichTable:
     shown.add_column("policy", no_wrap=True)
     for name in endings:
         shown.add_column(name, justify="right")
+    styles = policy_styles(comparison.outcomes)
     for policy, counts in comparison.outcomes.items():
-        shown.add_row(policy, *(str(counts.get(name, 0)) for name in endings))
+        shown.add_row(_policy_name(policy, styles), *(str(counts.get(name, 0)) for name in endings))
     return shown
 
 
@@ -75,18 +81,6 @@ def loss_lines(comparison: Comparison) -> list[str]:
         for policy, counts in comparison.losses.items()
         if counts
     ]
-
-
-def policy_styles(policies: Sequence[str]) -> Mapping[str, tuple[str, str, str]]:
-    """Colour, marker and line of each policy: told apart without colour too."""
-    return {
-        policy: (
-            STATE_COLOURS[index % len(STATE_COLOURS)],
-            _MARKERS[index % len(_MARKERS)],
-            _LINES[index % len(_LINES)],
-        )
-        for index, policy in enumerate(policies)
-    }
 
 
 def draw_scatter(pairs: Sequence[Pair], policies: Sequence[str], title: str) -> Figure:
@@ -109,7 +103,7 @@ def scatter_costs(axes: Axes, pairs: Sequence[Pair], policies: Sequence[str]) ->
     axes.set_axisbelow(True)
     _mark_diagonal(axes, limit)
     unsatisfied = False
-    for policy, (colour, marker, _) in policy_styles(policies).items():
+    for policy, style in policy_styles(policies).items():
         if policy == BASELINE:
             continue
         good = [pair for pair in pairs if pair[policy].outcome == pair[BASELINE].outcome == SATISFIED]
@@ -118,15 +112,15 @@ def scatter_costs(axes: Axes, pairs: Sequence[Pair], policies: Sequence[str]) ->
             [pair[BASELINE].cost for pair in good],
             [pair[policy].cost for pair in good],
             s=12 if policy == KNOWN_MAP else 26,
-            marker=marker,
-            color=colour,
+            marker=style.marker,
+            color=style.colour,
             alpha=0.65,
             linewidths=0,
             label=f"{policy} ({len(good)} worlds)",
             zorder=2,
         )
         failed = [pair[BASELINE].cost for pair in bad], [pair[policy].cost for pair in bad]
-        axes.scatter(*failed, s=34, marker="x", color=colour, zorder=3)
+        axes.scatter(*failed, s=34, marker="x", color=style.colour, zorder=3)
         unsatisfied = unsatisfied or bool(bad)
     if unsatisfied:
         axes.scatter([], [], s=34, marker="x", color=FAINT, label="not satisfied")
