@@ -9,11 +9,13 @@ Suites:
     python -m eval.trials firefighting rooms maps revealed --processes 2
     python -m eval.trials --report docs/results/trials
 
-Results are appended as JSON lines; the same command again continues where it stopped.
+Results are appended as JSON lines; the same command again continues where it stopped. ``--report`` also reads
+JSON lines that were packed with ``gzip``.
 """
 
 import argparse
 import functools
+import gzip
 import json
 import multiprocessing
 import os
@@ -31,9 +33,10 @@ from eval.formulas import random_tasks, traits
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.rooms import Rooms
+from potlp_jax.environments.ros.cleaning import clean_map
 from potlp_jax.environments.ros.map_files import load_map
 from potlp_jax.environments.ros.places import Disc, Places
-from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig, clean_map
+from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task, TaskSizes
@@ -179,8 +182,12 @@ def work(arguments: tuple[dict[str, Any], Path]) -> None:
 def rows_of(out: Path, suite: str) -> list[dict[str, Any]]:
     """Rows written so far; a line cut off by a kill is dropped, its item runs again."""
     path = out / f"{suite}.jsonl"
+    packed = path.with_suffix(".jsonl.gz")  # as docs/results keeps them
+    text = path.read_text() if path.exists() else ""
+    if packed.exists():
+        text = gzip.decompress(packed.read_bytes()).decode() + text
     rows = []
-    for line in path.read_text().splitlines() if path.exists() else ():
+    for line in text.splitlines():
         try:
             rows.append(json.loads(line))
         except json.JSONDecodeError:
@@ -236,7 +243,7 @@ def main() -> None:
     enable_compilation_cache()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("suites", nargs="*", metavar="SUITE", help="firefighting, rooms, maps or revealed")
-    parser.add_argument("--out", type=Path, default=Path("docs/results/trials"))
+    parser.add_argument("--out", type=Path, default=Path("out/trials"))
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--report", type=Path, metavar="DIR", help="print the figures of a run and stop")
     arguments = parser.parse_args()

@@ -4,6 +4,7 @@
 imported on first use, so that ``import potlp_jax`` itself takes milliseconds and loads no JAX.
 """
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -27,12 +28,16 @@ if TYPE_CHECKING:
     from potlp_jax.planning.exact.api import solve_exact as solve_exact
     from potlp_jax.planning.policies import DecisionConfig as DecisionConfig
     from potlp_jax.planning.policies import Policy as Policy
+    from potlp_jax.planning.policies import PolicyFunction as PolicyFunction
     from potlp_jax.planning.policies import decide as decide
+    from potlp_jax.planning.policies import move_to as move_to
     from potlp_jax.planning.problem import PlanningProblem as PlanningProblem
     from potlp_jax.planning.problem import enumerate_actions as enumerate_actions
     from potlp_jax.planning.search.api import Plan as Plan
     from potlp_jax.planning.search.api import plan_actions as plan_actions
-    from potlp_jax.planning.search.graph import SearchConfig as SearchConfig
+    from potlp_jax.planning.search.config import SearchConfig as SearchConfig
+    from potlp_jax.planning.search.config import UctConfig as UctConfig
+    from potlp_jax.rl.episodes import TaskEnv as TaskEnv
     from potlp_jax.task.task import Task as Task
     from potlp_jax.task.task import TaskArrays as TaskArrays
     from potlp_jax.task.task import TaskSizes as TaskSizes
@@ -41,11 +46,17 @@ if TYPE_CHECKING:
     from potlp_jax.trials.batch import Start as Start
     from potlp_jax.trials.batch import run_batch as run_batch
     from potlp_jax.trials.config import TrialConfig as TrialConfig
+    from potlp_jax.trials.config import trial_config_for as trial_config_for
+    from potlp_jax.trials.loop import run_robot as run_robot
     from potlp_jax.trials.loop import run_trial as run_trial
     from potlp_jax.trials.record import Outcome as Outcome
+    from potlp_jax.trials.record import RunRecord as RunRecord
     from potlp_jax.trials.record import Trial as Trial
     from potlp_jax.trials.record import load_trial as load_trial
+    from potlp_jax.trials.robot import Leg as Leg
     from potlp_jax.trials.robot import Robot as Robot
+    from potlp_jax.trials.rules import Stop as Stop
+    from potlp_jax.trials.run import run as run
     from potlp_jax.types import NO_ACTION as NO_ACTION
     from potlp_jax.types import Status as Status
     from potlp_jax.world.frontiers import FrontierConfig as FrontierConfig
@@ -89,25 +100,35 @@ __all__ = [  # noqa: RUF022 - by use, not by the alphabet
     "DecisionConfig",
     "Intention",
     "Policy",
+    "PolicyFunction",
+    "move_to",
     "decide",
     "PlanningProblem",
     "enumerate_actions",
     "SearchConfig",
+    "UctConfig",
     "Plan",
     "plan_actions",
     "Bounds",
     "bound_exact",
     "solve_exact",
     # Whole trials, one or many.
+    "run",
     "TrialConfig",
+    "trial_config_for",
     "run_trial",
+    "run_robot",
+    "RunRecord",
     "Trial",
     "Outcome",
     "load_trial",
     "Robot",
+    "Leg",
+    "Stop",
     "Start",
     "Finished",
     "run_batch",
+    "TaskEnv",
     # Sentinels, flags and errors.
     "NO_ACTION",
     "Status",
@@ -128,16 +149,19 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "planning.distances.product": ("product_distances", "product_transitions"),
     "planning.estimates": ("Estimates",),
     "planning.exact.api": ("Bounds", "bound_exact", "solve_exact"),
-    "planning.policies": ("DecisionConfig", "Policy", "decide"),
+    "planning.policies": ("DecisionConfig", "Policy", "PolicyFunction", "decide", "move_to"),
     "planning.problem": ("PlanningProblem", "enumerate_actions"),
     "planning.search.api": ("Plan", "plan_actions"),
-    "planning.search.graph": ("SearchConfig",),
+    "planning.search.config": ("SearchConfig", "UctConfig"),
+    "rl.episodes": ("TaskEnv",),
     "task.task": ("Task", "TaskArrays", "TaskSizes", "stack_tasks"),
     "trials.batch": ("Finished", "Start", "run_batch"),
-    "trials.config": ("TrialConfig",),
-    "trials.loop": ("run_trial",),
-    "trials.record": ("Outcome", "Trial", "load_trial"),
-    "trials.robot": ("Robot",),
+    "trials.config": ("TrialConfig", "trial_config_for"),
+    "trials.loop": ("run_robot", "run_trial"),
+    "trials.record": ("Outcome", "RunRecord", "Trial", "load_trial"),
+    "trials.robot": ("Leg", "Robot"),
+    "trials.rules": ("Stop",),
+    "trials.run": ("run",),
     "types": ("NO_ACTION", "Status"),
     "world.frontiers": ("FrontierConfig", "Subgoals", "find_subgoals"),
     "world.grid": ("BeliefMap", "World", "belief_from_numpy", "make_world"),
@@ -150,10 +174,10 @@ def __getattr__(name: str) -> Any:
     """Import a public name when it is first asked for (PEP 562)."""
     if name == "__version__":
         # Imported here because it takes 25 ms, which nobody should pay who does not ask.
-        import importlib.metadata
+        from importlib.metadata import version
 
         # From the installed package, so that the version is written in pyproject.toml alone.
-        value = importlib.metadata.version("potlp-jax")
+        value = version("potlp-jax")
     elif name in _HOME:
         value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
     else:

@@ -14,6 +14,10 @@ class PotlpWarning(UserWarning):
     """Base of all remarks on what was given: it can be used, and something about it should be known."""
 
 
+class ConfigurationError(PotlpError):
+    """A setting is missing, unknown or has a value that does not fit; the message names it and what can be given."""
+
+
 class TaskError(PotlpError):
     """What is wrong with a task: its formula, its automaton or its propositions."""
 
@@ -42,7 +46,7 @@ class ProblemError(PotlpError):
 
 
 class ProblemTooLargeError(PotlpError):
-    """The problem has more states than the exact solver was allowed to look at."""
+    """The problem has more states than the exact solver was allowed to explore."""
 
 
 class NetworkError(PotlpError):
@@ -73,8 +77,8 @@ class BatchError(PotlpError):
     """Trials do not fit into one batch; the message says which and why."""
 
 
-class SpecificationError(PotlpError):
-    """A specification cannot be used: names the file, the entry and what to do."""
+class SpecificationError(ConfigurationError):
+    """A specification of a sweep cannot be used: names the file, the entry and what to do."""
 
 
 class StoreError(PotlpError):

@@ -27,6 +27,17 @@ def entry_points(group: str) -> tuple[str, ...]:
     return tuple(sorted(importlib.metadata.entry_points(group=group).names))
 
 
+def is_known(name: str, group: str) -> bool:
+    """Whether the name can be an extension of this kind, and not, say, that of a file."""
+    return is_reference(name) or name in entry_points(group)
+
+
+def reference_of(found: Any) -> str:
+    """``module:attribute`` of a function or class, or of the class of anything else: how records name it."""
+    named = found if hasattr(found, "__qualname__") else type(found)
+    return f"{named.__module__}:{named.__qualname__}"
+
+
 def load(name: str, *, group: str, kind: str, known: Iterable[str] = ()) -> Any:
     """The object that a name stands for.
 

@@ -1,20 +1,56 @@
 """Names shared by every room: array dimensions, sentinels and status bits.
 
-Dimension names (they appear in the jaxtyping annotations and mean the same thing everywhere):
+Glossary of the dimension names in jaxtyping annotations. ``tests/test_types.py`` compares it with the package: every
+name that is used stands here, and no other. A name with a ``1`` at its end has one entry more than the name without
+(``S1`` is ``S + 1``). Names behind a star, such as ``*batch``, are not listed: they stand for any number of axes.
 
-====  ==========================================================================================
-H, W  rows and columns of the grid; row 0 is the top row, a cell is ``(row, column)``
-Z     states of the task automaton (DFA)
-L     letters, ``2 ** n`` for ``n`` propositions; bit ``i`` of a letter is proposition ``i``
-E     edges ``(z', z'')`` of the automaton that a high-level action can attempt
-C     outcome classes ``(stay, cube)``: what an estimator is asked for
-M     conditions: the C classes first, then the conditions that several cubes make up
-K     cubes of a condition, at most
-S     subgoals; node ``S`` of a planning problem is the robot's own cell
-A     actions of a planning problem, ``S * E + 1``: ``s * E + e``, and last the finish action
-B     batch
-N     nodes of a search tree
-====  ==========================================================================================
+=============================  ======================================================================================
+Grid
+H, W                           rows and columns of the grid; row 0 is the top row, a cell is (row, column)
+H2, W2                         the same with a margin of one cell on each side
+two_h, two_w                   ``2 H - 1`` and ``2 W - 1``: differences between the coordinates of two cells
+h, w, h2, w2                   rows and columns of an image file or a map file, in pixels; the same once grown
+cells, real                    cells of the grid, counted row by row; ``real`` without the dummy entry at the end
+capacity, block                entries of a list of cells; entries that are handled at once
+lines, steps                   lines of sight, or lines of the grid; cells along a line, a ray or a path
+side, entries                  lines of one side of a square, or pixels of a disc; entries of a table of maxima
+
+Task
+Z                              states of the task automaton (DFA)
+L                              letters, ``2 ** P``; bit ``i`` of a letter is proposition ``i``
+P                              propositions
+E                              edges (z', z'') of the automaton that a high-level action can attempt
+C                              outcome classes (stay, cube): what an estimator is asked for
+M                              conditions: the C classes first, then the conditions that several cubes make up
+K                              cubes of a condition, at most; in training, samples of one view
+
+Planning
+S, S1                          subgoals; location ``S`` of a planning problem is the robot's own cell
+A                              actions, ``S * E + 1``: ``s * E + e``, and last the finish action
+N                              nodes of a search graph, or any number of things of one kind
+NZ                             nodes times states
+B                              rows of a batch
+D                              depth: actions of one simulation
+R, L1                          rows of a table of guesses; lengths of a chain of failures, 0 among them
+V                              words of a bit set over product states; in learning, panoramas in memory
+n                              flags, or words of a packed row
+slots                          entries of a hash table
+Q, T                           sources and targets of distances
+shared, lanes                  Q, or 1 where all sources share the entry; Q
+active, keys, ends             cells where the automaton's state can change; with the sources; with the targets
+to                             states that a move may lead to
+horizon1                       product states of a path: its moves and the source
+
+Pictures and estimators
+rows, columns                  of a panorama; a column is a bearing
+G                              views of a training batch
+F                              features of a position in a panorama
+feature_rows, feature_columns  rows and columns of a panorama's features
+bands, columns_out             bands of rows of a panorama; columns of a result where they are fewer
+patch_rows, patch_columns      rows and columns of the patch around a subgoal
+packed, pixels                 bands as channels; values of a patch in one vector
+k                              samples chosen from more
+=============================  ======================================================================================
 
 Costs are ``float32`` in the unit of ``World.resolution`` (cells where it is 1). Unreachable is ``inf``.
 Masks are True where an entry is real, False where it is padding.
@@ -43,8 +79,12 @@ NO_ACTION: int = -1
 
 
 class Status(IntFlag):
-    """Sticky bits that every padded producer ORs into its ``status``; zero means that nothing was lost."""
+    """Sticky bits that every padded producer ORs into its ``status``; zero means that nothing was lost.
 
+    No array is truncated silently: evaluation counts trials with a bit apart (``sweep.statistics``).
+    """
+
+    # Rows of results hold these numbers, so they do not change; 32 is not used.
     OK = 0
     SUBGOAL_OVERFLOW = 1
     """More frontier components than the array of subgoals holds; the farthest were left out."""
@@ -56,8 +96,6 @@ class Status(IntFlag):
     """No action is available and the root is not accepting: the value is the dead-end cost."""
     ACCEPTING_ROOT = 16
     """The task is already satisfied: the value is zero."""
-    NOT_CONVERGED = 32
-    """An iteration reached its limit before its fixed point."""
     FALLBACK = 64
     """No action was available; the robot went to the nearest frontier that violates nothing (liveness)."""
     NO_FRONTIER = 128
@@ -66,11 +104,17 @@ class Status(IntFlag):
     """The memory of panoramas was full; one was dropped that still showed a frontier."""
 
 
+def status_names(status: int) -> tuple[str, ...]:
+    """The bits that are set, by name: what people and programs are shown instead of a number."""
+    return tuple(str(flag.name).lower() for flag in Status(status))
+
+
 def status_array(status: Status = Status.OK) -> UInt32[Array, ""]:
     """The bits as a device scalar."""
+    # Through numpy: a Python integer would become int32, and strict dtype promotion refuses to mix the two.
     return jnp.asarray(np.uint32(int(status)))
 
 
 def status_if(condition: Array, status: Status) -> UInt32[Array, ""]:
-    """``status`` where ``condition`` holds, else no bits; works under jit and vmap."""
+    """``status`` where ``condition`` holds, otherwise no bits; works under jit and vmap."""
     return jnp.where(condition, np.uint32(int(status)), np.uint32(0))

@@ -12,7 +12,7 @@ from potlp_jax.errors import BatchError
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.policies import DecisionConfig, Policy
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig
 from potlp_jax.task.task import Task
 from potlp_jax.trials import batch
 from potlp_jax.trials.batch import Start, run_batch
@@ -74,7 +74,7 @@ def test_every_trial_is_what_it_is_alone(ran):
         number, task = start.name
         trial = run_trial(start.world, task, policy, start.key, CONFIG, arrays=start.arrays, estimator=UNTRAINED)
         fallbacks = sum(decision.fallback for decision in trial.decisions)
-        kept += sum(decision.kept_from is not None for decision in trial.decisions)
+        kept += sum(decision.overruled is not None for decision in trial.decisions)
         path = [list(cell) for cell in trial.path]
         alone[number] = (trial.outcome, trial.cost, path, len(trial.decisions), fallbacks, trial.status)
     assert _figures(finished) == alone

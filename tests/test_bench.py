@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from potlp_jax.bench.memory import tree_memory
-from potlp_jax.bench.perception import measure_looking
+from potlp_jax.bench.perception import measure_perception
 from potlp_jax.bench.planner import as_dict, make_scene, mean_depth, measure_distances
 from potlp_jax.bench.problems import family_problem
 from potlp_jax.bench.timing import Timing, compile_call, environment, measure, timed_runs
@@ -26,7 +26,7 @@ from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.policies import DecisionConfig
 from potlp_jax.planning.search.api import search_tree
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig
 from potlp_jax.task.task import Task
 from potlp_jax.world.frontiers import FrontierConfig
 
@@ -60,7 +60,7 @@ def tree(problem):
 def scene():
     toy = Toy()
     task = Task.from_formula(toy.tasks["1"], toy.propositions)
-    return make_scene(toy.generate(world_key(Split.VALIDATION, 0, toy.name)), task, looks=1)
+    return make_scene(toy.generate(world_key(Split.VALIDATION, 0, toy.name)), task, observations=1)
 
 
 def test_a_measurement_runs_the_function_and_keeps_phases_apart():
@@ -130,16 +130,16 @@ def test_mean_depth_is_actions_per_simulation():
     assert mean_depth(None, np.array([10, 10])) is None
 
 
-def test_phases_of_looking_and_deciding(scene):
+def test_phases_of_perception_and_decision(scene):
     config = NetworkConfig(
         propositions=Toy().propositions, first_widths=(4,) * 4, second_widths=(4,) * 8, dense_widths=(8,) * 4
     )
     params = EstimatorNetwork(config).init(jax.random.key(0))
     trained = TrainedEstimator(params=params, config=config, metadata={}, name="tiny", digest="")
     decision = DecisionConfig(frontiers=FrontierConfig(max_subgoals=2), search=QUICK)
-    rows = measure_looking(scene, trained, decision, repeats=1)
+    rows = measure_perception(scene, trained, decision, repeats=1)
     phases = [row.phase for row in rows]
-    assert phases[:4] == ["render", "first stage", "remember", "ways to subgoals"]
+    assert phases[:4] == ["render", "first stage", "remember", "distances to subgoals"]
     # What `measure_decision` measures, whatever the estimator.
     assert phases[4:] == ["assess", "estimates", "travel", "search", "path", "whole"]
     for row in rows:
@@ -153,8 +153,8 @@ def test_distances_are_measured_on_the_true_map(scene):
     assert json.loads(json.dumps(as_dict(row), allow_nan=False))["run_s"] > 0
 
 
-def test_looking_needs_an_estimator():
-    told = _potlp("bench", "--parts", "looking", "--environment", "toy", "--repeats", 1)
+def test_perception_needs_an_estimator():
+    told = _potlp("bench", "--parts", "perception", "--environment", "toy", "--repeats", 1)
     assert told.exit_code == 2
     assert "no estimator is shipped" in told.stderr
 
@@ -220,17 +220,17 @@ def test_importing_the_package_leaves_the_cache_off(tmp_path):
 
 
 CACHED = """
-import json, jax
 from potlp_jax.cache import enable_compilation_cache
+folder = enable_compilation_cache()
+import json, jax
 hits = []
 jax.monitoring.register_event_listener(lambda event, **_: hits.append(event.endswith("/cache_hits")))
-folder = enable_compilation_cache()
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.bench.problems import family_problem
 from potlp_jax.planning.search.api import plan_actions
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig
 problem = family_problem("find", 2, "tuning", 0)
 plan = jax.jit(plan_actions, static_argnums=2)(problem, jax.random.key(0), SearchConfig(simulations=12))
 print(json.dumps({"folder": str(folder), "hits": sum(hits), "q": repr(plan.q_values.tolist())}))

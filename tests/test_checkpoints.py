@@ -72,10 +72,10 @@ def test_unfinished_folders_are_no_checkpoints(tmp_path):
     [
         (
             {**IDENTITY, "network": {"propositions": ["fire", "alarm"]}},
-            r"network\.propositions is \['fire', 'exit'\] in the file and \['fire', 'alarm'\] here",
+            r'network\.propositions was \["fire", "exit"\], is \["fire", "alarm"\]',
         ),
-        ({**IDENTITY, "versions": {"jax": "2"}}, r"versions\.jax is 1 in the file and 2 here"),
-        ({**IDENTITY, "seed": 3}, r"seed is None in the file and 3 here"),
+        ({**IDENTITY, "versions": {"jax": "2"}}, r"versions\.jax was .*1.*, is .*2"),
+        ({**IDENTITY, "seed": 3}, "seed was null, is 3"),
     ],
 )
 def test_a_checkpoint_of_another_training_is_refused_by_name(tmp_path, identity, message):
@@ -87,7 +87,9 @@ def test_a_checkpoint_of_another_training_is_refused_by_name(tmp_path, identity,
 def test_other_shapes_are_refused_by_name(tmp_path):
     save_checkpoint(tmp_path, 3, _state(), IDENTITY, {})
     other = {**_state(), "params": {"kernel": jnp.zeros((2, 4)), "bias": jnp.zeros(4)}}
-    with pytest.raises(CheckpointError, match=r"params\.bias.*params\.kernel is float32\[2, 3\].*float32\[2, 4\] here"):
+    with pytest.raises(
+        CheckpointError, match=r"params\.bias.*params\.kernel was \"float32\[2, 3\]\", is \"float32\[2, 4\]"
+    ):
         load_checkpoint(tmp_path, 3, other, IDENTITY)
 
 
@@ -153,7 +155,7 @@ def test_an_estimator_of_another_format_or_network_is_refused_by_name(tmp_path, 
     path = tmp_path / "e.npz"
     wider = dataclasses.replace(CONFIG, dense_widths=(4, 4, 4, 5))
     save_estimator(path, params, wider, {})
-    with pytest.raises(CheckpointError, match=r"array\.second\.Dense_4\.bias is float32\[4\].*float32\[5\]"):
+    with pytest.raises(CheckpointError, match=r"array\.second\.Dense_4\.bias was .*float32\[4\].*float32\[5\]"):
         load_estimator(path)
     monkeypatch.setattr(estimator_files, "ESTIMATOR_FORMAT", "potlp-estimator-99")
     save_estimator(path, params, CONFIG, {})

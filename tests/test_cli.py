@@ -1,6 +1,7 @@
 """The command line: what it prints and writes, exit codes, and where its output goes."""
 
 import csv
+import gzip
 import json
 import subprocess
 import sys
@@ -12,13 +13,18 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from potlp_jax.cli import app
-from potlp_jax.environments.families import FAMILIES
+from potlp_jax.cli import app, completion
+from potlp_jax.environments.families import FAMILIES, NAMED
 from potlp_jax.environments.registry import make
-from potlp_jax.environments.splits import world_key
-from potlp_jax.errors import WorldError
+from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.environments.toy import Toy
+from potlp_jax.errors import PotlpError, WorldError
+from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
 from potlp_jax.trials.record import Outcome, load_trial
+from potlp_jax.trials.run import run
+
+ROOT = Path(__file__).parents[1]
 
 # Few simulations: what is tested is the command line, not the planner.
 FAST = ("--simulations", "20")
@@ -37,7 +43,7 @@ def _json(result):
 def recorded(tmp_path_factory) -> Path:
     """A trial of the toy environment with everything that `potlp run` writes."""
     folder = tmp_path_factory.mktemp("run")
-    result = _potlp("run", "toy", "-t", "2", "--policy", "oracle", "--seed", "3", "--out", folder, *FAST)
+    result = _potlp("run", "toy", "-t", "2", "--policy", "oracle", "--world", "3", "--out", folder, *FAST)
     assert result.exit_code == 0, result.output
     return folder
 
@@ -68,7 +74,7 @@ def test_task_as_json_is_its_description():
 
 def test_task_as_text_and_picture(tmp_path):
     svg = tmp_path / "task.svg"
-    result = _potlp("task", "toy-2", "--svg", svg)
+    result = _potlp("task", "toy-2", "--out", svg)
     assert result.exit_code == 0
     for part in ("!hazard U goal", "initial", "accepting", "trap", "!goal & hazard", "0→1"):
         assert part in result.stdout
@@ -96,7 +102,7 @@ def test_max_positive_literals_reaches_the_task():
         (("task", "F (a &"), "^"),
         (("task", "F b", "--propositions", "a"), "unknown proposition"),
         (("task", "missing.hoa"), "missing.hoa"),
-        (("task", "F a", "--svg", "picture.docx"), "docx"),
+        (("task", "F a", "--out", "picture.docx"), "docx"),
         (("run", "castle"), ", ".join(FAMILIES)),
         (("run", "map:missing.yaml"), "missing.yaml"),
         (("run", "floorplan:missing.xml"), "missing.xml: cannot be read"),
@@ -105,7 +111,7 @@ def test_max_positive_literals_reaches_the_task():
         (("run", "toy", "--task", "F dragon"), "dragon"),
         (("run", "toy", "--policy", "clever"), "known-map, baseline"),
         (("run", "toy", "--split", "holiday"), "validation"),
-        (("run", "toy", "--seed", "999999999999"), "--seed"),
+        (("run", "toy", "--world", "999999999999"), "--world"),
         (("compare", "toy", "--policies", "oracle,clever"), "clever"),
         (("run", "toy", "--policy", "potlp"), "no estimator is shipped for the propositions goal"),
         (("run", "firefighting", "--estimator", "nowhere.npz"), "nowhere.npz"),
@@ -122,7 +128,7 @@ def test_bad_input_is_one_message_and_exit_code_2(arguments, message):
 
 
 def test_bad_options_have_exit_code_2():
-    assert _potlp("run", "toy", "--seed", "-1").exit_code == 2
+    assert _potlp("run", "toy", "--world", "-1").exit_code == 2
     assert _potlp("compare", "toy", "--trials", "0").exit_code == 2
     assert _potlp("run").exit_code == 2
     assert _potlp("dance").exit_code == 2
@@ -142,23 +148,22 @@ def test_run_writes_record_picture_and_animation(recorded):
         assert animation.n_frames == len(trial.decisions) + 1
 
 
-@pytest.mark.parametrize("command", ["run", "compare"])
-def test_trials_have_the_key_of_their_world_in_a_sweep(monkeypatch, command):
+def test_a_trial_has_the_key_of_its_world_in_a_sweep(monkeypatch):
     keys = []
 
     def run_trial(world, task, policy, key, *rest, **named):
         keys.append(key)
         raise WorldError("seen")
 
-    monkeypatch.setattr(f"potlp_jax.cli.{command}.run_trial", run_trial)
-    _potlp(command, "toy", "--policies" if command == "compare" else "--policy", "baseline", "--seed", "3")
+    monkeypatch.setattr("potlp_jax.trials.loop.run_trial", run_trial)
+    _potlp("run", "toy", "--policy", "baseline", "--world", "3")
     assert (keys[0] == jax.random.fold_in(jax.random.key(0), 3)).all()
 
 
 def test_run_as_json_is_the_summary(recorded, tmp_path):
     data = _json(
         _potlp(
-            *("run", "toy", "-t", "2", "--policy", "oracle", "--seed", "3", "--out", tmp_path / "new"),
+            *("run", "toy", "-t", "2", "--policy", "oracle", "--world", "3", "--out", tmp_path / "new"),
             *("--no-animation", "--json", *FAST),
         )
     )
@@ -166,6 +171,18 @@ def test_run_as_json_is_the_summary(recorded, tmp_path):
     assert data == load_trial(recorded / "trial.json").summary()
     assert [Path(file).name for file in files] == ["trial.json", "trial.png"]
     assert not (tmp_path / "new" / "trial.gif").exists()
+
+
+def test_one_call_from_python_makes_the_trial_of_the_command_line():
+    data = _json(_potlp("run", "toy", "-t", "2", "--policy", "baseline", "--world", "4", "--json"))
+    assert {**run("toy", 2, "baseline", 4).summary(), "files": []} == data
+
+
+def test_environments_and_policies_of_others_are_run_by_their_names():
+    names = ("examples.own_environment:Corridor", "--policy", "examples.own_policy:largest_frontier")
+    data = _json(_potlp("run", *names, "--camera", "examples.own_camera:thermal", "--json"))
+    assert (data["environment"], data["policy"]) == (f"{names[0]}/validation", names[2])
+    assert data["outcome"] == "satisfied"
 
 
 def test_without_an_estimator_the_default_policy_is_the_baseline():
@@ -187,6 +204,31 @@ def test_task_that_is_not_satisfied_has_exit_code_1():
     result = _potlp("run", "toy", "--task", "!hazard U (goal & hazard)", "--policy", "baseline", "--json")
     assert result.exit_code == 1
     assert json.loads(result.stdout)["outcome"] == "infeasible"
+
+
+def _goals_behind_the_hazard(monkeypatch, possible):
+    """Toy worlds whose second task is possible in these numbers alone: elsewhere no cell is a goal."""
+    plain = Toy.draw
+
+    def draw(self, key):
+        world = plain(self, key)
+        keys = [world_key("validation", number, "toy") for number in possible]
+        return world if any((key == own).all() for own in keys) else world.replace(letters=world.letters * 0)
+
+    monkeypatch.setattr(Toy, "draw", draw)
+
+
+def test_an_infeasible_trial_says_whether_the_world_is_at_fault(monkeypatch):
+    _goals_behind_the_hazard(monkeypatch, {3})
+    result = _potlp("run", "toy", "-t", "2", "--policy", "baseline", "--world", "1")
+    assert result.exit_code == 1
+    assert "with the whole map it is impossible too: try --world 3" in result.stderr
+
+
+def test_a_task_that_no_world_allows_is_to_be_checked(monkeypatch):
+    monkeypatch.setattr("potlp_jax.cli.run.WORLDS_TRIED", 2)
+    result = _potlp("run", "toy", "--task", "!hazard U (goal & hazard)", "--policy", "baseline")
+    assert "as in the 2 worlds that follow: check the task" in result.stderr
 
 
 def test_out_that_is_a_file_is_refused(tmp_path):
@@ -239,46 +281,82 @@ def test_compare_reports_pairs_and_writes_its_files(tmp_path):
     )
     data = _json(result)
     assert data == json.loads((tmp_path / "compare.json").read_text())
-    assert (data["worlds"], data["seeds"], data["redrawn"]) == (3, [0, 1, 2], 0)
-    assert [row["policy"] for row in data["satisfied"]["rows"]] == ["known-map", "baseline", "oracle"]
+    (cell,) = data["cells"]
+    assert (cell["worlds"], cell["world_numbers"], cell["redrawn"]) == (3, [0, 1, 2], 0)
+    assert [row["policy"] for row in cell["satisfied"]["rows"]] == ["known-map", "baseline", "oracle"]
     with (tmp_path / "trials.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 9
     oracle = [float(row["cost"]) for row in rows if row["policy"] == "oracle"]
-    assert data["charged"]["rows"][2]["mean_cost"] == pytest.approx(sum(oracle) / 3)
+    assert cell["charged"]["rows"][2]["mean_cost"] == pytest.approx(sum(oracle) / 3)
     # 20 (H + W) on the toy's 9 by 15 cells.
     assert {float(row["budget"]) for row in rows} == {480.0}
-    assert "how trials ended" in (tmp_path / "table.txt").read_text()
+    assert "3 of 3" in (tmp_path / "table.txt").read_text()
     assert Image.open(tmp_path / "scatter.png").size[0] > 400
-    assert "world 2" in result.stderr
+    assert "9 of 9 trials" in result.stderr
+
+
+def test_a_comparison_is_a_sweep_that_the_other_commands_show(tmp_path):
+    command = (
+        "compare",
+        "toy",
+        "-t",
+        "2",
+        "--policies",
+        "baseline",
+        "--trials",
+        "2",
+        "--world",
+        "4",
+        "--out",
+        tmp_path,
+    )
+    compared = _json(_potlp(*command, "--json"))
+    assert _json(_potlp("sweep", "show", tmp_path, "--json")) == compared
+    assert compared["cells"][0]["world_numbers"] == [4, 5]
+    longer = _json(_potlp(*command, "--json", "--trials", "3"))
+    assert longer["cells"][0]["world_numbers"] == [4, 5, 6]
+
+
+def test_the_trials_in_one_world_are_drawn_side_by_side(tmp_path):
+    command = ("compare", "toy", "-t", "2", "--policies", "optimistic", "--trials", "2", "--json")
+    _json(_potlp(*command, "--out", tmp_path, "--picture", "1"))
+    with Image.open(tmp_path / "world-1.png") as picture:
+        assert picture.size[0] > 400
+    assert "the worlds compared are 0, 1" in _potlp(*command, "--out", tmp_path, "--picture", "9").stderr
+    assert "--picture needs --out" in _potlp(*command, "--picture", "1").stderr
+
+
+def test_the_demo_quotes_the_results():
+    """The Makefile's figures of task 2, from the trials of Table I."""
+    with gzip.open(ROOT / "docs" / "results" / "table1" / "rows.csv.gz", "rt", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["task"] == make("firefighting").tasks["2"]]
+    costs = {policy: {row["world"]: float(row["cost"]) for row in rows if row["policy"] == policy} for policy in Policy}
+    saved = [costs[Policy.BASELINE][world] - cost for world, cost in costs[Policy.POTLP].items()]
+    # Moves cost 1 or 1.414; what differs by less than a thousandth differs by rounding.
+    less, same = sum(cost > 1e-3 for cost in saved), sum(abs(cost) <= 1e-3 for cost in saved)
+    claim = f"Over {len(saved)} worlds PO-TLP costs less than the baseline in {less / len(saved):.0%}"
+    assert (
+        claim.replace("%", " %") + f" and the same in {100 * same / len(saved):.1f} %"
+        in (ROOT / "Makefile").read_text()
+    )
 
 
 def test_impossible_worlds_are_redrawn(monkeypatch):
-    from potlp_jax.environments.toy import Toy, ToyConfig
-
-    plain = Toy.generate
-
-    def generate(self, key):
-        """The goal of every world but the third and fourth is where the robot cannot go without the hazard."""
-        world = plain(self, key)
-        seeds = [world_key("validation", seed, "toy") for seed in (2, 3)]
-        return world if any((key == seed).all() for seed in seeds) else world.replace(letters=world.letters * 0)
-
-    monkeypatch.setattr(Toy, "generate", generate)
-    assert ToyConfig().height == 9
+    _goals_behind_the_hazard(monkeypatch, {2, 3})
     data = _json(_potlp("compare", "toy", "-t", "2", "--policies", "baseline", "--trials", "2", "--json"))
-    assert (data["seeds"], data["redrawn"]) == ([2, 3], 2)
+    assert (data["cells"][0]["world_numbers"], data["cells"][0]["redrawn"]) == ([2, 3], 2)
 
 
 def test_task_that_is_never_possible_fails(monkeypatch):
-    monkeypatch.setattr("potlp_jax.cli.compare.IMPOSSIBLE_IN_A_ROW", 3)
+    monkeypatch.setattr("potlp_jax.sweep.runner.IMPOSSIBLE_IN_A_ROW", 3)
     result = _potlp("compare", "toy", "--task", "!hazard U (goal & hazard)", "--policies", "baseline")
-    assert result.exit_code == 1
+    assert result.exit_code == 2
     assert "impossible in 3 worlds in a row" in result.stderr
 
 
 def test_unknown_environment_lists_the_known_ones():
-    with pytest.raises(WorldError, match="toy, firefighting, delivery, parcels, rooms"):
+    with pytest.raises(PotlpError, match="toy, firefighting, delivery, parcels, rooms"):
         make("castle")
 
 
@@ -307,10 +385,10 @@ def test_exit_codes_of_the_process():
 def test_interrupt_has_exit_code_130():
     interrupted = _process(
         "import signal, os, sys\n"
-        "import potlp_jax.cli.task as command\n"
+        "import potlp_jax.task.reading as reading\n"
         # A process started in the background inherits that interrupts are ignored.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "command.show_task = lambda *args: os.kill(os.getpid(), signal.SIGINT)\n"
+        "reading.read_task = lambda *args: os.kill(os.getpid(), signal.SIGINT)\n"
         "sys.argv = ['potlp', 'task', 'F a']\n"
         "from potlp_jax.cli import main\n"
         "main()\n"
@@ -319,11 +397,80 @@ def test_interrupt_has_exit_code_130():
     assert "Traceback" not in interrupted.stderr
 
 
-def test_help_loads_neither_pictures_nor_spot():
+LIGHT = """
+import sys
+slow = {'jax', 'numpy', 'scipy', 'matplotlib', 'spot', 'cv2', 'yaml'} & set(sys.modules)
+sys.exit(', '.join(slow) or 0)
+"""
+
+
+def test_importing_the_commands_loads_nothing_of_the_library():
+    # Every command's file, so that help and completion of each are quick.
     result = _process(
-        "import sys\n"
-        "import potlp_jax.cli\n"
-        "slow = {'matplotlib', 'spot', 'cv2'} & set(sys.modules)\n"
-        "sys.exit(', '.join(slow) or 0)\n"
+        "import importlib\n"
+        "from potlp_jax.cli.group import COMMANDS\n"
+        "for module in COMMANDS.values(): importlib.import_module(module)\n"
+        + LIGHT
+        + "sys.exit(', '.join(slow) or 0)\n"
     )
     assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("potlp ru", ["run"]),
+        ("potlp run fire", ["firefighting"]),
+        ("potlp run firefighting --task ", ["1", "2", "3", "4"]),
+        ("potlp run toy --policy o", ["optimistic", "oracle"]),
+        ("potlp run toy --split t", ["training", "test"]),
+        ("potlp compare toy --policies oracle,p", ["oracle,potlp"]),
+        ("potlp bench --environment del", ["delivery"]),
+        ("potlp sweep ex", ["export"]),
+    ],
+)
+def test_the_shell_is_told_what_may_follow(line, expected):
+    result = CliRunner().invoke(
+        app,
+        env={
+            "_POTLP_COMPLETE": "complete_bash",
+            "COMP_WORDS": line,
+            "COMP_CWORD": str(len(line.split(" ")) - 1),
+        },
+        prog_name="potlp",
+    )
+    assert result.stdout.split() == expected
+
+
+def test_completion_loads_nothing_of_the_library():
+    result = _process(
+        "import os\n"
+        "os.environ |= {'_POTLP_COMPLETE': 'complete_bash', 'COMP_WORDS': 'potlp run fire', 'COMP_CWORD': '2'}\n"
+        "from potlp_jax.cli import app\n"
+        "try: app(prog_name='potlp')\n"
+        "except SystemExit: pass\n" + LIGHT
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.split() == ["firefighting"]
+
+
+def test_completed_names_are_those_of_the_library():
+    assert tuple(Policy) == completion.POLICIES
+    assert tuple(Split) == completion.SPLITS
+    assert {name: tuple(make(name).tasks) for name in NAMED} == dict(completion.TASKS)
+
+
+@pytest.mark.parametrize("flag", ["--quiet", "--verbose"])
+def test_quiet_and_verbose_govern_what_is_said_on_stderr(flag):
+    result = _potlp(flag, "run", "toy", "-t", "2")
+    assert result.exit_code == 0
+    assert "satisfied" in result.stdout
+    if flag == "--quiet":
+        assert result.stderr == ""
+    else:
+        assert "no estimator is shipped for toy" in result.stderr
+        assert "decision 0" in result.stderr
+
+
+def test_quiet_still_tells_errors():
+    assert "castle" in _potlp("--quiet", "run", "castle").stderr

@@ -21,14 +21,14 @@ from potlp_jax.errors import DatasetError
 from potlp_jax.learning.dataset import decode, finished_shards, read_dataset, read_metadata, samples_file, views_file
 from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.recording import survey
+from potlp_jax.recipes.collection import CollectConfig, collect, summary
+from potlp_jax.recipes.exploration import Explorer, ExplorerConfig
 from potlp_jax.task.task import Task
 from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.renderer import render
 from potlp_jax.world.sensing import SensorConfig
 from tests.reference.dijkstra import dijkstra, grid_moves
 from tests.reference.sensing import visible
-from train.collect import CollectConfig, collect, main, summary
-from train.explorer import Explorer, ExplorerConfig
 
 GENERATOR = Firefighting.toy()
 CONFIG = CollectConfig(
@@ -197,20 +197,17 @@ def _assert_same_picture(found, expected):
 
 def test_a_folder_with_other_settings_is_not_continued(dataset):
     other = dataclasses.replace(CONFIG, seed=5)
-    with pytest.raises(DatasetError, match=r"collection.seed is 0 in one and 5 in the other"):
+    with pytest.raises(DatasetError, match=r"collection.seed was 0, is 5"):
         collect(GENERATOR, "firefighting", Split.TRAINING, WORLDS, dataset, other)
-    with pytest.raises(DatasetError, match=r"split is 'training' in one and 'validation' in the other"):
+    with pytest.raises(DatasetError, match=r'split was "training", is "validation"'):
         collect(GENERATOR, "firefighting", Split.VALIDATION, WORLDS, dataset, CONFIG)
 
 
-def test_worlds_fill_whole_shards(tmp_path, monkeypatch, capsys):
+def test_worlds_fill_whole_shards(tmp_path):
     with pytest.raises(DatasetError, match="ask for 4 worlds"):
         collect(GENERATOR, "firefighting", Split.TRAINING, 5, tmp_path, CONFIG)
-    monkeypatch.setenv("POTLP_NO_CACHE", "1")
-    with pytest.raises(SystemExit) as stopped:
-        main(["--environment", "toy", "--worlds", "3", "--worlds-per-shard", "2", "--out", str(tmp_path)])
-    assert stopped.value.code == 1
-    assert "ask for 2 worlds" in capsys.readouterr().err
+    with pytest.raises(DatasetError, match="ask for at least 1"):
+        collect(GENERATOR, "firefighting", Split.TRAINING, 4, tmp_path, CONFIG, processes=0)
     assert not list(tmp_path.iterdir())
 
 

@@ -181,7 +181,7 @@ def test_shards_of_different_datasets_do_not_mix(tmp_path):
     _write(tmp_path, [0])
     other = dataclasses.replace(METADATA, split="test", generator={"rooms": 5, "sizes": [3, 4]})
     _write(tmp_path, [1], other)
-    with pytest.raises(DatasetError, match=r"generator.rooms is 2 in one and 5 in the other.*split is 'training'"):
+    with pytest.raises(DatasetError, match=r"generator.rooms was 2, is 5; split was \"training\", is \"test\""):
         read_dataset(tmp_path)
 
 

@@ -144,10 +144,10 @@ def test_a_trial_is_satisfied_and_repeats(world, task, trained, trial):
 
 
 def test_looks_name_earlier_decisions(trial):
-    assert any(decision.looks for decision in trial.decisions)
+    assert any(decision.observations for decision in trial.decisions)
     for decision in trial.decisions:
-        assert len(decision.looks) == len(decision.subgoals)
-        assert all(0 <= number <= decision.index for number in decision.looks)
+        assert len(decision.observations) == len(decision.subgoals)
+        assert all(0 <= number <= decision.index for number in decision.observations)
 
 
 def test_a_saved_trial_replays_its_decisions(trial, trained, tmp_path):
@@ -227,12 +227,13 @@ def test_each_subgoal_is_shown_in_the_centre_of_the_panorama_that_its_estimates_
     decision = dataclasses.replace(
         last,
         subgoals=cells,
-        looks=(0, last.index),
+        observations=(0, last.index),
         actions=tuple(_action(index, 0) for index in range(8)),
         choice=1,
         preferred=1,
     )
-    panoramas = {look: _panorama(seen_from[look], cell) for look, cell in zip(decision.looks, cells, strict=True)}
+    shown = zip(decision.observations, cells, strict=True)
+    panoramas = {number: _panorama(seen_from[number], cell) for number, cell in shown}
     figure = draw_panoramas(trial, decision, panoramas)
     pictures = [axes for axes in figure.axes if axes.images]
     assert len(pictures) == 2
@@ -252,7 +253,7 @@ def test_each_subgoal_is_shown_in_the_centre_of_the_panorama_that_its_estimates_
 def test_explain_writes_the_panoramas_beside_the_tree(trial, trained_file, tmp_path, capsys):
     trial.save(tmp_path / "trial.json")
     index = next(decision.index for decision in trial.decisions if decision.actions)
-    explain_decision(f"{tmp_path}:{index}", tmp_path / "tree.png", 2, trained_file, json=False)
+    explain_decision(f"{tmp_path}:{index}", out=tmp_path / "tree.png", estimator=trained_file)
     told = capsys.readouterr().out
     for name in ("tree.png", "tree-panoramas.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")

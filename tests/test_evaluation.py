@@ -16,6 +16,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from potlp_jax.cli import app
+from potlp_jax.codec import config_from_dict
 from potlp_jax.errors import CheckpointError, EvaluationError
 from potlp_jax.learning.dataset import DatasetMetadata, Samples, decode, encode, view_id, write_shard
 from potlp_jax.learning.metrics import (
@@ -456,7 +457,7 @@ def test_info_shows_what_the_file_says(estimator):
         assert part in shown.stdout
     assert "nan" not in shown.stdout
     data = json.loads(_potlp("info", estimator, "--json").stdout)
-    assert NetworkConfig.from_json(data["network"]) == CONFIG
+    assert config_from_dict(NetworkConfig, data["network"], "network") == CONFIG
     assert data["bytes"] == estimator.stat().st_size
     assert data["metadata"]["figures"]["validation_success_rmse"] is None
 

@@ -6,7 +6,7 @@ from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 
 from potlp_jax.bench.problems import FAMILIES, family_problem
-from potlp_jax.planning.exact import search as exact_search
+from potlp_jax.planning.exact import exploration
 from potlp_jax.planning.exact.api import ProblemTooLargeError, bound_exact, solve_exact
 from potlp_jax.types import NO_ACTION, Status
 from tests.reference.planning import Recursion, ReferenceProblem
@@ -153,8 +153,8 @@ def test_too_large():
 
 def choose_from_the_start(monkeypatch):
     """Let no problem be so small that it is searched breadth first."""
-    monkeypatch.setattr(exact_search, "_BREADTH", 1)
-    monkeypatch.setattr(exact_search, "_BATCH", 1)
+    monkeypatch.setattr(exploration, "_BREADTH", 1)
+    monkeypatch.setattr(exploration, "_BATCH", 1)
 
 
 def _optimum(problem):

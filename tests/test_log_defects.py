@@ -15,7 +15,7 @@ from potlp_jax.errors import LogError
 from potlp_jax.logs import writing
 from potlp_jax.logs.bag import open_bag
 from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
-from potlp_jax.logs.drive import Eyes, read_drive
+from potlp_jax.logs.drive import PanoramaReader, read_drive
 from potlp_jax.logs.inspection import inspect
 from potlp_jax.logs.log import Log, LogConfig, typestore
 from potlp_jax.logs.transforms import quaternion_of
@@ -104,9 +104,9 @@ def test_pictures_of_other_encodings_are_lost_and_counted(bags, tmp_path):
     )
     drive = read_drive(log, places_of(bags))
     assert len(drive.pictures) == len(log.pictures)
-    eyes = Eyes(drive, CAMERA)
+    reader = PanoramaReader(drive, CAMERA)
     for step in drive.pictures:  # those that are left are the right ones
-        assert np.abs(eyes.panorama(step).astype(int) - panorama_of(step)).mean() < 4
+        assert np.abs(reader.panorama(step).astype(int) - panorama_of(step)).mean() < 4
 
 
 def test_a_picture_whose_data_end_early_is_passed_over(bags, tmp_path):
@@ -116,7 +116,7 @@ def test_a_picture_whose_data_end_early_is_passed_over(bags, tmp_path):
 
     drive = drive_of(rewrite(bags, tmp_path / "x.bag", cut), places_of(bags))
     assert drive.pictures  # the header is whole
-    assert Eyes(drive, CAMERA).panorama(0) is None
+    assert PanoramaReader(drive, CAMERA).panorama(0) is None
 
 
 def test_messages_of_another_definition_are_lost_and_counted(bags, tmp_path):

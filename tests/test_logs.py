@@ -16,12 +16,12 @@ from potlp_jax.cli import app
 from potlp_jax.environments.ros.places import Places, load_places
 from potlp_jax.errors import LogError, MapError, RecordError
 from potlp_jax.learning.dataset import decode, encode, finished_shards, read_dataset, samples_file, views_file
-from potlp_jax.learning.mistake_costs import WeightBounds
 from potlp_jax.learning.questions import TaskDistribution
-from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views, settled, survey
+from potlp_jax.learning.recording import Pose, Recorder, RecordingConfig, record_views, settled, survey
+from potlp_jax.learning.sample_weights import WeightBounds
 from potlp_jax.logs import writing
 from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
-from potlp_jax.logs.drive import Eyes
+from potlp_jax.logs.drive import PanoramaReader
 from potlp_jax.logs.inspection import inspect
 from potlp_jax.logs.log import Log, LogConfig
 from potlp_jax.logs.replaying import LoggedRobot, from_first_picture, replay
@@ -34,7 +34,8 @@ from potlp_jax.task.task import Task
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import NEVER_SEEN, Outcome, belief_seen_by, load_trial
 from potlp_jax.trials.replay import panorama_at
-from potlp_jax.trials.robot import Robot, Stop
+from potlp_jax.trials.robot import Robot
+from potlp_jax.trials.rules import Stop
 from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.grid import BeliefMap, make_world
 from tests.reference.tour import (
@@ -107,7 +108,7 @@ def test_a_dataset_from_a_bag_has_the_rows_of_the_simulator(bags, tmp_path, kind
     (count,) = collect_drives([drive], places_of(bags), tmp_path, "toy", "training", config)
     views, samples = pd.read_parquet(views_file(tmp_path, 0)), pd.read_parquet(samples_file(tmp_path, 0))
 
-    recorder = Recorder(0, ViewConfig(views_per_world=200, **settings), WeightBounds.of_map(*WORLD.shape, 1.0))
+    recorder = Recorder(0, RecordingConfig(views_per_world=200, **settings), WeightBounds.of_map(*WORLD.shape, 1.0))
     rng = np.random.default_rng([0, zlib.crc32(b"training"), 0])
     pool = [TaskDistribution(TOY.propositions).draw(rng) for _ in range(2)]
     record_views(recorder, WORLD, 0, _simulated_poses(), pool, rng, lambda pose: panorama_of(pose.step))
@@ -138,11 +139,11 @@ def _plain(value):
 
 def test_panoramas_are_turned_back_into_the_frame_of_the_map(bags):
     drive = drive_of(bags / name_of(BagFormat.ROS1), places_of(bags))
-    eyes = Eyes(drive, CAMERA)
+    reader = PanoramaReader(drive, CAMERA)
     for step in (0, 5, 12, 3):  # 3: backward, too
-        difference = np.abs(eyes.panorama(step).astype(int) - panorama_of(step))
+        difference = np.abs(reader.panorama(step).astype(int) - panorama_of(step))
         assert difference.mean() < 4
-        assert np.abs(np.roll(eyes.panorama(step), 16, axis=1).astype(int) - panorama_of(step)).mean() > 6
+        assert np.abs(np.roll(reader.panorama(step), 16, axis=1).astype(int) - panorama_of(step)).mean() > 6
 
 
 # What the labels say, where the robot looks, and the grid.
@@ -199,8 +200,8 @@ def test_a_camera_that_looks_aside_is_turned_back(bags, tmp_path, source):
 
     bag = rewrite(bags, tmp_path / "x.bag", turn)
     config = LogConfig(camera_yaw=None if source == "transforms" else math.degrees(aside))
-    eyes = Eyes(drive_of(bag, places_of(bags), config), CAMERA)
-    assert np.abs(eyes.panorama(4).astype(int) - panorama_of(4)).mean() < 4
+    reader = PanoramaReader(drive_of(bag, places_of(bags), config), CAMERA)
+    assert np.abs(reader.panorama(4).astype(int) - panorama_of(4)).mean() < 4
 
 
 def test_a_picture_that_is_not_a_sphere_needs_its_field(bags, tmp_path):
@@ -210,9 +211,9 @@ def test_a_picture_that_is_not_a_sphere_needs_its_field(bags, tmp_path):
 
     bag = rewrite(bags, tmp_path / "x.bag", square)
     with pytest.raises(LogError, match=r"60 x 40 pixels is not equirectangular.*--vertical-field DEGREES"):
-        Eyes(drive_of(bag, places_of(bags)), CAMERA).panorama(0)
+        PanoramaReader(drive_of(bag, places_of(bags)), CAMERA).panorama(0)
     assert "--vertical-field" in inspect(Log(bag))["uses"]["to-dataset"]
-    shown = Eyes(drive_of(bag, places_of(bags), LogConfig(vertical_field=120.0)), CAMERA).panorama(0)
+    shown = PanoramaReader(drive_of(bag, places_of(bags), LogConfig(vertical_field=120.0)), CAMERA).panorama(0)
     assert shown.shape == (16, 64, 3)
 
 
@@ -398,7 +399,7 @@ def test_a_robot_that_looks_stops_where_there_is_a_picture(bags):
     assert sorted(drive.pictures) == [0, 7, 15]
     seen = first_seen_along(WORLD, tour())
     np.testing.assert_array_equal(drive.first_seen, np.where(seen == NEVER_SEEN, seen, np.maximum(seen - 2, 0)))
-    robot = LoggedRobot(drive, Eyes(drive, CAMERA))
+    robot = LoggedRobot(drive, PanoramaReader(drive, CAMERA))
     assert isinstance(robot, Robot)
     path = KnownPath(
         cells=jnp.asarray([tour()[2], tour()[2]], jnp.int32),

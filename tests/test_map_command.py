@@ -16,10 +16,11 @@ from typer.testing import CliRunner
 
 from potlp_jax.cli import app
 from potlp_jax.environments.registry import make
+from potlp_jax.environments.ros.cleaning import clean_map
 from potlp_jax.environments.ros.map_files import load_map
 from potlp_jax.environments.ros.map_writer import save_map
 from potlp_jax.environments.ros.places import Disc, Places, Polygon, load_places, save_places
-from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig, clean_map
+from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig
 from potlp_jax.environments.ros.survey import find_passages, survey_map
 from potlp_jax.errors import MapError, MapWarning
 from potlp_jax.view.map_preview import OBSTACLE, REACHED, UNREACHED, draw_map, draw_places

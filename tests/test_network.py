@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from potlp_jax.errors import NetworkError
+from potlp_jax.codec import config_from_dict, json_copy
+from potlp_jax.errors import ConfigurationError, NetworkError
 from potlp_jax.learning.network import STRIDE, EstimatorNetwork, NetworkConfig, operation_counts, parameter_count
 
 CONFIG = NetworkConfig(
@@ -209,9 +210,11 @@ def test_operations_and_parameters_counted_by_hand():
 
 
 def test_configuration_survives_json():
-    assert NetworkConfig.from_json(CONFIG.to_json()) == CONFIG
-    with pytest.raises(NetworkError, match="step"):
-        NetworkConfig.from_json({name: value for name, value in CONFIG.to_json().items() if name != "step"})
+    data = json_copy(dataclasses.asdict(CONFIG))
+    assert config_from_dict(NetworkConfig, data, "network") == CONFIG
+    del data["step"]
+    with pytest.raises(ConfigurationError, match="network: step is missing"):
+        config_from_dict(NetworkConfig, data, "network")
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 
+from potlp_jax.codec import with_settings
 from potlp_jax.environments.campus.delivery import Delivery
 from potlp_jax.environments.campus.furnishing import PARCELS, Floor, FurnishConfig, Kind, furnish
 from potlp_jax.environments.registry import make
@@ -20,7 +21,7 @@ from potlp_jax.environments.splits import world_key
 from potlp_jax.errors import MapError, MapWarning, SpecificationError, WorldError
 from potlp_jax.sweep.specification import specification_from_dict
 from potlp_jax.task.task import Task
-from potlp_jax.trials.config import TrialConfig, trial_config_for, with_settings
+from potlp_jax.trials.config import TrialConfig, trial_config_for
 from tests.reference.map_files import drawn, p5, write_map
 
 # Three rooms above a hallway; a sign is half a metre.

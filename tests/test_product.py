@@ -12,7 +12,7 @@ from potlp_jax import Task
 from potlp_jax.planning.distances.paths import shortest_path
 from potlp_jax.planning.distances.portals import CAPACITY, find_active_cells, portals_pay
 from potlp_jax.planning.distances.product import (
-    LANES,
+    SOURCES_AT_ONCE,
     distance_table,
     grid_distances,
     one_letter_successors,
@@ -183,12 +183,12 @@ def test_unreachable_target_gives_an_empty_path():
     assert np.asarray(path.cells).tolist() == [[0, 0]] * 5
 
 
-def test_more_sources_than_lanes_keep_their_order():
+def test_more_sources_than_are_solved_at_once_keep_their_order():
     rng = np.random.default_rng(3)
     free = rng.random(SHAPE) > 0.2
     arrays = tasks["F a & F b"].padded(SIZES)
     letters = np.where(free, rng.integers(0, 4, SHAPE), 0).astype(np.int32)
-    count = 2 * LANES + 3
+    count = 2 * SOURCES_AT_ONCE + 3
     cells = np.argwhere(free)[:count].astype(np.int32)
     states = np.where(np.arange(count) % 3 == 0, NO_STATE, np.arange(count) % 3).astype(np.int32)
     transitions = jax.jit(product_transitions)(arrays, jnp.asarray(letters), jnp.asarray(free))

@@ -10,9 +10,10 @@ import pytest
 import yaml
 from matplotlib.path import Path as Outline
 
+from potlp_jax.environments.ros.cleaning import clean_map
 from potlp_jax.environments.ros.map_files import GridFrame, load_map
 from potlp_jax.environments.ros.places import Disc, Places
-from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig, clean_map
+from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig
 from potlp_jax.errors import MapError, MapWarning
 from tests.reference.map_files import p5, png, write_map
 

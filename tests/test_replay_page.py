@@ -30,7 +30,7 @@ def trial():
     toy = make("toy")
     task = Task.from_formula(toy.tasks["2"], propositions=toy.propositions)
     walked = run_trial(toy.generate(world_key("validation", 1, "toy")), task, Policy.BASELINE, jax.random.key(0), NEAR)
-    first = dataclasses.replace(walked.decisions[0], looks=(0,) * len(walked.decisions[0].subgoals))
+    first = dataclasses.replace(walked.decisions[0], observations=(0,) * len(walked.decisions[0].subgoals))
     return dataclasses.replace(walked, decisions=(first, *walked.decisions[1:]))
 
 
@@ -73,7 +73,7 @@ def test_the_page_needs_nothing_from_elsewhere(trial, panoramas):
 
 def test_view_writes_the_page_beside_the_record(trial, tmp_path):
     blind = dataclasses.replace(
-        trial, decisions=tuple(dataclasses.replace(decision, looks=()) for decision in trial.decisions)
+        trial, decisions=tuple(dataclasses.replace(decision, observations=()) for decision in trial.decisions)
     )
     blind.save(tmp_path / "trial.json")
     told = CliRunner().invoke(app, ["view", str(tmp_path), "--no-open"])

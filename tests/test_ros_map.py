@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from potlp_jax.environments.ros.cleaning import clean_map
 from potlp_jax.environments.ros.map_files import load_map
 from potlp_jax.environments.ros.places import Disc, Places
-from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig, clean_map, parse_spec
+from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig, parse_spec
 from potlp_jax.errors import MapError
 from tests.reference.map_files import PLACES, TWO_ROOMS, drawn, occupancy_map, p5, write_map
 

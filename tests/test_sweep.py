@@ -20,7 +20,7 @@ from eval.savings import decisions_of
 from potlp_jax.cli import app
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
-from potlp_jax.errors import SpecificationError, StoreError
+from potlp_jax.errors import ConfigurationError, StoreError
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.rows import path_text, read_path
 from potlp_jax.sweep.runner import RESULTS, Sweep, run_sweep
@@ -89,8 +89,8 @@ def test_settings_reach_every_depth():
         ({"settings": {"replan": 3}}, "settings: unknown field 'replan'"),
         ({"settings": {"decision": {"search": {"simulations": "many"}}}}, "settings.decision.search.simulations"),
         ({"settings": {"decision": {"frontiers": {"max_subgoals": 0}}}}, "settings.decision.frontiers: .*at least 1"),
-        ({"settings": {"revealed": 1}}, "settings.revealed: give a bool"),
-        ({"settings": {"decision": {"search": {"mode": "guess"}}}}, "settings.decision.search.mode: choose from"),
+        ({"settings": {"revealed": 1}}, "settings.revealed: give true or false, found 1"),
+        ({"settings": {"decision": {"search": {"mode": "guess"}}}}, "settings.decision.search.mode: give '"),
     ],
 )
 def test_wrong_entries_are_named(changes, message):
@@ -101,7 +101,7 @@ def test_wrong_entries_are_named(changes, message):
 def test_files_that_are_no_specification_are_named(tmp_path):
     for text, message in (("[1, 2", "not YAML"), ("- a", "give a mapping"), ("worlds: 3", "environments is missing")):
         (tmp_path / "sweep.yaml").write_text(text)
-        with pytest.raises(SpecificationError, match=rf"sweep\.yaml: .*{message}"):
+        with pytest.raises(ConfigurationError, match=rf"sweep\.yaml: .*{message}"):
             read_specification(tmp_path / "sweep.yaml")
 
 

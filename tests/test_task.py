@@ -225,3 +225,11 @@ def test_describe_is_json_and_readable():
 def test_describe_where_there_is_nothing_to_do():
     assert Task.from_formula("1").describe()["transitions"] == [{"from": 0, "to": 0, "guard": "true"}]
     assert Task.from_formula("F a", max_positive_literals=1).describe()["max_positive_literals"] == 1
+
+
+def test_a_formula_that_ships_over_more_propositions_is_compiled_over_those_given():
+    task = Task.of_formula("!fire U exit", ["fire", "exit"])
+    assert task.propositions == ("fire", "exit")
+    # Letters: nothing, fire, exit, both. States in the order in which letters lead there: search, fire, exit.
+    assert task.dfa.transitions.tolist() == [[0, 1, 2, 2], [1, 1, 1, 1], [2, 2, 2, 2]]
+    assert task.dfa.accepting.tolist() == [False, False, True]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from eval.formulas import random_tasks
+from potlp_jax.codec import config_from_dict
 from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import RecordError
@@ -17,12 +18,12 @@ from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning import policies
 from potlp_jax.planning.policies import DecisionConfig, MoveKind, Policy, decide
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig
 from potlp_jax.task.task import Task, TaskSizes
 from potlp_jax.trials import loop as trial_module
 from potlp_jax.trials import robot
-from potlp_jax.trials.config import TrialConfig, trial_config_from_dict
-from potlp_jax.trials.loop import Loop, run_trial
+from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import Outcome, load_trial
 from potlp_jax.trials.replay import replay_decision
 from potlp_jax.trials.robot import Leg, SimulatedRobot
@@ -142,7 +143,7 @@ def test_the_same_key_gives_the_same_trial_and_records_round_trip(tmp_path):
     first.save(tmp_path / "trial.json")
     loaded = load_trial(tmp_path / "trial.json")
     assert json.dumps(loaded.to_dict()) == json.dumps(first.to_dict())
-    assert trial_config_from_dict(loaded.config) == CONFIG
+    assert config_from_dict(TrialConfig, loaded.config, "trial record") == CONFIG
 
 
 def test_a_decision_is_replayed_from_its_record():
@@ -317,12 +318,14 @@ def test_a_robot_that_goes_elsewhere_is_on_its_way_to_nothing():
 
     for follower, stays in ((StayingRobot(), True), (robot, False)):
         estimator = TrueMapEstimator(world=world)
-        loop = Loop(follower, task, task.padded(SIZES), Policy.ORACLE, estimator, jax.random.key(0), CONFIG)
+        loop = trial_module._Loop(
+            follower, task, task.padded(SIZES), Policy.ORACLE, estimator, jax.random.key(0), CONFIG
+        )
         move = loop._decide(*robot.observe())
-        assert int(move.intention.state) == int(task.dfa.transitions[task.dfa.initial, loop.word[0]])
+        assert int(move.intention.state) == int(loop._tally.state)
         loop._advance(robot.observe()[0], move)
         expected = NO_STATE if stays else int(move.intention.state)
-        assert int(loop._intention.state) == expected
+        assert int(loop._tally.intention.state) == expected
 
 
 def test_an_oracle_without_estimator_is_refused():

@@ -16,7 +16,6 @@ and the batch, with the exponents of a fit in double-logarithmic scale. Writes J
 
 import argparse
 import functools
-import importlib.util
 import json
 import platform
 import statistics
@@ -31,9 +30,10 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 
+from eval.bench.opponents import installed
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions, search
-from potlp_jax.planning.search.graph import SearchConfig, SearchMode
+from potlp_jax.planning.search.config import SearchConfig, UctConfig
 from potlp_jax.task.task import Task
 
 mpl.use("Agg")
@@ -125,9 +125,11 @@ def problem_batch(goals: int, subgoals: int, batch: int) -> PlanningProblem:
     )
 
 
-def kernel(problems: PlanningProblem, simulations: int, **settings: Any) -> Prepared:
-    """The batched kernel."""
-    config = SearchConfig(simulations=simulations, **settings)
+def kernel(
+    problems: PlanningProblem, simulations: int, kind: type[SearchConfig | UctConfig] = SearchConfig
+) -> Prepared:
+    """The batched search of one kind, with its other settings by default."""
+    config = kind(simulations=simulations)
 
     def run(problems, keys):
         plan, tree = search(problems, keys, config)
@@ -231,12 +233,11 @@ def _pomdp_py(problems: PlanningProblem, simulations: int) -> Prepared:
 PROGRAMS: dict[str, Callable[[PlanningProblem, int], Prepared]] = {
     "search": kernel,
     "vmap(plan_actions)": under_vmap,
-    "search, authors_code": functools.partial(kernel, mode=SearchMode.AUTHORS_CODE, exploration=50.0),
+    "search, uct": functools.partial(kernel, kind=UctConfig),
     "mctx": mctx,
     "pomdp-py": _pomdp_py,
     "numba": _numba,
 }
-NEEDS = {"numba": ["numba"], "pomdp-py": ["numba", "pomdp_py"], "mctx": ["mctx"]}
 MOST_ROWS = {"mctx": 64, "pomdp-py": 1, "numba": 1}
 """Batches beyond which a program is not asked: one tree at a time, or more than its rate is worth waiting for."""
 
@@ -332,11 +333,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parsed = parser.parse_args(arguments)
     if parsed.quick:
         parsed.batches, parsed.simulations, parsed.repeats = [1, 16], 100, 1
-    for name in list(parsed.programs):
-        missing = [module for module in NEEDS.get(name, ()) if importlib.util.find_spec(module) is None]
-        if missing:
-            print(f"{name} is left out: {', '.join(missing)} is not installed (extra 'bench')")
-            parsed.programs.remove(name)
+    parsed.programs = installed(parsed.programs)
     return parsed
 
 

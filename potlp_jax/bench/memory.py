@@ -7,7 +7,7 @@ import jax
 
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import search_tree
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig, UctConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,18 +33,22 @@ class TreeMemory:
         return self.total / self.nodes
 
 
-def tree_memory(problem: PlanningProblem, config: SearchConfig) -> TreeMemory:
+def tree_memory(problem: PlanningProblem, config: SearchConfig | UctConfig) -> TreeMemory:
     """Memory of the tree that searching one problem of this shape with this configuration fills.
 
     Args:
       problem: an unbatched problem; only its shapes matter.
       config: settings of the search; ``simulations`` and ``tree_capacity`` decide.
+
+    Returns:
+      Bytes by array.
     """
 
     def fields_of_tree(problem: PlanningProblem) -> dict[str, jax.Array]:
         _, tree = search_tree(problem, jax.random.key(0), config)
         return {field.name: getattr(tree, field.name) for field in dataclasses.fields(tree)}
 
+    # Shapes are followed through the search without running it. The key needs no values either.
     fields = jax.eval_shape(fields_of_tree, problem)
     arrays = {name: math.prod(field.shape) * field.dtype.itemsize for name, field in fields.items()}
     return TreeMemory(arrays=arrays, nodes=config.capacity)

@@ -23,14 +23,14 @@ from potlp_jax.planning.estimates import Estimator, ask
 from potlp_jax.planning.policies import DecisionConfig, Move, Policy, Situation, assess, decide, planning_problem
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions, search
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.types import NO_STATE
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.sensing import SensorConfig, observe
 
-LOOKS: int = 3
-"""Places from which a scene has been observed: enough for several frontiers, few enough to leave most unknown."""
+OBSERVATIONS: int = 3
+"""Cells from which a scene has been observed: enough for several frontiers, few enough to leave most unknown."""
 
 
 @struct.dataclass(kw_only=True)
@@ -52,14 +52,27 @@ class Scene:
     estimator: Estimator
 
 
-def make_scene(world: World, task: Task, sensor: SensorConfig = SensorConfig(), looks: int = LOOKS) -> Scene:
-    """A scene in a world: observed from the start, then each time from the farthest cell that known space reaches."""
+def make_scene(
+    world: World, task: Task, sensor: SensorConfig = SensorConfig(), observations: int = OBSERVATIONS
+) -> Scene:
+    """A scene in a world: observed from the start, then each time from the farthest cell that known space reaches.
+
+    Args:
+        world: the truth.
+        task: of the world's propositions.
+        sensor: with which the robot observes.
+        observations: how many there are, at least 1.
+
+    Returns:
+        The robot at the cell of the last observation, the automaton in the state after that cell's letter.
+    """
     belief, cell = observe(BeliefMap.unobserved(world), world, world.start, sensor), world.start
-    for _ in range(looks - 1):
-        way = np.asarray(grid_distances(belief.free, cell, belief.resolution))
-        farthest = np.unravel_index(np.argmax(np.where(np.isfinite(way), way, -1.0)), way.shape)
+    for _ in range(observations - 1):
+        cost = np.asarray(grid_distances(belief.free, cell, belief.resolution))
+        farthest = np.unravel_index(np.argmax(np.where(np.isfinite(cost), cost, -1.0)), cost.shape)
         cell = jnp.asarray(farthest, jnp.int32)
         belief = observe(belief, world, cell, sensor)
+    # The word up to here is left out: only where the robot stands matters to what a decision takes.
     letter = int(belief.letters[cell[0], cell[1]])
     return Scene(
         belief=belief,
@@ -71,13 +84,32 @@ def make_scene(world: World, task: Task, sensor: SensorConfig = SensorConfig(), 
 
 
 def make_world(environment: str, size: int, index: int = 0) -> World:
-    """World ``index`` of the validation split; ``size`` is the side of a floor of ``rooms`` and ignored elsewhere."""
+    """A world of the validation split.
+
+    Args:
+        environment: a registered name.
+        size: side of a floor of ``rooms`` in cells; other environments ignore it.
+        index: number of the world in its split.
+
+    Returns:
+        The world.
+    """
+    # Validation, so that measuring never opens a world of the test split.
     generator = Rooms(RoomsConfig(smallest=size, largest=size)) if environment == "rooms" else make(environment)
     return generator.generate(world_key(Split.VALIDATION, index, generator.name))
 
 
 def family_batch(family: str, subgoals: int, count: int) -> PlanningProblem:
-    """The first tuning problems of a benchmark family, stacked along a leading axis."""
+    """The first tuning problems of a benchmark family, stacked along a leading axis.
+
+    Args:
+        family: a key of ``problems.FAMILIES``.
+        subgoals: S of each.
+        count: how many.
+
+    Returns:
+        The problems, each field with the leading axis ``count``.
+    """
     problems = [family_problem(family, subgoals, "tuning", index) for index in range(count)]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems)
 
@@ -106,11 +138,24 @@ class SearchRow:
 
 
 def measure_search(family: str, subgoals: int, batch: int, config: SearchConfig, repeats: int) -> SearchRow:
-    """Search the first ``batch`` tuning problems of a family in lockstep."""
+    """Search the first tuning problems of a family in lockstep.
+
+    Args:
+        family: a key of ``problems.FAMILIES``.
+        subgoals: S of each problem.
+        batch: number of problems.
+        config: settings of the search.
+        repeats: timed runs.
+
+    Returns:
+        Shapes, memory and times.
+    """
+    # The kernel takes a leading batch axis, so the batch is searched as ``vmap`` would have it.
     problems, keys = family_batch(family, subgoals, batch), jax.random.split(jax.random.key(0), batch)
     tree_bytes = tree_memory(family_problem(family, subgoals, "tuning", 0), config).total
     call = compile_call(search, problems, keys, config, static_argnums=2)
     timing = call.timing(repeats)
+    # Searches end early where nothing is left to decide, so the rate is by simulations that were run.
     _, tree = call.run()
     simulations = int(np.asarray(tree.simulations).sum())
     return SearchRow(
@@ -140,7 +185,10 @@ def mean_depth(steps: ArrayLike | None, simulations: ArrayLike) -> float | None:
 
 @dataclasses.dataclass(frozen=True)
 class DistanceRow:
-    """Shortest ways from ``sources`` product states to every cell in every state."""
+    """Shortest paths from ``sources`` product states to every cell in every state.
+
+    ``reached`` is the share of product states that the average source reaches.
+    """
 
     height: int
     width: int
@@ -154,13 +202,20 @@ class DistanceRow:
 def measure_distances(scene: Scene, sources: int, repeats: int) -> DistanceRow:
     """Distances on the true map of the scene, from the robot and cells drawn at random, in its state.
 
-    ``reached`` is the share of product states that the average source reaches.
+    Args:
+        scene: a scene with the true map's estimator.
+        sources: number of cells, the robot's included.
+        repeats: timed runs.
+
+    Returns:
+        Sizes and times.
     """
     world = world_of(scene)
     known = BeliefMap.revealed(world)
     moves = product_transitions(scene.task, known.letters, known.free)
     # As in a decision: nothing is left to do after acceptance.
     transitions = jnp.where(scene.task.accepting[None, None, :], NO_STATE, moves)
+    # Sources that reach nothing would be solved at once and make the mean look good.
     reachable = np.isfinite(np.asarray(grid_distances(known.free, scene.cell, known.resolution)))
     cells = _spread(reachable, np.asarray(scene.cell), sources)
     states = jnp.broadcast_to(scene.state, (sources,))
@@ -179,8 +234,9 @@ def measure_distances(scene: Scene, sources: int, repeats: int) -> DistanceRow:
     )
 
 
-def _spread(mask: Bool[np.ndarray, "H W"], first: Int32[np.ndarray, "2"], count: int) -> Int32[np.ndarray, "count 2"]:
+def _spread(mask: Bool[np.ndarray, "H W"], first: Int32[np.ndarray, "2"], count: int) -> Int32[np.ndarray, "N 2"]:
     """``first`` and cells drawn evenly, always the same, from those where the mask is True."""
+    # Row-major order and a fixed seed: two versions of the library solve the same sources.
     cells = np.argwhere(mask)
     drawn = np.random.default_rng(0).integers(len(cells), size=count - 1)
     return np.concatenate([first[None], cells[drawn]]).astype(np.int32)
@@ -211,6 +267,7 @@ class Phases:
 
     def measure(self, name: str, function: Callable[..., Any], *arguments: Any) -> Any:
         """Add a row for the phase and return what it computes."""
+        # Arguments that are configuration are closed over by ``function``, so everything here is an array.
         call = compile_call(function, *arguments)
         timing = call.timing(self._repeats)
         self.rows.append(PhaseRow(phase=name, per_s=1.0 / timing.run_s, timing=timing))
@@ -225,8 +282,17 @@ def measure_decision(
     * assess: distances from the robot, frontiers, subgoals
     * estimates: the answers of the scene's estimator (the true map's) for every subgoal and outcome class
     * travel: distances between subgoals, as a planning problem
-    * search: PO-UCT
-    * path: the way to the target
+    * search: graph search over histories
+    * path: through known space to the target
+
+    Args:
+        scene: where the robot is, and who answers.
+        config: settings of the decision.
+        repeats: timed runs of each phase.
+        policy: whose decision the whole is; the phases are the same for all that search.
+
+    Returns:
+        A row for each phase, then one for the whole. Phases are programs of their own, so they add up to more.
     """
     key = jax.random.key(0)
     phases = Phases(repeats)
@@ -252,25 +318,30 @@ def measure_decision(
     )
     phases.measure("search", lambda problem, key: plan_actions(problem, key, config.search), problem, key)
 
-    def whole(scene: Scene, key: Array) -> Move:
-        return decide(
-            scene.belief,
-            scene.cell,
-            scene.state,
-            scene.task,
-            scene.estimator,
-            key,
-            policy=policy,
-            config=config,
-        )
-
-    move = phases.measure("whole", whole, scene, key)
+    # One program, in which XLA may share work between phases that the rows above count twice. The path's target is the
+    # whole decision's, so the whole is measured before the last phase and reported after it.
+    move = phases.measure("whole", lambda scene, key: _decide(scene, key, policy, config), scene, key)
     phases.measure("path", lambda situation, move: _path(situation, move, config), situation, move)
     *parts, all_of_it, path = phases.rows
     return [*parts, path, all_of_it]
 
 
+def _decide(scene: Scene, key: Array, policy: Policy, config: DecisionConfig) -> Move:
+    """The whole decision in a scene."""
+    return decide(
+        scene.belief,
+        scene.cell,
+        scene.state,
+        scene.task,
+        scene.estimator,
+        key,
+        policy=policy,
+        config=config,
+    )
+
+
 def _path(situation: Situation, move: Move, config: DecisionConfig) -> Any:
+    """The last phase: from the robot to the move's target."""
     return shortest_path(
         situation.distances,
         situation.transitions,
@@ -286,5 +357,6 @@ def _path(situation: Situation, move: Move, config: DecisionConfig) -> Any:
 
 def as_dict(row: SearchRow | DistanceRow | PhaseRow) -> dict[str, Any]:
     """A row, JSON-able, its timing flattened into it."""
+    # Rows have no field in common with ``Timing``.
     fields = {field.name: getattr(row, field.name) for field in dataclasses.fields(row) if field.name != "timing"}
     return {**fields, **row.timing.as_dict()}

@@ -1,10 +1,11 @@
 """Benchmark problems for planners: eight families of tasks on random maps, as many instances as wanted.
 
 An instance is a map about 100 cells on a side, with the robot, S subgoals and sometimes a few labelled cells on it.
-Places are joined by paths of octile length times a random detour, closed under shortest paths, so travel is a metric.
-Travel and finish costs are shortest paths in the product of the places and the task's automaton: the path between two
-places reads empty letters, arriving reads the place's own letter, which is empty at most subgoals. Estimates look like
-those of a trained estimator: a share of them, which differs from map to map, is confident, mostly of failure.
+These locations are joined by paths of octile length times a random detour, closed under shortest paths, so travel is a
+metric. Travel and finish costs are shortest paths in the product of the locations and the task's automaton: the path
+between two locations reads empty letters, arriving reads the location's own letter, which is empty at most subgoals.
+Estimates look like those of a trained estimator: a share of them, which differs from map to map, is confident, mostly
+of failure.
 
 Everything follows from (family, S, split, index); tuning and test instances are drawn from different seeds, and in
 the random family from different tasks. All problems of one family and S have arrays of the same shapes.
@@ -31,12 +32,26 @@ SUBGOAL_COUNTS: tuple[int, ...] = (1, 2, 4, 6, 8)
 """Numbers of subgoals that the benchmark reports."""
 
 DEAD_END_COST: float = 500.0
+"""Cost of a dead end in every problem, in cells; the map's diagonal is 141."""
 
 _SIDE = 100.0
+"""Side of the map in cells."""
 _LARGEST_DETOUR = 1.8
+"""Length of a path, of that across an empty map, at most."""
 _MOST_LABELLED = 2
+"""Labelled cells of a problem that has any, at most."""
 _FARTHEST_LABELLED = 100.0
+"""How far off the other locations a labelled cell may lie: going there can be a bad choice."""
 
+# Chances in the drawing of problems and estimates. Changing one changes every published figure of the benchmark.
+_CHANCE_LABELLED_CELLS = 0.3
+_CHANCE_LABELLED_SUBGOAL = 0.25
+_CHANCE_OTHER_START = 0.2
+_CHANCE_IMPOSSIBLE = 0.05
+_MOST_CONFIDENT = 0.7
+_CHANCE_CONFIDENT_SUCCESS = 0.15
+
+# Transitions whose guard needs several cubes: b or c together with a, two of three, one without another.
 _SEVERAL_CUBES = (
     "F(a & (b | c))",
     "F((a | b) & X(b | c))",
@@ -47,6 +62,7 @@ _SEVERAL_CUBES = (
     "(!a U (b | c)) & F a",
 )
 
+# The text of a formula is what the golden problems are known by, so the brackets stay as the generator wrote them.
 # Drawn at random, the first six of each number of states from 2 to 8 that ask the robot to look for something.
 _RANDOM = (
     "F((((b) | (c))) & F(((b) M (b))))",
@@ -117,17 +133,21 @@ class Family:
 
     def formula(self, split: Split, index: int) -> str:
         """The task of an instance."""
+        # Every second formula belongs to the test split, so that both have automata of every size.
         own = self.formulas[get_args(Split).index(split) :: 2] if self.disjoint_tasks else self.formulas
         return own[index % len(own)]
 
 
 _FIREFIGHTING = Firefighting.tasks["1"]
 
+# Sizes are (states, propositions, edges, classes, compound conditions, cubes): exact for families of one task, the
+# largest of each for the others, so that one compiled program serves the whole family.
 FAMILIES: Mapping[str, Family] = MappingProxyType(
     {
         family.name: family
         for family in (
             Family("find", ("F g",), ("g",), TaskSizes(2, 1, 1, 1, 0, 1)),
+            # No cell holds two of the three things, so edges that would need one do not exist; in -joint they do.
             Family("three-single", ("F a & F b & F c",), ("a", "b", "c"), TaskSizes(8, 3, 12, 12, 0, 1), 1),
             Family("three-joint", ("F a & F b & F c",), ("a", "b", "c"), TaskSizes(8, 3, 19, 19, 0, 1)),
             Family("two", ("F a & F b",), ("a", "b"), TaskSizes(4, 2, 5, 5, 0, 1)),
@@ -144,7 +164,7 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
 * firefighting: task 1 of the fire-fighting building (Bradley et al. 2021, section V-A)
 * reuse: what was found once is needed again
 * random: co-safe formulas whose automata have 2 to 8 states
-* cubes: transitions that come about in several ways
+* cubes: transitions that have several cubes
 """
 
 
@@ -157,6 +177,9 @@ def family_problem(family: str, subgoals: int, split: Split, index: int) -> Plan
         split: "tuning" or "test".
         index: number of the instance, from 0.
 
+    Returns:
+        The problem; every problem of the family and S has its shapes.
+
     Raises:
         ValueError: no such family or split, no subgoal, or a negative index.
     """
@@ -168,7 +191,9 @@ def family_problem(family: str, subgoals: int, split: Split, index: int) -> Plan
         raise ValueError(f"subgoals is {subgoals} and index {index}: they must be at least 1 and 0")
     spec = FAMILIES[family]
     task, arrays = _compile(spec, spec.formula(split, index))
+    # A checksum and not ``hash``, which differs from process to process.
     rng = np.random.default_rng([zlib.crc32(f"{family}/{split}".encode()), subgoals, index])
+    # The order of drawing is part of the definition: geometry, estimates, start.
     problem = PlanningProblem.from_arrays(
         arrays,
         **_geometry(task, spec.sizes, subgoals, rng),
@@ -181,17 +206,19 @@ def family_problem(family: str, subgoals: int, split: Split, index: int) -> Plan
     return problem
 
 
-def random_metric(places: int, rng: np.random.Generator) -> Float64[np.ndarray, "N N"]:
-    """Shortest paths between random places of the map: symmetric, 0 on the diagonal only, triangle inequality."""
-    points = rng.uniform(0.0, _SIDE, (places, 2))
+def random_metric(locations: int, rng: np.random.Generator) -> Float64[np.ndarray, "N N"]:
+    """Shortest paths between random locations on the map: symmetric, 0 on the diagonal only, triangle inequality."""
+    points = rng.uniform(0.0, _SIDE, (locations, 2))
     offset = np.abs(points[:, None] - points[None])
     octile = offset.max(axis=-1) + (DIAGONAL - 1.0) * offset.min(axis=-1)
+    # One detour for both directions; the shortest paths through other locations restore the triangle inequality.
     detour = np.triu(rng.uniform(1.0, _LARGEST_DETOUR, octile.shape), 1)
     return _shortest(np.maximum(octile, 1.0) * (detour + detour.T))
 
 
 @cache
 def _compile(family: Family, formula: str) -> tuple[Task, TaskArrays]:
+    """A family's task and its padded arrays: compiled once, since Spot takes longer than drawing a problem."""
     task = Task.from_formula(formula, family.propositions, family.max_positive_literals)
     return task, task.padded(family.sizes)
 
@@ -200,11 +227,12 @@ def _start_state(task: Task, rng: np.random.Generator) -> int:
     """The automaton's state after empty letters; now and then another one from which something can be tried."""
     first = int(_after_empty_letters(task)[task.dfa.initial])
     others = np.setdiff1d(task.edges[:, 0], [first])
-    return int(rng.choice(others)) if rng.random() < 0.2 and len(others) else first
+    return int(rng.choice(others)) if rng.random() < _CHANCE_OTHER_START and len(others) else first
 
 
 def _after_empty_letters(task: Task) -> Int32[np.ndarray, " Z"]:
     """State after as many empty letters as there are states: a path through free space is longer than that."""
+    # Without cycles under the empty letter (as for F, U and X) the state has come to rest by then.
     state = np.arange(task.dfa.num_states, dtype=np.int32)
     for _ in range(task.dfa.num_states):
         state = task.dfa.transitions[state, 0]
@@ -212,23 +240,27 @@ def _after_empty_letters(task: Task) -> Int32[np.ndarray, " Z"]:
 
 
 def _geometry(task: Task, sizes: TaskSizes, subgoals: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """``travel`` and ``finish``: shortest paths in the product of places and automaton.
+    """``travel`` and ``finish``: shortest paths in the product of locations and automaton.
 
-    Nodes are subgoals, robot, labelled cells. Labelled cells lie off the map's middle, each at the end of a path of its
-    own.
+    Locations are subgoals, robot, labelled cells, in this order. Labelled cells lie off the map's middle, each at the
+    end of a path of its own.
     """
     dfa, states, robot = task.dfa, task.dfa.num_states, subgoals
-    labelled = int(rng.integers(1, _MOST_LABELLED + 1)) if rng.random() < 0.3 else 0
+    labelled = int(rng.integers(1, _MOST_LABELLED + 1)) if rng.random() < _CHANCE_LABELLED_CELLS else 0
     path_cost = random_metric(subgoals + 1 + labelled, rng)
     aside = np.concatenate([np.zeros(subgoals + 1), rng.uniform(0.0, _FARTHEST_LABELLED, labelled)])
     path_cost = np.where(np.eye(len(path_cost), dtype=bool), 0.0, path_cost + aside[:, None] + aside[None, :])
-    letters = _place_letters(task, subgoals, labelled, rng)
+    letters = _location_letters(task, subgoals, labelled, rng)
+    # Arriving reads the empty letters of the path, then the location's own.
     arrive = dfa.transitions[_after_empty_letters(task)][:, letters].T
     cost = _shortest(_product_moves(path_cost, arrive, dfa.trap))
 
+    # A path from beyond a subgoal re-enters the subgoal's cell and reads its letter (docs/model.md section 5); one from
+    # the robot's cell does not, its letter has been read.
     entered = dfa.transitions[:, letters].T
     start = np.where(np.arange(len(path_cost))[:, None] == robot, np.arange(states)[None, :], entered)[: subgoals + 1]
     begins = cost.reshape(len(path_cost), states, len(path_cost), states)[np.arange(subgoals + 1)[:, None], start]
+    # Entering the cell again may itself violate the task: then nothing can be reached from there.
     begins[dfa.trap[start]] = np.inf
     travel = np.full((subgoals + 1, sizes.states, subgoals, sizes.states), np.inf)
     travel[:, :states, :, :states] = begins[:, :, :subgoals]
@@ -237,28 +269,30 @@ def _geometry(task: Task, sizes: TaskSizes, subgoals: int, rng: np.random.Genera
     return {"travel": travel, "finish": finish}
 
 
-def _place_letters(task: Task, subgoals: int, labels: int, rng: np.random.Generator) -> Int32[np.ndarray, " N"]:
+def _location_letters(task: Task, subgoals: int, labels: int, rng: np.random.Generator) -> Int32[np.ndarray, " N"]:
     """One proposition at each labelled cell; in every fourth problem one at a subgoal, unless that alone satisfies
     the task."""
     letters = 1 << rng.integers(0, len(task.propositions), subgoals + 1 + labels, dtype=np.int32)
-    chosen = int(rng.integers(0, subgoals)) if rng.random() < 0.25 else subgoals
+    chosen = int(rng.integers(0, subgoals)) if rng.random() < _CHANCE_LABELLED_SUBGOAL else subgoals
+    # A subgoal that satisfies the task where it stands would leave nothing to plan.
     satisfies = task.dfa.accepting[task.dfa.transitions[:, letters[chosen]]] & ~task.dfa.accepting
-    place = np.arange(len(letters))
-    labelled = (place > subgoals) | ((place == chosen) & (chosen < subgoals) & ~satisfies.any())
+    # Location ``subgoals`` is the robot's; chosen, it stands for no labelled subgoal.
+    location = np.arange(len(letters))
+    labelled = (location > subgoals) | ((location == chosen) & (chosen < subgoals) & ~satisfies.any())
     return np.where(labelled, letters, 0).astype(np.int32)
 
 
 def _product_moves(
     path_cost: Float64[np.ndarray, "N N"], arrive: Int32[np.ndarray, "N Z"], trap: np.ndarray
 ) -> Float64[np.ndarray, "NZ NZ"]:
-    """Cost of going straight from one (place, state) to another; ``arrive[v, z]`` is the state in which v is reached
+    """Cost of going straight from one (location, state) to another; ``arrive[v, z]`` is the state in which v is reached
     from state z. No path leads into a trap."""
-    places, states = arrive.shape
-    moves = np.full((places, states, places, states), np.inf)
-    for to, state in np.ndindex(places, states):
+    locations, states = arrive.shape
+    moves = np.full((locations, states, locations, states), np.inf)
+    for to, state in np.ndindex(locations, states):
         if not trap[state] and not trap[arrive[to, state]]:
-            moves[:, state, to, arrive[to, state]] = np.where(np.arange(places) == to, np.inf, path_cost[:, to])
-    return moves.reshape(places * states, places * states)
+            moves[:, state, to, arrive[to, state]] = np.where(np.arange(locations) == to, np.inf, path_cost[:, to])
+    return moves.reshape(locations * states, locations * states)
 
 
 def _shortest(cost: Float64[np.ndarray, "N N"]) -> Float64[np.ndarray, "N N"]:
@@ -272,12 +306,17 @@ def _shortest(cost: Float64[np.ndarray, "N N"]) -> Float64[np.ndarray, "N N"]:
 def _estimates(task: Task, sizes: TaskSizes, subgoals: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """P_S, R_S and R_F. What implies more is less likely and lies farther away."""
     shape = (subgoals, task.sizes.classes)
-    confident = rng.random(shape) < rng.uniform(0.0, 0.7)
-    extreme = np.where(rng.random(shape) < 0.15, rng.uniform(0.9, 0.995, shape), rng.uniform(0.005, 0.1, shape))
+    confident = rng.random(shape) < rng.uniform(0.0, _MOST_CONFIDENT)
+    # A confident estimate says failure far more often than success: most frontiers hide nothing.
+    extreme = np.where(
+        rng.random(shape) < _CHANCE_CONFIDENT_SUCCESS, rng.uniform(0.9, 0.995, shape), rng.uniform(0.005, 0.1, shape)
+    )
     probability = np.where(confident, extreme, rng.uniform(0.05, 0.75, shape))
-    probability[rng.random(shape) < 0.05] = 0.0
+    probability[rng.random(shape) < _CHANCE_IMPOSSIBLE] = 0.0
     success = rng.uniform(3.0, 60.0, shape)
     failure = rng.uniform(5.0, 80.0, shape)
+    # A condition that implies others holds no more often than they do, and is not met before them; independent draws
+    # would contradict each other, and with them the closure of what a rollout knows.
     implies = task.outcomes.implies[: shape[1], : shape[1]]
     probability = np.where(implies, probability[:, None, :], np.inf).min(axis=2)
     success = np.where(implies, success[:, None, :], 0.0).max(axis=2)

@@ -69,6 +69,7 @@ class CompiledCall:
         """Run once to warm up, then ``repeats`` times with the clock running."""
         if repeats < 1:
             raise ValueError(f"repeats is {repeats}, must be at least 1")
+        # The first run allocates, and on some platforms still compiles.
         jax.block_until_ready(self.run())
         return Timing(self.trace_s, self.compile_s, timed_runs(self.run, repeats), self.memory)
 
@@ -86,6 +87,9 @@ def measure(
       arguments: what to call it with, static ones included.
       repeats: timed runs.
       static_argnums: positions of arguments that are configuration rather than arrays.
+
+    Returns:
+      The times of tracing, compiling and each run.
     """
     return compile_call(function, *arguments, static_argnums=static_argnums).timing(repeats)
 
@@ -97,7 +101,16 @@ def compile_call(
 
     Side effect: all functions that the process has compiled before are forgotten, so that none of their parts makes
     this measurement shorter.
+
+    Args:
+      function: what to compile.
+      arguments: what to call it with, static ones included.
+      static_argnums: positions of arguments that are configuration rather than arrays.
+
+    Returns:
+      The compiled call with the seconds that it took to make.
     """
+    # Static arguments are closed over; what jax compiles is a function of arrays alone.
     static = (static_argnums,) if isinstance(static_argnums, int) else tuple(static_argnums)
     dynamic = [None if index in static else argument for index, argument in enumerate(arguments)]
     leaves, structure = jax.tree.flatten(dynamic)
@@ -111,13 +124,16 @@ def compile_call(
         outputs, results[:] = _flatten(function(*filled))
         return outputs
 
+    # A jitted part that was compiled before would be taken from the cache and missing from the clock.
     jax.clear_caches()
     with _without_persistent_cache():
+        # Tracing and lowering are Python's work and grow with the size of the program; compiling is XLA's.
         start = time.perf_counter()
         lowered = jax.jit(flat).lower(*leaves)
         traced = time.perf_counter()
         compiled = lowered.compile()
         done = time.perf_counter()
+    # Inputs are on the device before the clock of a run starts.
     placed = jax.block_until_ready(jax.device_put(leaves))
 
     def run() -> Any:
@@ -134,6 +150,7 @@ def _flatten(outputs: Any) -> tuple[list[Any], list[Any]]:
 
 def timed_runs(run: Callable[[], Any], repeats: int) -> tuple[float, ...]:
     """Seconds of each of ``repeats`` runs; a run ends when its results are ready. For code other than jax's as well."""
+    # Every run is waited for: jax returns as soon as work is queued.
     seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
@@ -149,6 +166,7 @@ def environment() -> dict[str, Any]:
     single-threaded.
     """
     device = jax.devices()[0]
+    # What decides about times: versions, processor, threads and XLA's flags.
     usable = usable_cores()
     return {
         "python": platform.python_version(),
@@ -167,6 +185,7 @@ def environment() -> dict[str, Any]:
     }
 
 
+# Pinned processes and containers have fewer cores than the machine.
 def usable_cores() -> int | None:
     """Cores that this process may run on, None where the system does not tell."""
     if hasattr(os, "sched_getaffinity"):
@@ -176,6 +195,7 @@ def usable_cores() -> int | None:
 
 def processor_name() -> str:
     """The processor's model as Linux names it, elsewhere what Python knows."""
+    # ``platform.processor`` is empty on most Linux systems.
     try:
         with open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
             names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
@@ -200,6 +220,7 @@ def _without_persistent_cache() -> Iterator[None]:
 
 def _memory_of(compiled: jax.stages.Compiled) -> dict[str, int] | None:
     """Bytes of a compiled program, None where the platform does not tell."""
+    # Not every backend implements the analysis, and some return nothing.
     try:
         analysis = compiled.memory_analysis()
     except (NotImplementedError, jax.errors.JaxRuntimeError):

@@ -1,34 +1,34 @@
-"""``potlp ...``: the command line.
+"""``potlp ...``: the command line. One file a command, imported when the command is used.
 
-Options and help texts are in `commands`; what a command does is in the file of its name beside this one.
+Importing this package, showing help and completing words import neither jax nor anything that does: files of commands
+import the library inside of their functions, and what only annotations need under ``TYPE_CHECKING``.
+``tests/test_cli.py`` holds them to it.
 """
 
-import sys
+import logging
 from typing import Annotated
 
 import typer
 
-from potlp_jax.cache import enable_compilation_cache
-from potlp_jax.cli.commands import estimator, log, maps, planner, report, sweep, task, trials
-from potlp_jax.cli.output import package_version
+from potlp_jax.cli.group import CommandGroup
+from potlp_jax.cli.output import package_version, set_verbosity
 
-NO_CACHE = "--no-cache"
+_QUIET, _NORMAL, _VERBOSE = logging.ERROR, logging.INFO, logging.DEBUG
 
 app = typer.Typer(
     name="potlp",
+    cls=CommandGroup,
     no_args_is_help=True,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (task, trials, report, planner, estimator, sweep, maps, log):
-    app.add_typer(group.app)
 
 _ABOUT = (
     "Plan temporal-logic tasks in buildings that the robot has never seen.\n\n"
     "A task says what to reach and what to avoid: [cyan](!fire U extinguisher) & F fire[/cyan] means no fire until the "
-    "extinguisher is found, and in the end the fire. The robot sees as it goes, weighs the frontiers of what it has "
-    "seen by the chance that the task goes on behind them, and moves until the task is satisfied."
+    "extinguisher is found, and in the end the fire. The robot explores, weighs each frontier of the map by the "
+    "probability that the task can be continued behind it, and moves until the task is satisfied."
 )
 
 
@@ -59,19 +59,32 @@ def potlp(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and leave.")
     ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Also say what the library does, on stderr.")
+    ] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="No notes and no progress on stderr, only errors.")
+    ] = False,
     no_cache: Annotated[
         bool,
         typer.Option(
-            NO_CACHE,
+            "--no-cache",
             help="Do not keep compiled programs in your cache folder for the next start (nor with POTLP_NO_CACHE=1).",
         ),
     ] = False,
 ) -> None:
-    """The options of ``potlp`` itself; ``main`` heeds ``no_cache``."""
+    """The options of ``potlp`` itself, which stand before the command: ``potlp --quiet run toy``."""
+    # `group.Command` heeds `no_cache`, because only a command that really runs may import jax.
+    set_verbosity(_QUIET if quiet else _VERBOSE if verbose else _NORMAL)
+
+
+def _keep_compiled_programs() -> None:
+    from potlp_jax.cache import enable_compilation_cache
+
+    enable_compilation_cache()
 
 
 def main() -> None:
     """Entry point of the ``potlp`` script. Only here is the cache turned on: ``app`` may run within other programs."""
-    if NO_CACHE not in sys.argv[1:]:
-        enable_compilation_cache()
-    app()
+    # The context's object is what a command calls before it runs (`group.Command.invoke`).
+    app(obj=_keep_compiled_programs)

@@ -1,51 +1,74 @@
-"""``potlp bench``: how fast the planner is here, and what it takes."""
+"""``potlp bench``: how fast the planner is on this machine, and how much memory it takes."""
 
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from potlp_jax.bench.perception import measure_looking
-from potlp_jax.bench.planner import (
-    DistanceRow,
-    PhaseRow,
-    Scene,
-    SearchRow,
-    as_dict,
-    make_scene,
-    make_world,
-    measure_decision,
-    measure_distances,
-    measure_search,
-)
-from potlp_jax.bench.problems import FAMILIES
-from potlp_jax.bench.timing import environment as describe_environment
-from potlp_jax.cli.inputs import read_environment_task, trial_config
+from potlp_jax.cli.completion import complete_environment
+from potlp_jax.cli.group import Command, command_app
+from potlp_jax.cli.options import Json, Simulations, TaskName
 from potlp_jax.cli.output import console, fail, package_version, print_json, progress_bar
-from potlp_jax.environments.registry import make
-from potlp_jax.learning.estimator import TrainedEstimator, estimator_for
-from potlp_jax.planning.policies import DecisionConfig
 
-PARTS = ("search", "distances", "decision", "looking")
+if TYPE_CHECKING:
+    from potlp_jax.bench.planner import DistanceRow, PhaseRow, Scene, SearchRow
+    from potlp_jax.learning.estimator import TrainedEstimator
+    from potlp_jax.planning.policies import DecisionConfig
+
+PARTS = ("search", "distances", "decision", "perception")
+
+app = command_app()
 
 
+@app.command(
+    "bench",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp bench[/cyan] - search, distances and the whole decision
+
+[cyan]potlp bench --parts search --family firefighting --batches 1,64,256 --core 0[/cyan]
+
+[cyan]potlp bench --parts decision --environment firefighting --json[/cyan]
+
+[cyan]potlp bench --parts perception --environment firefighting --world 1[/cyan] - what the camera and the network add
+
+[dim]Compiled anew for every measurement: the cache of compiled programs is left out.[/dim]
+""",
+)
 def run_bench(
-    parts: str,
-    family: str,
-    subgoals: int,
-    batches: str,
-    simulations: int | None,
-    environment: str,
-    task_name: str,
-    size: int,
-    world: int,
-    sources: int,
-    repeats: int,
-    core: int | None,
-    json: bool,
+    parts: Annotated[
+        str, typer.Option("--parts", help="search, distances, decision, perception; joined by commas.")
+    ] = "search,distances,decision",
+    family: Annotated[str, typer.Option(help="Family of benchmark problems for the search.")] = "three-single",
+    subgoals: Annotated[int, typer.Option(min=1, help="Subgoals of the problems for the search.")] = 8,
+    batches: Annotated[str, typer.Option(help="Problems searched at once; joined by commas.")] = "1,16,64",
+    simulations: Simulations = None,
+    environment: Annotated[
+        str,
+        typer.Option(
+            "--environment", "-e", help="Where distances and decisions are made.", autocompletion=complete_environment
+        ),
+    ] = "rooms",
+    task: TaskName = "1",
+    size: Annotated[int, typer.Option(min=21, help="Cells a side of a floor of rooms.")] = 64,
+    world: Annotated[int, typer.Option(min=0, help="Number of the world, of those for validation.")] = 0,
+    sources: Annotated[int, typer.Option(min=1, help="Cells from which to measure distances.")] = 16,
+    repeats: Annotated[int, typer.Option(min=1, help="Timed runs, of which the median is shown.")] = 5,
+    core: Annotated[int | None, typer.Option(min=0, help="Stay on this core, with one thread.")] = None,
+    json: Json = False,
 ) -> None:
-    """Measure what was asked for and print it."""
+    """Measure the planner on this machine: times of compiling and running, throughput, memory."""
+    from potlp_jax.bench.planner import make_scene, make_world, measure_search
+    from potlp_jax.bench.problems import FAMILIES
+    from potlp_jax.bench.timing import environment as describe_environment
+    from potlp_jax.cli.inputs import trial_config
+    from potlp_jax.environments.registry import make
+    from potlp_jax.learning.estimator import estimator_for
+
     chosen = _read_parts(parts)
     counts = _read_batches(batches)
     if family not in FAMILIES:
@@ -58,14 +81,15 @@ def run_bench(
         if "search" in chosen:
             rows["search"] = [measure_search(family, subgoals, batch, decision.search, repeats) for batch in counts]
         if set(chosen) - {"search"}:
-            progress.update(bar, description="looking around in a world")
-            generator = make(environment)
-            task = read_environment_task(generator, task_name)
-            # First of all, so that a missing one is told before anything long.
-            trained = estimator_for(task.propositions) if "looking" in chosen else None
-            scene = make_scene(make_world(environment, size, world), task)
+            progress.update(bar, description="exploring a world")
+            asked = make(environment).task(task)
+            # First of all, so that a missing estimator is reported before anything long.
+            trained = estimator_for(asked.propositions) if "perception" in chosen else None
+            scene = make_scene(make_world(environment, size, world), asked)
             progress.update(bar, description="compiling and measuring")
-            rows |= _measure_scene(scene, trained, chosen, decision, sources, repeats)
+            rows |= _measure_scene(
+                scene, parts=chosen, trained=trained, decision=decision, sources=sources, repeats=repeats
+            )
     where = describe_environment()
     if json:
         print_json({"potlp_jax": package_version(), "environment": where, "rows": _plain(rows)})
@@ -74,20 +98,24 @@ def run_bench(
 
 
 def _measure_scene(
-    scene: Scene,
-    trained: TrainedEstimator | None,
-    chosen: list[str],
-    decision: DecisionConfig,
+    scene: "Scene",
+    *,
+    parts: list[str],
+    trained: "TrainedEstimator | None",
+    decision: "DecisionConfig",
     sources: int,
     repeats: int,
 ) -> dict[str, list[Any]]:
+    from potlp_jax.bench.perception import measure_perception
+    from potlp_jax.bench.planner import measure_decision, measure_distances
+
     rows: dict[str, list[Any]] = {}
-    if "distances" in chosen:
+    if "distances" in parts:
         rows["distances"] = [measure_distances(scene, sources, repeats)]
-    if "decision" in chosen:
+    if "decision" in parts:
         rows["decision"] = measure_decision(scene, decision, repeats)
     if trained is not None:
-        rows["looking"] = measure_looking(scene, trained, decision, repeats)
+        rows["perception"] = measure_perception(scene, trained, decision, repeats)
     return rows
 
 
@@ -122,6 +150,8 @@ def _pin(core: int | None) -> None:
 
 
 def _plain(rows: dict[str, list[Any]]) -> dict[str, list[dict[str, Any]]]:
+    from potlp_jax.bench.planner import as_dict
+
     return {part: [as_dict(row) for row in measured] for part, measured in rows.items()}
 
 
@@ -135,8 +165,8 @@ def _print(rows: dict[str, list[Any]], where: dict[str, Any]) -> None:
         out.print(_distance_table(rows["distances"]))
     if "decision" in rows:
         out.print(_phase_table("one decision, by phase", rows["decision"]))
-    if "looking" in rows:
-        out.print(_phase_table("looking, and one decision with the trained network, by phase", rows["looking"]))
+    if "perception" in rows:
+        out.print(_phase_table("perception, and one decision with the trained network, by phase", rows["perception"]))
     out.print("medians; compile is what XLA took, run is one call after a warm-up", style="dim")
 
 
@@ -147,7 +177,7 @@ def _table(title: str, *columns: str) -> Table:
     return table
 
 
-def _search_table(rows: list[SearchRow]) -> Table:
+def _search_table(rows: "list[SearchRow]") -> Table:
     first = rows[0]
     table = _table(
         f"search: family {first.family}, {first.subgoals} subgoals, {first.states} states, {first.actions} actions, "
@@ -168,7 +198,7 @@ def _search_table(rows: list[SearchRow]) -> Table:
     return table
 
 
-def _distance_table(rows: list[DistanceRow]) -> Table:
+def _distance_table(rows: "list[DistanceRow]") -> Table:
     table = _table("distances: map × automaton, to everywhere", "grid", "states", "sources", "per source", "compile")
     for row in rows:
         table.add_row(
@@ -181,7 +211,7 @@ def _distance_table(rows: list[DistanceRow]) -> Table:
     return table
 
 
-def _phase_table(title: str, rows: list[PhaseRow]) -> Table:
+def _phase_table(title: str, rows: "list[PhaseRow]") -> Table:
     table = _table(title, "phase", "run", "per second", "working memory", "trace", "compile")
     for row in rows:
         memory = row.timing.memory

@@ -1,41 +1,217 @@
 """``potlp estimator``: what an estimator is, and how good it is."""
 
+import dataclasses
 import importlib.util
+import logging
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from rich.box import SIMPLE_HEAD
+from rich.console import Console
 from rich.table import Table
 
-from potlp_jax.cli.output import FAILED, console, fail, print_json
-from potlp_jax.errors import CheckpointError
-from potlp_jax.learning.fovea import ABOVE, BAND, BELOW
-from potlp_jax.learning.network import operation_counts, parameter_count
-from potlp_jax.learning.serialization import load_estimator
+from potlp_jax.cli.group import Command, command_app
+from potlp_jax.cli.options import Json
+from potlp_jax.cli.output import FAILED, console, fail, make_folder, print_json, progress_bar, to_json
+
+if TYPE_CHECKING:
+    from potlp_jax.learning.dataset import Samples
+    from potlp_jax.learning.metrics import Predictions, Prior, Report
+    from potlp_jax.learning.network import EstimatorNetwork, Params
+
+logger = logging.getLogger(__name__)
+
+SHOWN: int = 4
+"""Panoramas of each kind in predictions.png."""
+
+app = command_app("estimator", "Describe or evaluate a trained estimator.")
+EstimatorArgument = Annotated[
+    Path, typer.Argument(metavar="CHECKPOINT", help="An estimator (.npz), as `potlp fit` writes it.")
+]
 
 
-def show_estimator(path: Path, json: bool) -> None:
-    """Print what an estimator file says of itself."""
-    try:
-        params, config, metadata = load_estimator(path)
-    except CheckpointError as error:
-        fail(str(error))
-    first, second = operation_counts(config)
+@app.command(
+    "evaluate",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp estimator evaluate out/fit/estimator.npz data/validation[/cyan]
+
+[cyan]potlp estimator evaluate out/fit/estimator.npz data/validation --ablate all --out out/figures[/cyan]
+
+[dim]Needs the extra: pip install 'potlp-jax\\[train]'. docs/estimator.md says what the figures mean.[/dim]
+""",
+)
+def evaluate_estimator(
+    checkpoint: EstimatorArgument,
+    dataset: Annotated[Path, typer.Argument(metavar="DATASET", help="Folder of samples from `potlp collect`.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for evaluation.json, table.txt and three pictures."),
+    ] = None,
+    ablate: Annotated[
+        str,
+        typer.Option("--ablate", help="Also without the [cyan]image[/cyan], with shuffled [cyan]phi[/cyan], or all."),
+    ] = "none",
+    json: Json = False,
+) -> None:
+    """Measure an estimator on worlds it has not seen: skill, calibration, errors of costs."""
+    if importlib.util.find_spec("pyarrow") is None:
+        fail("data sets are Parquet files, and pyarrow is not installed: pip install 'potlp-jax[train]'", FAILED)
+    from potlp_jax.codec import finite_or_null
+    from potlp_jax.learning.dataset import read_dataset
+    from potlp_jax.learning.metrics import INTACT, check_fit, evaluate, prior_of
+    from potlp_jax.learning.network import EstimatorNetwork
+    from potlp_jax.learning.serialization import load_estimator
+
+    variants = _read_variants(ablate)
+    params, config, metadata = load_estimator(checkpoint)
+    samples = read_dataset(dataset)
+    check_fit(config, metadata, samples, str(checkpoint), str(dataset))
+    _warn(metadata, samples)
+    folder = None if out is None else make_folder(out)
+    predictions = _predict(EstimatorNetwork(config), params, samples, variants)
+    prior = prior_of(metadata, samples)
+    reports = {name: evaluate(samples, entry, prior) for name, entry in predictions.items()}
+    found = finite_or_null(
+        {
+            "estimator": str(checkpoint),
+            "dataset": str(dataset),
+            "environment": samples.metadata.environment,
+            "split": samples.metadata.split,
+            "panoramas": len(samples.images),
+            "unit": samples.metadata.unit,
+            "prior": prior.value,
+            "prior_source": prior.source,
+            "figures": {name: report.to_dict() for name, report in reports.items()},
+        }
+    )
+    heading = _heading(checkpoint, samples, prior)
+    if folder is not None:
+        (folder / "evaluation.json").write_text(to_json(found) + "\n", "utf-8")
+        _write(folder, heading, reports=reports, samples=samples, predictions=predictions[INTACT])
+    if json:
+        print_json(found)
+        return
+    _print_reports(console(), heading, reports, [INTACT])
+    if folder is not None:
+        pictures = "reliability.png, costs.png and predictions.png"
+        console().print(f"wrote evaluation.json, table.txt, {pictures} in {folder}", markup=False)
+
+
+def _read_variants(ablate: str) -> tuple[str, ...]:
+    from potlp_jax.learning.metrics import ABLATIONS, INTACT
+
+    chosen = {"none": (), "all": ABLATIONS, **{name: (name,) for name in ABLATIONS}}
+    if ablate not in chosen:
+        fail(f"unknown ablation {ablate!r}; choose from: {', '.join(chosen)}")
+    return (INTACT, *chosen[ablate])
+
+
+def _warn(metadata: Mapping[str, Any], samples: "Samples") -> None:
+    """Say what makes the figures mean less, or more, than one may think."""
+    from potlp_jax.cli.inputs import warn_of_test_worlds
+    from potlp_jax.environments.splits import Split
+
+    trained_on = metadata.get("data", {})
+    own = (samples.metadata.environment, samples.metadata.split)
+    if (trained_on.get("environment"), trained_on.get("split")) == own:
+        logger.warning(
+            f"the estimator was trained on {'/'.join(own)}: these figures say nothing about worlds it has not seen"
+        )
+    if samples.metadata.split == Split.TEST:
+        warn_of_test_worlds()
+
+
+def _predict(
+    network: "EstimatorNetwork", params: "Params", samples: "Samples", variants: tuple[str, ...]
+) -> "dict[str, Predictions]":
+    from potlp_jax.learning.metrics import ablated, predict
+
+    predictions = {}
+    with progress_bar() as progress:
+        for name in variants:
+            bar = progress.add_task(f"samples, {name}", total=len(samples.success))
+            predictions[name] = predict(
+                network,
+                params,
+                ablated(samples, name),
+                lambda done, bar=bar: progress.update(bar, completed=done),
+            )
+    return predictions
+
+
+def _heading(path: Path, samples: "Samples", prior: "Prior") -> str:
+    of_what = "the training data" if prior.source == "training" else "these samples"
+    return (
+        f"{path.name} on {samples.metadata.environment}/{samples.metadata.split}: {len(samples.images)} panoramas, "
+        f"{len(samples.success)} samples; constant prior {prior.value:.3f}, the mean P_S of {of_what}"
+    )
+
+
+def _print_reports(out: Console, heading: str, reports: "Mapping[str, Report]", variants: Sequence[str]) -> None:
+    from potlp_jax.view.calibration import VARIANTS, ablation_table, cost_table, probability_table
+
+    out.print(heading, markup=False, style="bold")
+    for name in variants:
+        out.print(probability_table(reports[name], VARIANTS[name]))
+        out.print(cost_table(reports[name], VARIANTS[name]))
+    if len(reports) > 1:
+        out.print(ablation_table(reports))
+
+
+def _write(
+    folder: Path, heading: str, *, reports: "Mapping[str, Report]", samples: "Samples", predictions: "Predictions"
+) -> None:
+    from potlp_jax.learning.metrics import INTACT, most_confident
+    from potlp_jax.view.calibration import draw_costs, draw_predictions, draw_reliability
+    from potlp_jax.view.style import save_figure
+
+    with (folder / "table.txt").open("w", encoding="utf-8") as file:
+        _print_reports(Console(file=file, width=160, highlight=False), heading, reports, list(reports))
+    chosen = most_confident(samples, predictions, SHOWN)
+    save_figure(draw_reliability(reports, heading), folder / "reliability.png")
+    save_figure(draw_costs(samples, predictions, reports[INTACT].overall, heading), folder / "costs.png")
+    save_figure(draw_predictions(samples, predictions, chosen, heading), folder / "predictions.png")
+
+
+@app.command(
+    "info",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp estimator info out/fit/estimator.npz[/cyan]
+
+[cyan]potlp estimator info out/fit/estimator.npz --json[/cyan]
+""",
+)
+def show_estimator(checkpoint: EstimatorArgument, json: Json = False) -> None:
+    """Show what an estimator knows, how large it is and how it was trained."""
+    from potlp_jax.codec import finite_or_null
+    from potlp_jax.learning.network import operation_counts, parameter_count
+    from potlp_jax.learning.serialization import load_estimator
+
+    params, config, metadata = load_estimator(checkpoint)
+    per_panorama, per_answer = operation_counts(config)
     description = {
-        "estimator": str(path),
-        "bytes": path.stat().st_size,
+        "estimator": str(checkpoint),
+        "bytes": checkpoint.stat().st_size,
         "parameters": parameter_count(params),
-        "operations_per_panorama": first,
-        "operations_per_answer": second,
-        "network": config.to_json(),
+        "operations_per_panorama": per_panorama,
+        "operations_per_answer": per_answer,
+        "network": dataclasses.asdict(config),
         "metadata": metadata,
     }
     if json:
-        print_json(finite(description))
+        print_json(finite_or_null(description))
         return
     out = console()
-    out.print(str(path), markup=False, style="bold")
+    out.print(str(checkpoint), markup=False, style="bold")
     table = Table(box=SIMPLE_HEAD, show_header=False, pad_edge=False)
     table.add_column(no_wrap=True)
     table.add_column()
@@ -44,18 +220,11 @@ def show_estimator(path: Path, json: bool) -> None:
     out.print(table)
 
 
-def evaluate_estimator(path: Path, dataset: Path, out: Path | None, ablate: str, json: bool) -> None:
-    """Report how good an estimator is on a data set."""
-    if importlib.util.find_spec("pyarrow") is None:
-        fail("data sets are Parquet files, and pyarrow is not installed: pip install 'potlp-jax[train]'", FAILED)
-    from potlp_jax.cli.evaluation import run_evaluation
-
-    run_evaluation(path, dataset, out, ablate, json)
-
-
 def _fovea(reach: int) -> str:
     if not reach:
         return "nothing"
+    from potlp_jax.learning.fovea import ABOVE, BAND, BELOW
+
     return f"{2 * reach + 1} columns × {(ABOVE + BELOW) * BAND} rows around each subgoal"
 
 
@@ -103,12 +272,3 @@ def _rows(description: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _list(values: list[int]) -> str:
     return ", ".join(map(str, values))
-
-
-def finite(value: Any) -> Any:
-    """JSON-able values with None for numbers that are not finite."""
-    if isinstance(value, dict):
-        return {name: finite(entry) for name, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -2,32 +2,53 @@
 
 import json as json_format
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import typer
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from potlp_jax.cli.inputs import read_task, trial_config
-from potlp_jax.cli.output import FAILED, console, fail, output_folder, print_json, progress_bar
-from potlp_jax.export import ANY_BATCH, MANIFEST, ExportConfig, export_planner
+from potlp_jax.cli.group import Command, command_app
+from potlp_jax.cli.options import Formula, Json, Propositions, Simulations
+from potlp_jax.cli.output import FAILED, console, fail, make_folder, print_json, progress_bar
 
 KNOWN_PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 
+app = command_app()
 
+
+@app.command(
+    "export",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp export "!fire U exit" --out planner[/cyan] - the search, for distances of your own
+
+[cyan]potlp export "F a & F b" --height 64 --width 64 --subgoals 8 --batch any --out planner[/cyan]
+
+[dim]planner/manifest.json names every input and output; docs/planner.md shows how to call the programs.[/dim]
+""",
+)
 def export_task(
-    formula: str,
-    propositions: str | None,
-    height: int | None,
-    width: int | None,
-    subgoals: int,
-    simulations: int | None,
-    batch: str | None,
-    platforms: str,
-    out: Path,
-    json: bool,
+    formula: Formula,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the programs and manifest.json.")],
+    propositions: Propositions = None,
+    height: Annotated[int | None, typer.Option(min=1, help="Rows of the map, for the whole decision.")] = None,
+    width: Annotated[int | None, typer.Option(min=1, help="Columns of the map, for the whole decision.")] = None,
+    subgoals: Annotated[int, typer.Option(min=1, help="Length of the array of subgoals.")] = 12,
+    simulations: Simulations = None,
+    batch: Annotated[
+        str | None, typer.Option(help="Problems per call: a number, or 'any'. Default: one, without a batch axis.")
+    ] = None,
+    platforms: Annotated[str, typer.Option(help="cpu, cuda, rocm, tpu; joined by commas.")] = "cpu,cuda",
+    json: Json = False,
 ) -> None:
-    """Export the planner for one task and say what was written."""
-    names = None if propositions is None else [name.strip() for name in propositions.split(",") if name.strip()]
+    """Export the planner as programs of plain arrays that run with jax alone."""
+    from potlp_jax.cli.inputs import read_names, trial_config
+    from potlp_jax.export import MANIFEST, ExportConfig, export_planner
+    from potlp_jax.task.reading import read_task
+
     if (height is None) != (width is None):
         fail("--height and --width go together: the whole decision needs both, the search alone neither")
     config = ExportConfig(
@@ -37,9 +58,8 @@ def export_task(
         batch=_read_batch(batch),
         platforms=_read_platforms(platforms),
     )
-    task = read_task(formula, names)
-    folder = output_folder(out)
-    assert folder is not None
+    task = read_task(formula, read_names(propositions))
+    folder = make_folder(out)
     with progress_bar() as progress:
         progress.add_task("lowering the planner", total=None)
         try:
@@ -54,6 +74,8 @@ def export_task(
 
 
 def _read_batch(text: str | None) -> int | str | None:
+    from potlp_jax.export import ANY_BATCH
+
     if text is None or text == ANY_BATCH:
         return text
     if not text.isdigit() or int(text) < 1:

@@ -1,58 +1,55 @@
-"""From the words of the command line to tasks, policies, worlds and configurations."""
+"""From the words of the command line to policies, worlds, stores and configurations.
+
+Imports the library, so commands import this module inside of their functions.
+"""
 
 import dataclasses
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from potlp_jax.cli.output import fail, note
+from potlp_jax.cli.output import fail
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split, default_split, world_key
-from potlp_jax.learning.estimator import TrainedEstimator, read_estimator, shipped_estimator
+from potlp_jax.learning.estimator import TrainedEstimator, named_estimator
+from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy
-from potlp_jax.task.task import Task, shipped_tasks
+from potlp_jax.sweep.runner import RESULTS
+from potlp_jax.sweep.store import Store
+from potlp_jax.trials import run
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 from potlp_jax.world.grid import World
 
+logger = logging.getLogger(__name__)
 
-def read_task(text: str, propositions: Sequence[str] | None = None, max_positive_literals: int | None = None) -> Task:
-    """A task from a .hoa file, the name of a shipped task, or a formula. Raises TaskError."""
-    if text.endswith(".hoa"):
-        return Task.from_hoa(_read(Path(text)), propositions, max_positive_literals)
-    if text in shipped_tasks():
-        return Task.from_hoa(Task.shipped(text).to_hoa(), propositions, max_positive_literals)
-    return Task.from_formula(text, propositions, max_positive_literals)
+RECORD: str = "trial.json"
+"""Name of the record in a folder that ``potlp run --out`` wrote."""
 
 
-def read_environment_task(generator: Generator, text: str) -> Task:
-    """A task over the environment's propositions; a number (or name) of the environment's tasks is its formula."""
-    formula = generator.tasks.get(text, text)
-    if formula.strip().isdigit():
-        known = ", ".join(f"{number} ({entry})" for number, entry in generator.tasks.items()) or "none"
-        fail(f"the environment has no task {text}; it has: {known}. Or give a formula.")
-    if formula in generator.tasks.values():
-        return Task.of_formula(formula, generator.propositions)
-    return read_task(formula, generator.propositions)
+def read_names(text: str | None) -> list[str] | None:
+    """Names joined by commas; None stays None."""
+    return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
 
 
-def read_policy(name: str) -> Policy:
-    """A policy by name; ``known_map`` is as good as ``known-map``."""
-    try:
-        return Policy(name.strip().replace("_", "-"))
-    except ValueError:
-        fail(f"unknown policy {name.strip()!r}; choose from: {', '.join(Policy)}")
+def record_file(trial: Path) -> Path:
+    """The record of a trial that is named by its file or by its folder."""
+    return trial / RECORD if trial.is_dir() else trial
 
 
 def default_policy(generator: Generator) -> Policy:
-    """PO-TLP where an estimator is shipped for the environment's propositions, else the baseline, with a note."""
-    if shipped_estimator(generator.propositions) is not None:
-        return Policy.POTLP
-    note(f"no estimator is shipped for {generator.name}: the policy is {Policy.BASELINE}; choose another with --policy")
-    return Policy.BASELINE
+    """PO-TLP where an estimator is shipped for the environment's propositions, otherwise the baseline, with a note."""
+    policy = run.default_policy(generator.propositions)
+    if policy is not Policy.POTLP:
+        logger.warning(
+            f"no estimator is shipped for {generator.name}: the policy is {policy}; choose another with --policy"
+        )
+    return policy
 
 
-def read_trained_estimator(path: Path | None) -> TrainedEstimator | None:
-    """An estimator from a file; None asks for the shipped one. Raises CheckpointError."""
-    return None if path is None else read_estimator(path)
+def read_estimator(name: str | None) -> TrainedEstimator | Estimator | None:
+    """An estimator by name; None asks for the shipped one. Raises CheckpointError or PluginError."""
+    return None if name is None else named_estimator(name)
 
 
 def read_split(name: str | None, generator: Generator) -> Split:
@@ -63,30 +60,51 @@ def read_split(name: str | None, generator: Generator) -> Split:
         fail(f"unknown split {name!r}; choose from: {', '.join(Split)}")
     check_split(Split(name), generator.name)
     if name == Split.TEST:
-        note("worlds of the test split are for reported figures: log this run")
+        warn_of_test_worlds()
     return Split(name)
 
 
-def make_world(generator: Generator, split: Split, seed: int) -> World:
-    """World number ``seed`` of a split. Raises WorldError where none can be made."""
-    if seed > MAX_INDEX:
-        fail(f"--seed {seed} is too large; the last world is number {MAX_INDEX}")
-    return generator.generate(world_key(split, seed, generator.name))
+def warn_of_test_worlds() -> None:
+    """Say that a run on the test split counts (`environments.splits`)."""
+    logger.warning("worlds of the test split are for reported figures: log this run")
 
 
-def trial_config(simulations: int | None, generator: Generator | None = None) -> TrialConfig:
-    """What the generator's worlds call for, with another number of simulations if one is given."""
+def make_world(generator: Generator, split: Split, number: int) -> World:
+    """World ``number`` of a split. Raises WorldError where none can be made."""
+    if number > MAX_INDEX:
+        fail(f"--world {number} is too large; the last world is number {MAX_INDEX}")
+    return generator.generate(world_key(split, number, generator.name))
+
+
+def trial_config(simulations: int | None, generator: Generator | None = None, camera: str | None = None) -> TrialConfig:
+    """What the options change of the settings of a trial.
+
+    Args:
+        simulations: per decision; None: the default.
+        generator: its worlds say what the other settings are; None: the defaults.
+        camera: name of a renderer; None: the shipped one.
+
+    Returns:
+        The settings.
+    """
     config = TrialConfig() if generator is None else trial_config_for(generator)
+    if camera is not None:
+        config = dataclasses.replace(config, camera=dataclasses.replace(config.camera, renderer=camera))
     if simulations is None:
         return config
     search = dataclasses.replace(config.decision.search, simulations=simulations)
     return dataclasses.replace(config, decision=dataclasses.replace(config.decision, search=search))
 
 
-def _read(path: Path) -> str:
+@contextmanager
+def open_store(folder: Path) -> Iterator[Store]:
+    """The store of a sweep that has been begun, closed at the end."""
+    if not (folder / RESULTS).is_file():
+        fail(
+            f"{folder}: there is no sweep in here (no {RESULTS}); begin one with `potlp sweep FILE.yaml --out {folder}`"
+        )
+    store = Store(folder / RESULTS)
     try:
-        return path.read_text("utf-8")
-    except OSError as error:
-        fail(f"{path}: {error.strerror}")
-    except UnicodeDecodeError:
-        fail(f"{path}: not a text file")
+        yield store
+    finally:
+        store.close()

@@ -1,97 +1,102 @@
-"""``potlp log``: robots' logs inspected, turned into datasets, replayed, and written by the simulator.
-
-Imports of this module need the extra ``logs``.
-"""
+"""``potlp log``: robots' logs inspected, turned into datasets, replayed, and written by the simulator."""
 
 import importlib.util
-import webbrowser
-from dataclasses import dataclass
+import logging
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import jax
 import typer
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from potlp_jax.cli.inputs import read_policy, read_task, read_trained_estimator, trial_config
-from potlp_jax.cli.output import BAD_INPUT, FAILED, console, fail, note, output_folder, print_json, progress_bar
-from potlp_jax.cli.run import RECORD
+from potlp_jax.cli.completion import complete_policy
+from potlp_jax.cli.group import Command, command_app
+from potlp_jax.cli.options import EstimatorName, Json, OpenPage, Simulations, TrialFile
+from potlp_jax.cli.output import FAILED, console, fail, make_folder, open_page, print_json, progress_bar
 from potlp_jax.cli.view import PAGE
-from potlp_jax.environments.ros.places import load_places
-from potlp_jax.learning.estimator import TrainedEstimator, shipped_estimator
-from potlp_jax.logs.drive import Drive, read_drive
-from potlp_jax.logs.inspection import inspect
-from potlp_jax.logs.log import Log, LogConfig
-from potlp_jax.logs.replaying import replay
-from potlp_jax.logs.working_grid import GridConfig
-from potlp_jax.logs.writing import BagFormat, write_trial
-from potlp_jax.planning.policies import Policy
-from potlp_jax.trials.record import load_trial
-from potlp_jax.view.maps import draw_trial
-from potlp_jax.view.replay_page import replay_page
-from potlp_jax.view.style import save_figure
+
+if TYPE_CHECKING:
+    from potlp_jax.learning.estimator import TrainedEstimator
+    from potlp_jax.logs.drive import Drive
+    from potlp_jax.logs.log import LogConfig
+    from potlp_jax.logs.working_grid import GridConfig
+    from potlp_jax.planning.policies import Policy
+
+logger = logging.getLogger(__name__)
+
+app = command_app(
+    "log", "Use what a robot recorded: ROS 1 bags, ROS 2 bags and MCAP. Needs the extra [cyan]logs[/cyan], no ROS."
+)
+
+_BAG_HELP = "A .bag, .mcap or .db3 file, or the folder of a ROS 2 bag."
+BagFile = Annotated[Path, typer.Argument(metavar="BAG", help=_BAG_HELP)]
+BagFiles = Annotated[list[Path], typer.Argument(metavar="BAG...", help=f"{_BAG_HELP} All with one map frame.")]
+Labels = Annotated[
+    Path, typer.Option("--labels", "-l", help="YAML of where the propositions are, in metres of the map's frame.")
+]
+MapTopic = Annotated[str | None, typer.Option("--map-topic", help="Of nav_msgs/OccupancyGrid; default: /map.")]
+ImageTopic = Annotated[
+    str | None, typer.Option("--image-topic", help="Of sensor_msgs/CompressedImage; default: the only one.")
+]
+BaseFrame = Annotated[
+    str | None, typer.Option("--base-frame", help="The robot's frame; default: the odometry's child, or base_link.")
+]
+Free = Annotated[int, typer.Option("--free", help="Occupancy, in percent, up to which a cell is free.")]
+Occupied = Annotated[int, typer.Option("--occupied", help="Occupancy, in percent, from which it is an obstacle.")]
+Resolution = Annotated[
+    float | None, typer.Option("--resolution", help="Metres a cell of the planner; default: 0.2, or the map's.")
+]
+Radius = Annotated[float, typer.Option("--radius", help="The robot's radius in metres, by which obstacles grow.")]
+CameraYaw = Annotated[
+    float | None,
+    typer.Option(
+        "--camera-yaw",
+        help="Degrees, counter-clockwise, from ahead to where the middle of a picture looks; default: as /tf says.",
+    ),
+]
+VerticalField = Annotated[
+    float | None,
+    typer.Option("--vertical-field", help="Degrees from a picture's lower to its upper edge; default: square pixels."),
+]
 
 
-@dataclass(frozen=True)
-class Reading:
-    """How a log is read, in the words of the command line."""
+@app.command(
+    "inspect",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
 
-    map_topic: str | None
-    image_topic: str | None
-    base_frame: str | None
-    free: int
-    occupied: int
-    resolution: float | None
-    radius: float
-    camera_yaw: float | None
-    vertical_field: float | None
+[cyan]potlp log inspect drive.bag[/cyan]
 
-    def log(self, bag: Path) -> Log:
-        """The log of a bag."""
-        return Log(
-            bag,
-            LogConfig(
-                map_topic=self.map_topic,
-                image_topic=self.image_topic,
-                base_frame=self.base_frame,
-                free=self.free,
-                occupied=self.occupied,
-                camera_yaw=self.camera_yaw,
-                vertical_field=self.vertical_field,
-            ),
-        )
+[cyan]potlp log inspect drive/ --map-topic /slam/map --json[/cyan]
 
-    def drive(self, bag: Path, labels: Path) -> Drive:
-        """The drive of a bag; what was lost is noted on stderr."""
-        drive = read_drive(self.log(bag), load_places(labels), GridConfig(self.resolution, self.radius))
-        for remark in drive.notes:
-            note(f"{bag}: {remark}")
-        return drive
-
-
+[dim]Ends with exit code 1 if the log is damaged or cannot be used for anything.[/dim]
+""",
+)
 def inspect_log(
-    bag: Path,
-    map_topic: str | None,
-    image_topic: str | None,
-    base_frame: str | None,
-    free: int,
-    occupied: int,
-    vertical_field: float | None,
-    json: bool,
+    bag: BagFile,
+    map_topic: MapTopic = None,
+    image_topic: ImageTopic = None,
+    base_frame: BaseFrame = None,
+    free: Free = 25,
+    occupied: Occupied = 65,
+    vertical_field: VerticalField = None,
+    json: Json = False,
 ) -> None:
-    """Print what is in a log; leave with exit code 1 if it is damaged or of no use."""
-    log = Log(
-        bag,
-        LogConfig(
-            map_topic=map_topic,
-            image_topic=image_topic,
-            base_frame=base_frame,
-            free=free,
-            occupied=occupied,
-            vertical_field=vertical_field,
-        ),
+    """Show what is in a log: topics, rates, gaps, what it can be used for, and what is wrong with it."""
+    _check_rosbags()
+    from potlp_jax.logs.inspection import inspect
+    from potlp_jax.logs.log import Log, LogConfig
+
+    config = LogConfig(
+        map_topic=map_topic,
+        image_topic=image_topic,
+        base_frame=base_frame,
+        free=free,
+        occupied=occupied,
+        vertical_field=vertical_field,
     )
+    log = Log(bag, config)
     found = inspect(log)
     if json:
         print_json(found)
@@ -99,6 +104,226 @@ def inspect_log(
         _print_inspection(found)
     if log.bag.damaged or not any(use.startswith("yes") for use in found["uses"].values()):
         raise typer.Exit(FAILED)
+
+
+@app.command(
+    "to-dataset",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp log to-dataset drive.bag --labels places.yaml --out data/office[/cyan]
+
+[cyan]potlp log to-dataset monday/ tuesday/ -l places.yaml --environment office --split validation -o data/v[/cyan]
+
+[dim]The answers come from the final map of each bag: drive until the building is mapped. docs/dataset.md describes the
+files. Needs the extra train, too.[/dim]
+""",
+)
+def logs_to_dataset(
+    bags: BagFiles,
+    labels: Labels,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Empty folder for the dataset.")],
+    environment: Annotated[
+        str | None, typer.Option("--environment", "-e", help="Name of the building; default: that of the labels' file.")
+    ] = None,
+    split: Annotated[
+        str, typer.Option("--split", help="What the dataset is for: training, validation, ...")
+    ] = "training",
+    views: Annotated[int, typer.Option("--views", min=1, help="Views of each bag, at most.")] = 200,
+    seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="Of the tasks asked about, and the spacing.")] = 0,
+    map_topic: MapTopic = None,
+    image_topic: ImageTopic = None,
+    base_frame: BaseFrame = None,
+    free: Free = 25,
+    occupied: Occupied = 65,
+    resolution: Resolution = None,
+    radius: Radius = 0.1,
+    camera_yaw: CameraYaw = None,
+    vertical_field: VerticalField = None,
+    json: Json = False,
+) -> None:
+    """Turn drives into samples for training an estimator: panoramas, and the true answers from the final map."""
+    _check_rosbags()
+    if importlib.util.find_spec("pyarrow") is None:
+        fail("datasets are Parquet files, and pyarrow is not installed: pip install 'potlp-jax[train]'", FAILED)
+    from potlp_jax.environments.ros.places import load_places
+    from potlp_jax.learning.dataset import read_dataset
+    from potlp_jax.learning.questions import HELD_OUT
+    from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
+    from potlp_jax.logs.log import LogConfig
+    from potlp_jax.logs.working_grid import GridConfig
+
+    name = labels.name.split(".")[0] if environment is None else environment
+    collecting = LogCollectConfig(views_per_world=views, seed=seed, held_out=HELD_OUT.get(name, ()))
+    config = LogConfig(
+        map_topic=map_topic,
+        image_topic=image_topic,
+        base_frame=base_frame,
+        free=free,
+        occupied=occupied,
+        camera_yaw=camera_yaw,
+        vertical_field=vertical_field,
+    )
+    with progress_bar() as progress:
+        progress.add_task("reading and labelling (the first view compiles)", total=None)
+        drives = [_read_drive(bag, labels, config, GridConfig(resolution, radius)) for bag in bags]
+        counts = collect_drives(drives, load_places(labels), out, name, split, collecting)
+    samples = read_dataset(out)
+    holds = samples.success > 0
+    summary = {
+        "dataset": str(out),
+        "views": dict(zip(map(str, bags), counts, strict=True)),
+        "samples": len(holds),
+        "successes": int(holds.sum()),
+        "propositions": list(samples.metadata.propositions),
+    }
+    if json:
+        print_json(summary)
+    else:
+        out_console = console()
+        for bag, count in summary["views"].items():
+            out_console.print(f"{bag}: {count} views", markup=False)
+        out_console.print(f"{len(holds)} samples, {int(holds.sum())} successes", markup=False)
+        out_console.print(f"wrote {out}", markup=False)
+    if not len(holds):
+        logger.warning(
+            "no sample: nowhere a subgoal was in view whose answer the final map gives; drive on until the building is "
+            "mapped"
+        )
+        raise typer.Exit(FAILED)
+
+
+@app.command(
+    "replay",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp log replay drive.bag --labels places.yaml --task "F document & F package" --out out/replay[/cyan]
+
+[cyan]potlp log replay drive/ --labels places.yaml --task 1 --policy oracle --out out/oracle --no-open[/cyan]
+
+[dim]The path is the one that was driven; the decisions are what the policy would have chosen at each moment.[/dim]
+""",
+)
+def replay_log(
+    bag: BagFile,
+    labels: Labels,
+    task: Annotated[
+        str, typer.Option("--task", "-t", help="A formula, the name of one in the labels, or a .hoa file.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for trial.json, trial.png and replay.html.")],
+    policy: Annotated[
+        str | None,
+        typer.Option(
+            "--policy",
+            "-p",
+            help="potlp (the default where an estimator knows the propositions), baseline, optimistic or oracle.",
+            show_default=False,
+            autocompletion=complete_policy,
+        ),
+    ] = None,
+    simulations: Simulations = None,
+    estimator: EstimatorName = None,
+    map_topic: MapTopic = None,
+    image_topic: ImageTopic = None,
+    base_frame: BaseFrame = None,
+    free: Free = 25,
+    occupied: Occupied = 65,
+    resolution: Resolution = None,
+    radius: Radius = 0.1,
+    camera_yaw: CameraYaw = None,
+    vertical_field: VerticalField = None,
+    open_it: OpenPage = False,
+    json: Json = False,
+) -> None:
+    """Show what would have been decided at each moment of a drive, as the replay of a trial."""
+    _check_rosbags()
+    import jax
+
+    from potlp_jax.cli.inputs import RECORD, read_estimator, trial_config
+    from potlp_jax.logs.log import LogConfig
+    from potlp_jax.logs.replaying import replay
+    from potlp_jax.logs.working_grid import GridConfig
+    from potlp_jax.planning.policies import named_policy, policy_name
+    from potlp_jax.task.reading import read_task
+    from potlp_jax.view.maps import draw_trial
+    from potlp_jax.view.replay_page import replay_page
+    from potlp_jax.view.style import save_figure
+
+    config = LogConfig(
+        map_topic=map_topic,
+        image_topic=image_topic,
+        base_frame=base_frame,
+        free=free,
+        occupied=occupied,
+        camera_yaw=camera_yaw,
+        vertical_field=vertical_field,
+    )
+    drive = _read_drive(bag, labels, config, GridConfig(resolution, radius))
+    asked = read_task(drive.tasks.get(task, task), drive.propositions)
+    trained = read_estimator(estimator)
+    chosen = _default_policy(drive, trained) if policy is None else named_policy(policy)
+    folder = make_folder(out)
+    with progress_bar() as progress:
+        progress.add_task("deciding along the drive (the first decision compiles)", total=None)
+        trial, panoramas = replay(drive, asked, chosen, jax.random.key(0), trial_config(simulations), trained)
+    files = [folder / RECORD, folder / "trial.png", folder / PAGE]
+    trial.save(files[0])
+    save_figure(draw_trial(trial), files[1])
+    files[2].write_text(replay_page(trial, panoramas), "utf-8")
+    if json:
+        print_json({**trial.summary(), "files": [str(file) for file in files]})
+    else:
+        console().print(
+            f"{trial.outcome}: {len(trial.decisions)} decisions of {policy_name(chosen)} along {trial.cost:.2f} m",
+            markup=False,
+        )
+        for file in files:
+            console().print(f"wrote {file}", markup=False)
+    if open_it:
+        open_page(files[2])
+
+
+@app.command(
+    "write",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp run rooms --out out/rooms[/cyan], then [cyan]potlp log write out/rooms --out drive.bag[/cyan]
+
+[cyan]potlp log write out/rooms --out drive --format mcap[/cyan]
+
+[dim]Also writes the labels, as drive.labels.yaml. The topics and frames are those that a robot should record.[/dim]
+""",
+)
+def write_log(
+    trial: TrialFile,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Bag to write: a .bag file, or a folder for ROS 2.")],
+    kind: Annotated[
+        str | None, typer.Option("--format", help="ros1, ros2 or mcap; default: ros1 for .bag, otherwise ros2.")
+    ] = None,
+    height: Annotated[int, typer.Option("--height", min=16, help="Rows of the pictures, twice as wide.")] = 512,
+) -> None:
+    """Write a simulated trial as a bag: what a robot should record, and a way to try the other commands."""
+    _check_rosbags()
+    from potlp_jax.cli.inputs import record_file
+    from potlp_jax.logs.writing import BagFormat, write_trial
+    from potlp_jax.trials.record import load_trial
+
+    if kind is not None and kind not in list(BagFormat):
+        fail(f"unknown format {kind!r}; choose from: {', '.join(BagFormat)}")
+    by_name = BagFormat.ROS1 if out.suffix == ".bag" else BagFormat.ROS2
+    chosen = by_name if kind is None else BagFormat(kind)
+    if (chosen is BagFormat.ROS1) != (out.suffix == ".bag"):
+        fail(f"--out {out}: a ROS 1 bag is a file that ends in .bag, and a ROS 2 bag a folder that does not")
+    labels = out.with_suffix(".labels.yaml")
+    count = write_trial(load_trial(record_file(trial)), out, chosen, labels, height)
+    console().print(f"wrote {out}: {count} messages", markup=False)
+    console().print(f"wrote {labels}", markup=False)
+    console().print(f"next: potlp log inspect {out}", markup=False, style="dim")
 
 
 def _print_inspection(found: dict[str, Any]) -> None:
@@ -153,120 +378,33 @@ def _facts(found: dict[str, Any]) -> list[tuple[str, str]]:
     return facts
 
 
-def logs_to_dataset(
-    bags: list[Path],
-    labels: Path,
-    out: Path,
-    environment: str | None,
-    split: str,
-    views: int,
-    seed: int,
-    reading: Reading,
-    json: bool,
-) -> None:
-    """Write the samples of some drives."""
-    if importlib.util.find_spec("pyarrow") is None:
-        fail("datasets are Parquet files, and pyarrow is not installed: pip install 'potlp-jax[train]'", FAILED)
-    from potlp_jax.errors import DatasetError
-    from potlp_jax.learning.dataset import read_dataset
-    from potlp_jax.learning.questions import HELD_OUT
-    from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
-
-    name = labels.name.split(".")[0] if environment is None else environment
-    config = LogCollectConfig(views_per_world=views, seed=seed, held_out=HELD_OUT.get(name, ()))
-    try:
-        with progress_bar() as progress:
-            progress.add_task("reading and labelling (the first view compiles)", total=None)
-            drives = [reading.drive(bag, labels) for bag in bags]
-            counts = collect_drives(drives, load_places(labels), out, name, split, config)
-        samples = read_dataset(out)
-    except DatasetError as error:
-        fail(str(error))
-    holds = samples.success > 0
-    summary = {
-        "dataset": str(out),
-        "views": dict(zip(map(str, bags), counts, strict=True)),
-        "samples": len(holds),
-        "successes": int(holds.sum()),
-        "propositions": list(samples.metadata.propositions),
-    }
-    if json:
-        print_json(summary)
-    else:
-        out_console = console()
-        for bag, count in summary["views"].items():
-            out_console.print(f"{bag}: {count} views", markup=False)
-        out_console.print(f"{len(holds)} samples, {int(holds.sum())} successes", markup=False)
-        out_console.print(f"wrote {out}", markup=False)
-    if not len(holds):
-        note(
-            "no sample: nowhere a subgoal was in view whose answer the final map gives; drive on until the building is "
-            "mapped"
-        )
-        raise typer.Exit(FAILED)
+def _check_rosbags() -> None:
+    """End the command where logs cannot be read."""
+    if importlib.util.find_spec("rosbags") is None:
+        fail("logs are read by rosbags, which is not installed: pip install 'potlp-jax[logs]'", FAILED)
 
 
-def replay_log(
-    bag: Path,
-    labels: Path,
-    task_text: str,
-    out: Path,
-    policy_name: str | None,
-    simulations: int | None,
-    estimator: Path | None,
-    reading: Reading,
-    open_it: bool,
-    json: bool,
-) -> None:
-    """Write the decisions of a policy along a drive as a record, a picture and a page."""
-    drive = reading.drive(bag, labels)
-    task = read_task(drive.tasks.get(task_text, task_text), drive.propositions)
-    trained = read_trained_estimator(estimator)
-    policy = _default_policy(drive, trained) if policy_name is None else read_policy(policy_name)
-    folder = output_folder(out)
-    assert folder is not None
-    with progress_bar() as progress:
-        progress.add_task("deciding along the drive (the first decision compiles)", total=None)
-        trial, panoramas = replay(drive, task, policy, jax.random.key(0), trial_config(simulations), trained)
-    files = [folder / RECORD, folder / "trial.png", folder / PAGE]
-    trial.save(files[0])
-    save_figure(draw_trial(trial), files[1])
-    files[2].write_text(replay_page(trial, panoramas), "utf-8")
-    if json:
-        print_json({**trial.summary(), "files": [str(file) for file in files]})
-    else:
-        console().print(
-            f"{trial.outcome}: {len(trial.decisions)} decisions of {policy} along {trial.cost:.2f} m", markup=False
-        )
-        for file in files:
-            console().print(f"wrote {file}", markup=False)
-    if open_it and not webbrowser.open(files[2].resolve().as_uri()):
-        note("there is no browser to open it with")
+def _read_drive(bag: Path, labels: Path, log: "LogConfig", grid: "GridConfig") -> "Drive":
+    """The drive of a bag; what could not be used of it is noted on stderr."""
+    from potlp_jax.environments.ros.places import load_places
+    from potlp_jax.logs.drive import read_drive
+    from potlp_jax.logs.log import Log
+
+    drive = read_drive(Log(bag, log), load_places(labels), grid)
+    for remark in drive.notes:
+        logger.warning(f"{bag}: {remark}")
+    return drive
 
 
-def _default_policy(drive: Drive, trained: TrainedEstimator | None) -> Policy:
-    """PO-TLP where an estimator knows the propositions and there are pictures, else the baseline, with a note."""
+def _default_policy(drive: "Drive", trained: "TrainedEstimator | None") -> "Policy":
+    """PO-TLP where an estimator knows the propositions and there are pictures, otherwise the baseline, with a note."""
+    from potlp_jax.learning.estimator import shipped_estimator
+    from potlp_jax.planning.policies import Policy
+
     if trained is None and shipped_estimator(drive.propositions) is None:
-        note(f"no estimator is shipped for {', '.join(drive.propositions)}: the policy is {Policy.BASELINE}")
+        logger.warning(f"no estimator is shipped for {', '.join(drive.propositions)}: the policy is {Policy.BASELINE}")
         return Policy.BASELINE
     if not drive.pictures:
-        note(f"the log has no panorama: the policy is {Policy.BASELINE}")
+        logger.warning(f"the log has no panorama: the policy is {Policy.BASELINE}")
         return Policy.BASELINE
     return Policy.POTLP
-
-
-def write_log(trial: Path, out: Path, kind_name: str | None, height: int) -> None:
-    """Write a recorded trial as a bag, and its labels."""
-    if kind_name is None:
-        kind = BagFormat.ROS1 if out.suffix == ".bag" else BagFormat.ROS2
-    elif kind_name in list(BagFormat):
-        kind = BagFormat(kind_name)
-    else:
-        fail(f"unknown format {kind_name!r}; choose from: {', '.join(BagFormat)}", BAD_INPUT)
-    if (kind is BagFormat.ROS1) != (out.suffix == ".bag"):
-        fail(f"--out {out}: a ROS 1 bag is a file that ends in .bag, and a ROS 2 bag a folder that does not")
-    labels = out.with_suffix(".labels.yaml")
-    count = write_trial(load_trial(trial / RECORD if trial.is_dir() else trial), out, kind, labels, height)
-    console().print(f"wrote {out}: {count} messages", markup=False)
-    console().print(f"wrote {labels}", markup=False)
-    console().print(f"next: potlp log inspect {out}", markup=False, style="dim")

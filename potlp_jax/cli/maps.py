@@ -7,33 +7,22 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import jax
+import typer
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
+from potlp_jax.cli.group import Command, command_app
+from potlp_jax.cli.options import Json
 from potlp_jax.cli.output import console, fail, print_json
-from potlp_jax.environments.ros.map_files import OccupancyMap, load_map
-from potlp_jax.environments.ros.map_writer import save_map
-from potlp_jax.environments.ros.places import (
-    Disc,
-    Places,
-    Point,
-    Polygon,
-    Region,
-    check_points,
-    load_places,
-    place_letters,
-    save_places,
-)
-from potlp_jax.environments.ros.ros_map import CleanMap, RosMap, RosMapConfig, clean_map
-from potlp_jax.environments.ros.survey import MapSurvey, Passage, survey_map
 from potlp_jax.errors import MapWarning
-from potlp_jax.task.formula import check_propositions
-from potlp_jax.task.task import Task
-from potlp_jax.view.map_preview import draw_map, draw_places
-from potlp_jax.view.style import save_figure
+
+if TYPE_CHECKING:
+    from potlp_jax.environments.ros.cleaning import CleanMap
+    from potlp_jax.environments.ros.map_files import OccupancyMap
+    from potlp_jax.environments.ros.places import Disc, Places, Point, Polygon, Region
+    from potlp_jax.environments.ros.survey import MapSurvey, Passage
 
 PLACE_RADIUS: float = 0.5
 """Metres around a point where its proposition is true, unless a radius is given."""
@@ -41,9 +30,41 @@ PLACE_RADIUS: float = 0.5
 SHOWN: int = 8
 """Passages, and parts that are cut off, that are printed; JSON has all."""
 
+app = command_app(
+    "map", "From a ROS map to a world: inspect, clean, label and look at it. docs/maps.md goes through it."
+)
+MapFile = Annotated[Path, typer.Argument(metavar="FILE.yaml", help="A map of ROS map_server or nav2_map_server.")]
+Resolution = Annotated[float, typer.Option("--resolution", help="Size of a cell of the working grid, in metres.")]
+Radius = Annotated[float, typer.Option("--radius", help="The robot's radius in metres, by which obstacles grow.")]
+Start = Annotated[
+    str | None,
+    typer.Option(
+        "--start", metavar="X,Y", help="Metres; what is connected with it is kept. Default: the largest part."
+    ),
+]
 
-def inspect_map(file: Path, resolution: float, radius: float, start: str | None, json: bool) -> None:
-    """Print what a map holds and what cleaning would make of it."""
+
+@app.command(
+    "inspect",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp map inspect office.yaml[/cyan]
+
+[cyan]potlp map inspect office.yaml --resolution 0.4 --radius 0.2 --json[/cyan]
+
+[dim]Changes nothing. Cells and radius are those of map:office.yaml,resolution=0.4,radius=0.2.[/dim]
+""",
+)
+def inspect_map(
+    file: MapFile, resolution: Resolution = 0.2, radius: Radius = 0.1, start: Start = None, json: Json = False
+) -> None:
+    """Show what a map holds, its narrowest passages, what is wrong with it, and what cleaning would do."""
+    from potlp_jax.environments.ros.cleaning import clean_map
+    from potlp_jax.environments.ros.map_files import load_map
+    from potlp_jax.environments.ros.survey import survey_map
+
     with _caught_warnings() as remarks:
         image_map = load_map(file)
     clean = clean_map(image_map, resolution, radius, _read_start(start), "--start")
@@ -64,8 +85,32 @@ def inspect_map(file: Path, resolution: float, radius: float, start: str | None,
         out.print(f"- {defect}", markup=False, soft_wrap=True)
 
 
-def write_clean_map(file: Path, out: Path, resolution: float, radius: float, start: str | None, json: bool) -> None:
-    """Write a cleaned map and say what has changed."""
+@app.command(
+    "clean",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp map clean office.yaml --out out/clean.yaml[/cyan]
+
+[cyan]potlp map clean office.yaml --resolution 0.05 --radius 0 --start 1.5,2 --out out/clean.yaml[/cyan]
+
+[dim]map:office.yaml cleans a map in the same way by itself; this is to see, mend or share the result.[/dim]
+""",
+)
+def write_clean_map(
+    file: MapFile,
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="NEW.yaml", help="Map to write, NEW.pgm beside it.")],
+    resolution: Resolution = 0.2,
+    radius: Radius = 0.1,
+    start: Start = None,
+    json: Json = False,
+) -> None:
+    """Write the grid on which the robot moves, where all else is an obstacle, as a ROS map."""
+    from potlp_jax.environments.ros.cleaning import clean_map
+    from potlp_jax.environments.ros.map_files import load_map
+    from potlp_jax.environments.ros.map_writer import save_map
+
     image_map = load_map(file)
     own = {path.resolve() for path in (image_map.settings.file, image_map.settings.image)}
     if own & {out.resolve(), out.with_suffix(".pgm").resolve()}:
@@ -87,24 +132,55 @@ def write_clean_map(file: Path, out: Path, resolution: float, radius: float, sta
     output.print(f"next: {next_one} (the radius is in the map already)", markup=False, style="dim")
 
 
+@app.command(
+    "label",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp map label office.yaml --place kitchen=2.1,3.4 --room "office=1,1 4,1 4,3 1,3"[/cyan]
+
+[cyan]potlp map label office.yaml --add --place kitchen=7.5,3.4,1 --start 0.5,0.5 --task "1=F kitchen & F office"[/cyan]
+
+[dim]A name that is given twice has two places. Without --out the file is office.places.yaml, which map:office.yaml
+finds.[/dim]
+""",
+)
 def label_map(
-    file: Path,
-    places: Sequence[str],
-    rooms: Sequence[str],
-    tasks: Sequence[str],
-    start: str | None,
-    out: Path | None,
-    add: bool,
-    resolution: float,
-    radius: float,
-    json: bool,
+    file: MapFile,
+    place: Annotated[
+        list[str] | None,
+        typer.Option("--place", metavar="NAME=X,Y[,RADIUS]", help="True around a point; radius 0.5 m by default."),
+    ] = None,
+    room: Annotated[
+        list[str] | None,
+        typer.Option("--room", metavar='NAME="X,Y X,Y X,Y ..."', help="True inside a polygon of three points or more."),
+    ] = None,
+    task: Annotated[
+        list[str] | None, typer.Option("--task", metavar="NAME=FORMULA", help="A task to run by its name.")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option("--start", metavar="X,Y", help="Where trials start; default: drawn at random.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="LABELS.yaml", help="Default: FILE.places.yaml beside the map."),
+    ] = None,
+    add: Annotated[bool, typer.Option("--add", help="Add to the labels that the file holds already.")] = False,
+    resolution: Resolution = 0.2,
+    radius: Radius = 0.1,
+    json: Json = False,
 ) -> None:
-    """Write labels that have been checked against the map."""
+    """Say in metres where propositions are true, and check that a robot gets there."""
+    from potlp_jax.environments.ros.cleaning import clean_map
+    from potlp_jax.environments.ros.map_files import load_map
+    from potlp_jax.environments.ros.places import Places, check_points, load_places, place_letters, save_places
+
     target = file.with_suffix(".places.yaml") if out is None else out
     if target.exists() and not add:
         fail(f"{target} exists: --add adds to it, --out writes another file")
     old = load_places(target) if add else Places(())
-    labels = _joined(old, places, rooms, tasks, start)
+    labels = _joined(old, places=place or [], rooms=room or [], tasks=task or [], start=start)
     clean = clean_map(load_map(file), resolution, radius, labels.start, labels.source)
     check_points(labels, clean.free, clean.frame)
     letters = place_letters(labels, clean.free, clean.frame)
@@ -119,13 +195,42 @@ def label_map(
     for name, count in cells.items():
         output.print(f"{name:12} {count} cells, {count * side**2:.1f} m2", markup=False)
     output.print(f"wrote {target}", markup=False)
-    task = labels.tasks[0][0] if labels.tasks else " & ".join(f"F {name}" for name in labels.names)
+    example = labels.tasks[0][0] if labels.tasks else " & ".join(f"F {name}" for name in labels.names)
     world = _environment(file, None if out is None else target, resolution, radius)
-    output.print(f"next: potlp run {world} --task '{task}'", markup=False, style="dim")
+    output.print(f"next: potlp run {world} --task '{example}'", markup=False, style="dim")
 
 
-def preview_map(file: Path, out: Path, labels: Path | None, resolution: float, radius: float) -> None:
-    """Draw a map, with labels where there are any."""
+@app.command(
+    "preview",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp map preview office.yaml --out office.png[/cyan]
+
+[cyan]potlp map preview office.yaml --labels office.places.yaml --resolution 0.4 --out office.pdf[/cyan]
+
+[dim]Labels in office.places.yaml are drawn without being named.[/dim]
+""",
+)
+def preview_map(
+    file: MapFile,
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="PICTURE", help="Picture to write: .png, .svg or .pdf.")],
+    labels: Annotated[
+        Path | None, typer.Option("--labels", metavar="LABELS.yaml", help="Labels to draw; default: FILE.places.yaml.")
+    ] = None,
+    resolution: Resolution = 0.2,
+    radius: Radius = 0.1,
+) -> None:
+    """Draw a map in metres: what the robot can reach, what is cut off, propositions and start."""
+    import jax
+
+    from potlp_jax.environments.ros.cleaning import clean_map
+    from potlp_jax.environments.ros.map_files import load_map
+    from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig
+    from potlp_jax.view.map_preview import draw_map, draw_places
+    from potlp_jax.view.style import save_figure
+
     beside = file.with_suffix(".places.yaml")
     found = labels or (beside if beside.is_file() else None)
     if found is None:
@@ -141,6 +246,8 @@ def preview_map(file: Path, out: Path, labels: Path | None, resolution: float, r
 
 def _environment(file: Path, places: Path | None, resolution: float, radius: float) -> str:
     """How the command line names the worlds on a map; what is as by default is left out."""
+    from potlp_jax.environments.ros.ros_map import RosMapConfig
+
     chosen = {"resolution": resolution, "radius": radius}
     options = [f"{name}={value:g}" for name, value in chosen.items() if value != getattr(RosMapConfig, name)]
     return ",".join([f"map:{file}", *([] if places is None else [f"places={places}"]), *options])
@@ -156,11 +263,11 @@ def _caught_warnings() -> Iterator[list[str]]:
     texts += [str(warning.message) for warning in caught]
 
 
-def _title(file: Path, clean: CleanMap) -> str:
+def _title(file: Path, clean: "CleanMap") -> str:
     return f"{file.name}: {clean.frame.height} x {clean.frame.width} cells of {clean.frame.resolution:g} m"
 
 
-def _map_facts(image_map: OccupancyMap) -> dict[str, Any]:
+def _map_facts(image_map: "OccupancyMap") -> dict[str, Any]:
     settings, frame = image_map.settings, image_map.frame
     return {
         "file": str(settings.file),
@@ -177,12 +284,12 @@ def _map_facts(image_map: OccupancyMap) -> dict[str, Any]:
     }
 
 
-def _survey_facts(survey: MapSurvey) -> dict[str, Any]:
+def _survey_facts(survey: "MapSurvey") -> dict[str, Any]:
     facts = dataclasses.asdict(survey)
     return {"shares": {name: facts.pop(name) for name in ("free", "occupied", "unknown")}, **facts}
 
 
-def _clean_facts(clean: CleanMap, radius: float) -> dict[str, Any]:
+def _clean_facts(clean: "CleanMap", radius: float) -> dict[str, Any]:
     return {
         "grid": {"cells": [clean.frame.height, clean.frame.width], "resolution": clean.frame.resolution},
         "radius": radius,
@@ -192,7 +299,7 @@ def _clean_facts(clean: CleanMap, radius: float) -> dict[str, Any]:
     }
 
 
-def _map_lines(image_map: OccupancyMap, survey: MapSurvey) -> Iterator[tuple[str, str]]:
+def _map_lines(image_map: "OccupancyMap", survey: "MapSurvey") -> Iterator[tuple[str, str]]:
     settings, frame = image_map.settings, image_map.frame
     metres = f"{frame.width * frame.resolution:.2f} x {frame.height * frame.resolution:.2f} m"
     yield "image", f"{settings.image.name}, {frame.width} x {frame.height} pixels of {frame.resolution:g} m: {metres}"
@@ -206,7 +313,7 @@ def _map_lines(image_map: OccupancyMap, survey: MapSurvey) -> Iterator[tuple[str
     yield "free space", f"connected parts: {survey.components}{specks}; the largest has {survey.largest:.1f} m2"
 
 
-def _clean_lines(clean: CleanMap, radius: float) -> Iterator[tuple[str, str]]:
+def _clean_lines(clean: "CleanMap", radius: float) -> Iterator[tuple[str, str]]:
     frame, area = clean.frame, clean.area
     yield "grid", f"{frame.height} x {frame.width} cells of {frame.resolution:g} m, {clean.free.sum()} reachable"
     yield (
@@ -216,7 +323,7 @@ def _clean_lines(clean: CleanMap, radius: float) -> Iterator[tuple[str, str]]:
     )
 
 
-def _passage_table(passages: Sequence[Passage]) -> Table:
+def _passage_table(passages: "Sequence[Passage]") -> Table:
     rest = len(passages) - SHOWN
     table = Table(
         title="narrowest passages",
@@ -235,7 +342,7 @@ def _passage_table(passages: Sequence[Passage]) -> Table:
     return table
 
 
-def _defects(survey: MapSurvey, clean: CleanMap) -> Iterator[str]:
+def _defects(survey: "MapSurvey", clean: "CleanMap") -> Iterator[str]:
     """What looks wrong, in words, with what cleaning does about it."""
     if survey.open_edge:
         yield (
@@ -249,7 +356,7 @@ def _defects(survey: MapSurvey, clean: CleanMap) -> Iterator[str]:
     yield from _cut_off_lines(clean)
 
 
-def _cut_off_lines(clean: CleanMap) -> Iterator[str]:
+def _cut_off_lines(clean: "CleanMap") -> Iterator[str]:
     why = "cut off by the size of the cells: use smaller ones"
     for part in clean.cut_off[:SHOWN]:
         yield f"{part.area:.1f} m2 at [{part.at[0]:.2f}, {part.at[1]:.2f}] are {why}"
@@ -259,9 +366,13 @@ def _cut_off_lines(clean: CleanMap) -> Iterator[str]:
 
 
 def _joined(
-    old: Places, places: Sequence[str], rooms: Sequence[str], tasks: Sequence[str], start: str | None
-) -> Places:
+    old: "Places", *, places: Sequence[str], rooms: Sequence[str], tasks: Sequence[str], start: str | None
+) -> "Places":
     """The old labels with what the options add. Raises TaskError for a bad name or formula."""
+    from potlp_jax.environments.ros.places import Places
+    from potlp_jax.task.formula import check_propositions
+    from potlp_jax.task.task import Task
+
     regions: dict[str, list[Region]] = {name: list(found) for name, found in old.propositions}
     for option in places:
         name, text = _named("--place", option, "NAME=X,Y[,RADIUS]")
@@ -290,7 +401,9 @@ def _named(option: str, text: str, form: str) -> tuple[str, str]:
     return name, value
 
 
-def _read_disc(option: str, text: str) -> Disc:
+def _read_disc(option: str, text: str) -> "Disc":
+    from potlp_jax.environments.ros.places import Disc
+
     numbers = _read_numbers(f"--place {option}", text)
     if len(numbers) not in (2, 3):
         fail(f"--place {option}: give x and y in metres and, if you like, a radius: 2.1,3.4,0.5")
@@ -300,14 +413,16 @@ def _read_disc(option: str, text: str) -> Disc:
     return Disc((numbers[0], numbers[1]), radius)
 
 
-def _read_polygon(option: str, text: str) -> Polygon:
+def _read_polygon(option: str, text: str) -> "Polygon":
+    from potlp_jax.environments.ros.places import Polygon
+
     corners = [_read_numbers(f"--room {option}", corner) for corner in text.split()]
     if len(corners) < 3 or any(len(corner) != 2 for corner in corners):
         fail(f"--room {option}: give three corners or more, in metres: 1,1 4,1 4,3")
     return Polygon(tuple((x, y) for x, y in corners))
 
 
-def _read_start(text: str | None) -> Point | None:
+def _read_start(text: str | None) -> "Point | None":
     if text is None:
         return None
     numbers = _read_numbers("--start", text)

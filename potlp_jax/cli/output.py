@@ -1,18 +1,25 @@
-"""What the commands share: consoles, errors as one message, progress on stderr, JSON on stdout."""
+"""What the commands share: consoles, messages and progress on stderr, JSON on stdout, errors as one line.
 
-import functools
-import importlib.metadata
+What only some commands need is imported where it is used: help and completion load this file too.
+"""
+
 import json
+import logging
 import warnings
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn, TextIO
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from potlp_jax.errors import PotlpError, PotlpWarning
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+logger = logging.getLogger(__name__)
 
 FAILED = 1
 BAD_INPUT = 2
@@ -31,6 +38,8 @@ def error_console() -> Console:
 
 def package_version() -> str:
     """The version of the installed package."""
+    import importlib.metadata
+
     return importlib.metadata.version("potlp-jax")
 
 
@@ -44,9 +53,26 @@ def print_json(data: Any) -> None:
     typer.echo(to_json(data))
 
 
-def note(message: str) -> None:
-    """A remark on stderr."""
-    error_console().print(message, style="yellow", markup=False, soft_wrap=True)
+class _Messages(logging.Handler):
+    """Log records as lines on stderr: what is worth knowing in yellow, what only ``--verbose`` asks for faint."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        # A console of its own for each line: who runs commands in one process, as tests do, may exchange stderr.
+        style = "dim" if record.levelno < logging.INFO else "yellow"
+        error_console().print(self.format(record), style=style, markup=False, soft_wrap=True)
+
+
+def set_verbosity(level: int) -> None:
+    """Show the package's log messages from this level on; progress is shown from ``logging.INFO`` on."""
+    package = logging.getLogger("potlp_jax")
+    package.setLevel(level)
+    if not any(isinstance(handler, _Messages) for handler in package.handlers):
+        package.addHandler(_Messages())
+
+
+def shows_progress() -> bool:
+    """Whether progress is wanted: not with ``--quiet``."""
+    return logging.getLogger("potlp_jax").isEnabledFor(logging.INFO)
 
 
 def fail(message: str, code: int = BAD_INPUT) -> NoReturn:
@@ -55,23 +81,20 @@ def fail(message: str, code: int = BAD_INPUT) -> NoReturn:
     raise typer.Exit(code)
 
 
-def clear_errors(command: Callable[..., None]) -> Callable[..., None]:
+@contextmanager
+def clear_errors() -> Iterator[None]:
     """Turn errors about the user's input and files into one message without a traceback, and warnings into notes."""
-
-    @functools.wraps(command)
-    def wrapped(*args: Any, **kwargs: Any) -> None:
-        try:
-            with warnings.catch_warnings():
-                warnings.showwarning = _show_warning
-                command(*args, **kwargs)
-        except PotlpError as error:
-            fail(str(error))
-        except OSError as error:
-            if error.filename is None:
-                raise
-            fail(f"{error.filename}: {error.strerror}", FAILED)
-
-    return wrapped
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            yield
+    except PotlpError as error:
+        fail(str(error))
+    except OSError as error:
+        # An error of the system that is about no file is a fault of the program: its traceback is needed.
+        if error.filename is None:
+            raise
+        fail(f"{error.filename}: {error.strerror}", FAILED)
 
 
 def _show_warning(
@@ -79,13 +102,15 @@ def _show_warning(
 ) -> None:
     """A warning about the user's input as a note, without the place in the program; any other as Python shows it."""
     if issubclass(category, PotlpWarning):
-        note(str(message))
+        logger.warning(message)
     else:
-        error_console().print(warnings.formatwarning(message, category, filename, lineno), markup=False)
+        logger.warning(warnings.formatwarning(message, category, filename, lineno))
 
 
-def progress_bar() -> Progress:
-    """A progress display on stderr that leaves nothing behind; silent where stderr is no terminal."""
+def progress_bar() -> "Progress":
+    """A progress display on stderr that leaves nothing behind; silent with --quiet and where stderr is no terminal."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
     terminal = error_console()
     return Progress(
         SpinnerColumn(),
@@ -95,14 +120,21 @@ def progress_bar() -> Progress:
         TimeElapsedColumn(),
         console=terminal,
         transient=True,
-        disable=not terminal.is_terminal,
+        disable=not (terminal.is_terminal and shows_progress()),
     )
 
 
-def output_folder(folder: Path | None) -> Path | None:
+def make_folder(folder: Path) -> Path:
     """The folder for results, made if it is not there."""
-    if folder is not None:
-        if folder.exists() and not folder.is_dir():
-            fail(f"--out {folder} is a file; give a folder")
-        folder.mkdir(parents=True, exist_ok=True)
+    if folder.exists() and not folder.is_dir():
+        fail(f"--out {folder} is a file; give a folder")
+    folder.mkdir(parents=True, exist_ok=True)
     return folder
+
+
+def open_page(page: Path) -> None:
+    """Open a page in the browser, if there is one."""
+    import webbrowser
+
+    if not webbrowser.open(page.resolve().as_uri()):
+        logger.warning("there is no browser to open it with")

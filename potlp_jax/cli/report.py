@@ -2,28 +2,52 @@
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
+
+from potlp_jax.cli.group import Command, command_app
+from potlp_jax.cli.options import SweepFolder
 from potlp_jax.cli.output import console, fail, progress_bar
-from potlp_jax.cli.sweep import open_store
-from potlp_jax.cli.view import panoramas_of
-from potlp_jax.planning.policies import Policy
-from potlp_jax.sweep.results import Pair, pair_rows
-from potlp_jax.sweep.runner import Sweep
-from potlp_jax.sweep.specification import specification_from_store
-from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP
-from potlp_jax.sweep.store import Row
-from potlp_jax.view.replay_page import replay_data
-from potlp_jax.view.report_page import Cell, Shown, report_page
+
+if TYPE_CHECKING:
+    from potlp_jax.sweep.results import Pair
+    from potlp_jax.sweep.runner import Sweep
+    from potlp_jax.sweep.store import Row
+    from potlp_jax.view.report_page import Shown
 
 PAGE: str = "report.html"
 
+app = command_app()
 
-def write_report(folder: Path, out: Path | None, replays: int) -> None:
-    """Write the page of a sweep; its worst and best trials are made again for it."""
-    store = open_store(folder)
-    facts = store.facts()
-    store.close()
+
+@app.command(
+    "report",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp report out/validation[/cyan] - writes out/validation/report.html
+
+[cyan]potlp report out/validation --replays 0 --out table.html[/cyan] - tables and plots alone, a small file
+""",
+)
+def write_report(
+    folder: SweepFolder,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Page to write; default: report.html in DIR.")] = None,
+    replays: Annotated[
+        int, typer.Option(min=0, help="Worst and as many best trials of each task to replay; about 1 MB each.")
+    ] = 2,
+) -> None:
+    """Write a sweep as one page: tables, plots, and the worst and best trials as replays."""
+    from potlp_jax.cli.inputs import open_store
+    from potlp_jax.sweep.results import pair_rows
+    from potlp_jax.sweep.runner import Sweep
+    from potlp_jax.sweep.specification import specification_from_store
+    from potlp_jax.view.report_page import Cell, report_page
+
+    with open_store(folder) as store:
+        facts = store.facts()
     page = out or folder / PAGE
     if page.suffix != ".html":
         fail(f"--out {page}: give a name that ends in .html")
@@ -37,9 +61,8 @@ def write_report(folder: Path, out: Path | None, replays: int) -> None:
             found = sweep.store.rows(cell.environment, cell.task)
             rows += found
             pairs = pair_rows(found, policies)
-            chosen = _notable(pairs, _subject(policies), replays)
             shown = []
-            for reason, row, baseline in chosen:
+            for reason, row, baseline in _notable(pairs, _subject(policies), replays):
                 progress.update(bar, description=f"running world {row.item.world} again")
                 shown.append(_shown(sweep, reason, row, baseline))
             cells.append(Cell(cell.environment, cell.task, pairs, shown))
@@ -48,22 +71,30 @@ def write_report(folder: Path, out: Path | None, replays: int) -> None:
 
 
 def _subject(policies: Sequence[str]) -> str:
-    """The policy whose trials are looked at: PO-TLP where it took part, else the last."""
-    return Policy.POTLP.value if Policy.POTLP.value in policies else policies[-1]
+    """The policy whose trials are looked at: PO-TLP where it took part, otherwise the last."""
+    return "potlp" if "potlp" in policies else policies[-1]
 
 
-def _notable(pairs: Sequence[Pair], policy: str, count: int) -> Iterator[tuple[str, Row, Row]]:
+def _notable(pairs: "Sequence[Pair]", policy: str, count: int) -> "Iterator[tuple[str, Row, Row]]":
     """The worlds that cost the policy most, and saved it most, against the baseline; with the baseline's row."""
+    from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP
+
+    # The two that savings are measured between have none of their own to be notable for.
     if policy in (BASELINE, KNOWN_MAP):
         return
     ordered = sorted(pairs, key=lambda pair: pair[policy].cost - pair[BASELINE].cost, reverse=True)
     for place, pair in enumerate(ordered[:count]):
         yield f"worst {place + 1}", pair[policy], pair[BASELINE]
+    # Of few worlds none is shown both as one of the worst and as one of the best.
     for place, pair in enumerate(reversed(ordered[max(count, len(ordered) - count) :])):
         yield f"best {place + 1}", pair[policy], pair[BASELINE]
 
 
-def _shown(sweep: Sweep, reason: str, row: Row, baseline: Row) -> Shown:
+def _shown(sweep: "Sweep", reason: str, row: "Row", baseline: "Row") -> "Shown":
+    from potlp_jax.trials.replay import panoramas_of
+    from potlp_jax.view.replay_page import replay_data
+    from potlp_jax.view.report_page import Shown
+
     trial = sweep.trial(row.item)
     return Shown(
         reason=reason,
@@ -75,7 +106,7 @@ def _shown(sweep: Sweep, reason: str, row: Row, baseline: Row) -> Shown:
     )
 
 
-def _facts(facts: dict[str, Any], rows: Sequence[Row]) -> list[tuple[str, str]]:
+def _facts(facts: dict[str, Any], rows: "Sequence[Row]") -> list[tuple[str, str]]:
     """What was run, and with what; where rows differ, all that there is."""
 
     def all_of(values: Sequence[str]) -> str:

@@ -1,60 +1,112 @@
 """``potlp run``: one trial, its record, picture and animation."""
 
+import logging
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from potlp_jax.cli.inputs import (
-    default_policy,
-    make_world,
-    read_environment_task,
-    read_policy,
-    read_split,
-    read_trained_estimator,
-    trial_config,
+from potlp_jax.cli.group import Command, command_app
+from potlp_jax.cli.options import (
+    CameraName,
+    Environment,
+    EstimatorName,
+    Json,
+    PolicyName,
+    Simulations,
+    SplitName,
+    TaskName,
+    WorldNumber,
 )
-from potlp_jax.cli.output import FAILED, console, output_folder, print_json, progress_bar
-from potlp_jax.environments.registry import make
-from potlp_jax.trials.loop import run_trial, trial_key
-from potlp_jax.trials.record import Outcome, Trial
-from potlp_jax.types import Status
-from potlp_jax.view.animation import save_animation
-from potlp_jax.view.maps import draw_trial
-from potlp_jax.view.style import save_figure
+from potlp_jax.cli.output import FAILED, console, make_folder, print_json, progress_bar
 
-RECORD = "trial.json"
+if TYPE_CHECKING:
+    from potlp_jax.environments.base import Generator
+    from potlp_jax.environments.splits import Split
+    from potlp_jax.task.task import Task
+    from potlp_jax.trials.config import TrialConfig
+    from potlp_jax.trials.record import Trial
+
+logger = logging.getLogger(__name__)
+
+WORLDS_TRIED: int = 20
+"""Worlds in which to look for one where the task is possible, after one where it is not."""
+
+_SHOWN = {
+    "task": "task",
+    "environment": "environment",
+    "world": "seed",  # the record's word for a world's number
+    "policy": "policy",
+    "steps": "steps",
+    "decisions": "decisions",
+    "fallbacks": "fallbacks",
+}
+
+app = command_app()
 
 
+@app.command(
+    "run",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp run toy --task 1[/cyan]
+
+[cyan]potlp run firefighting --task 3 --world 7 --out out/fire[/cyan]
+
+[cyan]potlp run firefighting --task "!fire U exit" --policy baseline --json[/cyan]
+
+[dim]Ends with exit code 1 if the task was not satisfied.[/dim]
+""",
+)
 def run_one(
-    environment: str,
-    task_name: str,
-    policy_name: str | None,
-    seed: int,
-    split_name: str | None,
-    out: Path | None,
-    animation: bool,
-    simulations: int | None,
-    estimator: Path | None,
-    json: bool,
+    environment: Environment,
+    task: TaskName = "1",
+    policy: PolicyName = None,
+    world: WorldNumber = 0,
+    split: SplitName = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for trial.json, trial.png and trial.gif.")
+    ] = None,
+    animation: Annotated[bool, typer.Option(help="Make the animation, the slowest of the three files.")] = True,
+    simulations: Simulations = None,
+    estimator: EstimatorName = None,
+    camera: CameraName = None,
+    json: Json = False,
 ) -> None:
-    """Run a trial and leave with exit code 1 if it did not end satisfied."""
+    """Run one trial: one world, one task, one policy."""
+    from potlp_jax.cli.inputs import (
+        default_policy,
+        make_world,
+        read_estimator,
+        read_split,
+        trial_config,
+    )
+    from potlp_jax.environments.registry import make
+    from potlp_jax.planning.policies import named_policy
+    from potlp_jax.trials.loop import run_trial
+    from potlp_jax.trials.record import Outcome
+    from potlp_jax.trials.rules import trial_key
+
     generator = make(environment)
-    split = read_split(split_name, generator)
-    policy = default_policy(generator) if policy_name is None else read_policy(policy_name)
-    trained = read_trained_estimator(estimator)
-    task = read_environment_task(generator, task_name)
-    world = make_world(generator, split, seed)
-    folder = output_folder(out)
+    chosen_split = read_split(split, generator)
+    chosen_policy = default_policy(generator) if policy is None else named_policy(policy)
+    trained = read_estimator(estimator)
+    asked = generator.task(task)
+    made = make_world(generator, chosen_split, world)
+    config = trial_config(simulations, generator, camera)
+    folder = None if out is None else make_folder(out)
     with progress_bar() as progress:
         progress.add_task("running the trial (the first decision compiles the planner)", total=None)
         trial = run_trial(
-            world,
-            task,
-            policy,
-            trial_key(seed),
-            trial_config(simulations, generator),
-            environment=f"{environment}/{split}",
-            seed=seed,
+            made,
+            asked,
+            chosen_policy,
+            trial_key(world),
+            config,
+            environment=f"{environment}/{chosen_split}",
+            seed=world,
             estimator=trained,
         )
     files = [] if folder is None else _write(trial, folder, animation)
@@ -62,11 +114,41 @@ def run_one(
         print_json({**trial.summary(), "files": [str(file) for file in files]})
     else:
         _print(trial, files)
+    if trial.outcome is Outcome.INFEASIBLE:
+        logger.warning(_why_infeasible(generator, chosen_split, asked, config, world=world))
     if trial.outcome is not Outcome.SATISFIED:
         raise typer.Exit(FAILED)
 
 
-def _write(trial: Trial, folder: Path, animation: bool) -> list[Path]:
+def _why_infeasible(generator: "Generator", split: "Split", task: "Task", config: "TrialConfig", *, world: int) -> str:
+    """Whether the world or the policy is at fault, and another world to try."""
+    from potlp_jax.cli.inputs import make_world
+    from potlp_jax.environments.splits import MAX_INDEX
+    from potlp_jax.planning.policies import Policy
+    from potlp_jax.trials.loop import run_trial
+    from potlp_jax.trials.record import Outcome
+    from potlp_jax.trials.rules import trial_key
+
+    def is_possible(number: int) -> bool:
+        # The planner that knows the map from the start finds every path there is.
+        made = make_world(generator, split, number)
+        return run_trial(made, task, Policy.KNOWN_MAP, trial_key(number), config).outcome is Outcome.SATISFIED
+
+    if is_possible(world):
+        return "with the whole map the task is possible in this world: the policy went where it cannot be satisfied"
+    following = range(world + 1, min(world + WORLDS_TRIED, MAX_INDEX) + 1)
+    other = next((number for number in following if is_possible(number)), None)
+    if other is None:
+        return f"with the whole map it is impossible too, as in the {len(following)} worlds that follow: check the task"
+    return f"with the whole map it is impossible too: try --world {other}"
+
+
+def _write(trial: "Trial", folder: Path, animation: bool) -> list[Path]:
+    from potlp_jax.cli.inputs import RECORD
+    from potlp_jax.view.animation import save_animation
+    from potlp_jax.view.maps import draw_trial
+    from potlp_jax.view.style import save_figure
+
     files = [folder / RECORD, folder / "trial.png"]
     trial.save(files[0])
     save_figure(draw_trial(trial), files[1])
@@ -80,16 +162,19 @@ def _write(trial: Trial, folder: Path, animation: bool) -> list[Path]:
     return files
 
 
-def _print(trial: Trial, files: list[Path]) -> None:
+def _print(trial: "Trial", files: list[Path]) -> None:
+    from potlp_jax.trials.record import Outcome
+    from potlp_jax.types import status_names
+
     out = console()
     colour = "green" if trial.outcome is Outcome.SATISFIED else "red"
     out.print(f"[bold {colour}]{trial.outcome.value}[/]  cost {trial.cost:.2f}")
     summary = trial.summary()
-    for name in ("task", "environment", "seed", "policy", "steps", "decisions", "fallbacks"):
-        out.print(f"{name:12} {summary[name]}", markup=False)
+    for label, name in _SHOWN.items():
+        out.print(f"{label:12} {summary[name]}", markup=False)
     if trial.status:
-        flags = [str(flag.name).lower().replace("_", " ") for flag in Status(trial.status)]
-        out.print(f"{'status':12} {', '.join(flags)}", markup=False)
+        flags = ", ".join(status_names(trial.status)).replace("_", " ")
+        out.print(f"{'status':12} {flags}", markup=False)
     for file in files:
         out.print(f"wrote {file}", markup=False)
     if files:

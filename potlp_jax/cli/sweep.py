@@ -3,67 +3,135 @@
 import csv
 import dataclasses
 import json as json_module
+import logging
 import os
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from potlp_jax.cli.output import console, fail, note, output_folder, print_json, progress_bar
-from potlp_jax.environments.splits import Split
-from potlp_jax.sweep.results import compare_pairs, pair_rows
-from potlp_jax.sweep.runner import RESULTS, Progress, run_sweep
-from potlp_jax.sweep.specification import read_specification
-from potlp_jax.sweep.store import Row, Store
-from potlp_jax.view.comparisons import loss_lines, outcome_table, savings_table
+import typer
+from rich.console import Console
+from typer.core import TyperGroup
 
-PLAIN_SECONDS: float = 10.0
-"""Seconds between lines of progress where stderr is no terminal."""
+from potlp_jax.cli.group import Command, command_app
+from potlp_jax.cli.options import Json, SweepFolder
+from potlp_jax.cli.output import console, fail, make_folder, print_json, progress_bar
+
+if TYPE_CHECKING:
+    from potlp_jax.sweep.results import CellResults
+    from potlp_jax.sweep.runner import Progress
+    from potlp_jax.sweep.specification import Specification
+    from potlp_jax.sweep.store import Row
+
+logger = logging.getLogger(__name__)
+
+SECONDS_BETWEEN_LINES: float = 10.0
+"""Between lines of progress where stderr is no terminal."""
 
 
-def sweep(file: Path, out: Path, processes: int | None, json: bool) -> None:
-    """Run what is missing of a sweep, then print its tables."""
+class _RunByDefault(TyperGroup):
+    """A group whose first command runs where none is named: `potlp sweep FILE.yaml`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if args and not args[0].startswith("-") and args[0] not in self.commands:
+            args = [next(iter(self.commands)), *args]
+        return super().parse_args(ctx, args)
+
+
+app = command_app(
+    "sweep",
+    "Run many paired trials; show or export their results. [cyan]potlp sweep FILE.yaml --out DIR[/cyan] runs.",
+    _RunByDefault,
+)
+
+
+@app.command(
+    "run",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp sweep eval/sweeps/validation.yaml --out out/validation[/cyan]
+
+[cyan]potlp sweep mine.yaml --out out/mine --processes 1[/cyan]
+
+[dim]Killed or interrupted, the same command again continues; several may run on one folder. docs/sweeps.md describes
+the file.[/dim]
+""",
+)
+def run(
+    file: Annotated[Path, typer.Argument(metavar="FILE.yaml", help="What to run: docs/sweeps.md.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")],
+    processes: Annotated[
+        int | None, typer.Option(min=1, help="Workers, each on a core of its own; default: one per core.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Run environments × tasks × policies × worlds, or what is missing of it."""
+    from potlp_jax.cli.inputs import warn_of_test_worlds
+    from potlp_jax.environments.splits import Split
+    from potlp_jax.sweep.specification import read_specification
+
     specification = read_specification(file)
     if specification.split is Split.TEST:
-        note("worlds of the test split are for reported figures: log this run")
-    folder = output_folder(out)
-    assert folder is not None
-    run_sweep(specification, folder, processes or _cores(), _Reporter().report)
-    show_sweep(folder, json)
+        warn_of_test_worlds()
+    run_reported(specification, make_folder(out), processes)
+    show(out, json)
 
 
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+@app.command("show", cls=Command)
+def show(folder: SweepFolder, json: Json = False) -> None:
+    """Show the tables of what is finished."""
+    from potlp_jax.cli.inputs import open_store
+    from potlp_jax.sweep.results import read_results
+
+    with open_store(folder) as store:
+        results = read_results(store)
+    if json:
+        print_json(results.to_dict())
+        return
+    for cell in results.cells:
+        print_cell(console(), cell, results.specification["split"])
+
+
+def run_reported(specification: "Specification", folder: Path, processes: int | None) -> None:
+    """Run what is missing of a sweep, with progress on stderr; ``processes`` None: one per core."""
+    from potlp_jax.sweep.runner import run_sweep
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    run_sweep(specification, folder, processes or cores, _Reporter().report)
 
 
 class _Reporter:
-    """Progress on stderr: a line now and then, with the rate since the start and the time that is left."""
+    """Progress on stderr: a bar on a terminal, otherwise a line now and then; with the rate and the time remaining."""
 
     def __init__(self) -> None:
-        self._start, self._first, self._said = time.monotonic(), -1, 0.0
+        self._start, self._done_before, self._last_line = time.monotonic(), -1, 0.0
         self._bar = progress_bar()
         self._task: Any = None
 
-    def report(self, progress: Progress) -> None:
-        if self._first < 0:
-            self._first = progress.done
+    def report(self, progress: "Progress") -> None:
+        if self._done_before < 0:
+            # A sweep that continues has trials from before, which say nothing about the rate of this run.
+            self._done_before = progress.done
             self._bar.start()
             self._task = self._bar.add_task("trials (the first ones compile)", total=progress.total)
         text = self._rate(progress)
         self._bar.update(self._task, completed=progress.done, description=f"trials{text}")
         finished = progress.done >= progress.total
         now = time.monotonic()
-        if self._bar.disable and (finished or now - self._said >= PLAIN_SECONDS):
-            self._said = now
-            note(f"{progress.done} of {progress.total} trials{text}")
+        if self._bar.disable and (finished or now - self._last_line >= SECONDS_BETWEEN_LINES):
+            self._last_line = now
+            logger.info(f"{progress.done} of {progress.total} trials{text}")
         if finished:
             self._bar.stop()
 
-    def _rate(self, progress: Progress) -> str:
-        seconds, done = time.monotonic() - self._start, progress.done - self._first
+    def _rate(self, progress: "Progress") -> str:
+        seconds, done = time.monotonic() - self._start, progress.done - self._done_before
         if done < 1:
             return ""
-        left = (progress.total - progress.done) * seconds / done
-        return f" ({done / seconds:.2f} a second, {_duration(left)} left)"
+        remaining = (progress.total - progress.done) * seconds / done
+        return f" ({done / seconds:.2f} a second, {_duration(remaining)} remaining)"
 
 
 def _duration(seconds: float) -> str:
@@ -71,66 +139,39 @@ def _duration(seconds: float) -> str:
     return f"{round(seconds)} s" if seconds < 90 else f"{minutes} min" if minutes < 90 else f"{minutes / 60:.1f} h"
 
 
-def open_store(folder: Path) -> Store:
-    """The store of a sweep that has been begun."""
-    if not (folder / RESULTS).is_file():
-        fail(
-            f"{folder}: there is no sweep in here (no {RESULTS}); begin one with `potlp sweep FILE.yaml --out {folder}`"
-        )
-    return Store(folder / RESULTS)
+def print_cell(out: Console, cell: "CellResults", split: str) -> None:
+    """The results of one environment and task: a heading, one table, and what qualifies it."""
+    from potlp_jax.view.comparisons import comparison_table, remark_lines
+
+    redrawn = f", {cell.redrawn} impossible ones left out" if cell.redrawn else ""
+    out.print(
+        f"{cell.environment}/{split}, task {cell.task}: {len(cell.pairs)} worlds{redrawn}", markup=False, style="bold"
+    )
+    out.print(comparison_table(cell.comparison))
+    for line in remark_lines(cell.comparison):
+        out.print(line, markup=False)
 
 
-def show_sweep(folder: Path, json: bool) -> None:
-    """Print the tables of what is finished: one per environment and task."""
-    store = open_store(folder)
-    specification = store.facts()["specification"]
-    comparisons = {
-        (cell["environment"], cell["task"]): compare_pairs(
-            pair_rows(store.rows(cell["environment"], cell["task"]), specification["policies"]),
-            specification["policies"],
-        )
-        for cell in specification["cells"]
-    }
-    store.close()
-    if json:
-        print_json(
-            {
-                "specification": specification,
-                "cells": [
-                    {"environment": environment, "task": task, **comparison.to_dict()}
-                    for (environment, task), comparison in comparisons.items()
-                ],
-            }
-        )
-        return
-    out = console()
-    for (environment, task), comparison in comparisons.items():
-        out.print(f"{environment}/{specification['split']}, task {task}", markup=False, style="bold")
-        satisfied, charged = comparison.satisfied, comparison.charged
-        out.print(savings_table(satisfied, f"{satisfied.pairs} worlds that every policy satisfied"))
-        if satisfied.dropped:
-            title = f"all {charged.pairs} worlds, unsatisfied trials charged their budget"
-            out.print(savings_table(charged, title))
-            out.print(outcome_table(comparison))
-        for line in loss_lines(comparison):
-            out.print(line, markup=False)
+@app.command("export", cls=Command)
+def export(
+    folder: SweepFolder,
+    out: Annotated[Path, typer.Option("--out", "-o", help="File to write: .csv or .parquet.")],
+) -> None:
+    """Write one line per finished trial to a file."""
+    from potlp_jax.cli.inputs import open_store
 
-
-def export_sweep(folder: Path, file: Path) -> None:
-    """Write the finished trials to a .csv or .parquet file."""
-    store = open_store(folder)
-    rows = [_flat(row) for row in store.rows()]
-    store.close()
-    if file.suffix == ".csv":
-        _write_csv(rows, file)
-    elif file.suffix == ".parquet":
-        _write_parquet(rows, file)
+    with open_store(folder) as store:
+        rows = [_flat(row) for row in store.rows()]
+    if out.suffix == ".csv":
+        _write_csv(rows, out)
+    elif out.suffix == ".parquet":
+        _write_parquet(rows, out)
     else:
-        fail(f"--out {file}: give a name that ends in .csv or .parquet")
-    console().print(f"wrote {len(rows)} trials to {file}", markup=False)
+        fail(f"--out {out}: give a name that ends in .csv or .parquet")
+    console().print(f"wrote {len(rows)} trials to {out}", markup=False)
 
 
-def _flat(row: Row) -> dict[str, Any]:
+def _flat(row: "Row") -> dict[str, Any]:
     """One level of plain values."""
     values = dataclasses.asdict(row)
     item = values.pop("item")

@@ -1,51 +1,86 @@
 """``potlp task``: what a formula means."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import typer
 from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
-from potlp_jax.cli.inputs import read_task
+from potlp_jax.cli.group import Command, command_app
+from potlp_jax.cli.options import Formula, Json, Propositions
 from potlp_jax.cli.output import console, print_json
-from potlp_jax.view.automata import Automaton, draw_automaton
-from potlp_jax.view.style import save_figure
+from potlp_jax.task.task import Task
+from potlp_jax.task.words import transition_words
+
+app = command_app()
 
 
+@app.command(
+    "task",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp task "F goal"[/cyan]
+
+[cyan]potlp task "(!fire U extinguisher) & F fire" --propositions fire,extinguisher,exit --out task.svg[/cyan]
+
+[cyan]potlp task automaton.hoa --json[/cyan]
+""",
+)
 def show_task(
-    formula: str, propositions: str | None, max_positive_literals: int | None, svg: Path | None, json: bool
+    formula: Formula,
+    propositions: Propositions = None,
+    max_positive_literals: Annotated[
+        int | None, typer.Option(min=0, help="Leave out ways that need more propositions to hold in one place.")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="Draw the automaton (.png, .svg, .pdf), or write it as .dot or .mmd (Mermaid)."
+        ),
+    ] = None,
+    json: Json = False,
 ) -> None:
-    """Print the automaton of a formula, and draw it if asked to."""
-    names = None if propositions is None else [name.strip() for name in propositions.split(",") if name.strip()]
-    task = read_task(formula, names, max_positive_literals)
+    """Show a task as an automaton: states, transitions, and the outcomes that have to be estimated."""
+    from potlp_jax.cli.inputs import read_names
+    from potlp_jax.task.reading import read_task
+
+    task = read_task(formula, read_names(propositions), max_positive_literals)
     description = task.describe()
-    if svg is not None:
-        save_figure(draw_automaton(Automaton.from_description(description), task.text), svg)
+    if out is not None:
+        from potlp_jax.view.automata import save_automaton
+
+        save_automaton(task, out)
     if json:
         print_json(description)
         return
-    out = console()
-    out.print(task.text, style="bold", markup=False)
-    out.print(f"propositions: {', '.join(task.propositions) or 'none'}", markup=False)
-    out.print(_states(description))
+    shown = console()
+    shown.print(task.text, style="bold", markup=False)
+    shown.print(f"propositions: {', '.join(task.propositions) or 'none'}", markup=False)
+    shown.print(_states(task, description))
     if description["classes"]:
-        out.print(_classes(description))
-    if svg is not None:
-        out.print(f"wrote {svg}", markup=False)
+        shown.print(_classes(description))
+    if out is not None:
+        shown.print(f"wrote {out}", markup=False)
 
 
-def _states(description: dict[str, Any]) -> Table:
+def _states(task: Task, description: dict[str, Any]) -> Table:
     table = Table(title="states and transitions", title_justify="left", box=SIMPLE_HEAD)
     table.add_column("state", justify="right")
     table.add_column("role")
     table.add_column("to", justify="right")
+    table.add_column("in words")
     table.add_column("when")
     for state in range(description["states"]):
         moves = [move for move in description["transitions"] if move["from"] == state]
         for line, move in enumerate(moves):
             first = (str(state), _role(state, description)) if line == 0 else ("", "")
-            table.add_row(*first, str(move["to"]), escape(move["guard"]), end_section=line == len(moves) - 1)
+            words = transition_words(task, state, move["to"])
+            end = line == len(moves) - 1
+            table.add_row(*first, str(move["to"]), escape(words), escape(move["guard"]), end_section=end)
     return table
 
 

@@ -1,35 +1,52 @@
 """``potlp view``: a recorded trial as a page in the browser."""
 
-import webbrowser
 from pathlib import Path
+from typing import Annotated
 
-import numpy as np
-from jaxtyping import UInt8
+import typer
 
-from potlp_jax.cli.output import console, fail, note
-from potlp_jax.cli.run import RECORD
-from potlp_jax.trials.record import Trial, load_trial
-from potlp_jax.trials.replay import panorama_at
-from potlp_jax.view.replay_page import replay_page
+from potlp_jax.cli.group import Command, command_app
+from potlp_jax.cli.options import OpenPage, TrialFile
+from potlp_jax.cli.output import console, fail, open_page
 
 PAGE: str = "replay.html"
 """Name of the page beside the record, unless another is given."""
 
+app = command_app()
 
-def view_trial(record: Path, out: Path | None, open_it: bool) -> None:
-    """Write the replay of a trial and, unless told otherwise, open it."""
-    file = record / RECORD if record.is_dir() else record
-    trial = load_trial(file)
+
+@app.command(
+    "view",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp view out/fire[/cyan] - out/fire/replay.html, opened in the browser
+
+[cyan]potlp view out/fire/trial.json --out page.html --no-open[/cyan]
+
+[dim]The page is one file. Arrow keys go by steps, Page Up and Page Down by decisions.[/dim]
+""",
+)
+def view_trial(
+    trial: TrialFile,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Page to write; default: replay.html beside it.")
+    ] = None,
+    open_it: OpenPage = True,
+) -> None:
+    """Replay a trial in the browser: the map as it was revealed, the actions and panoramas of every decision."""
+    from potlp_jax.cli.inputs import record_file
+    from potlp_jax.trials.record import load_trial
+    from potlp_jax.trials.replay import panoramas_of
+    from potlp_jax.view.replay_page import replay_page
+
+    file = record_file(trial)
+    recorded = load_trial(file)
     page = out or file.with_name(PAGE)
     if page.suffix != ".html":
         fail(f"--out {page}: give a name that ends in .html")
-    page.write_text(replay_page(trial, panoramas_of(trial)), "utf-8")
+    page.write_text(replay_page(recorded, panoramas_of(recorded)), "utf-8")
     console().print(f"wrote {page}", markup=False)
-    if open_it and not webbrowser.open(page.resolve().as_uri()):
-        note("there is no browser to open it with")
-
-
-def panoramas_of(trial: Trial) -> dict[int, UInt8[np.ndarray, "rows columns 3"]]:
-    """What the camera saw at the decisions whose panoramas were used, by number; none for policies that do not look."""
-    looks = sorted({look for decision in trial.decisions for look in decision.looks})
-    return {look: np.asarray(panorama_at(trial, trial.decisions[look])) for look in looks}
+    if open_it:
+        open_page(page)

@@ -12,6 +12,7 @@ from jaxtyping import PRNGKeyArray
 
 from potlp_jax.environments.splits import Split, default_split, world_key
 from potlp_jax.errors import TaskError
+from potlp_jax.task.reading import read_task
 from potlp_jax.task.task import Task
 from potlp_jax.world.grid import World
 from potlp_jax.world.settings import NO_SETTINGS, Settings
@@ -64,19 +65,25 @@ class Generator(abc.ABC):
         return self.generate(world_key(default_split(self.name) if split is None else split, index, self.name))
 
     def task(self, text: str | int) -> Task:
-        """One of the family's tasks by number (or name), or the task of a formula over the family's propositions.
+        """A task over the family's propositions.
+
+        Args:
+            text: number (or name) of one of the family's tasks, a formula, the name of a shipped task, or a ``.hoa``
+                file.
 
         Raises:
             TaskError: there is no such task, or the formula is none.
         """
+        # A number that is none of the tasks would be read as a formula, in which 1 and 0 are constants.
         formula = self.tasks.get(str(text), str(text))
         if formula.strip().isdecimal():
             known = ", ".join(f"{number} ({entry})" for number, entry in self.tasks.items()) or "none"
             raise TaskError(f"{self.name} has no task {text}; it has: {known}. Or give a formula.")
-        return Task.of_formula(formula, self.propositions)
+        return read_task(formula, self.propositions)
 
 
 def host_generators(key: PRNGKeyArray, count: int) -> tuple[np.random.Generator, ...]:
     """Independent NumPy generators from one typed key, so that, say, new colours never move a wall."""
+    # SeedSequence mixes the words of the key, and its children are independent by construction.
     words = np.asarray(jax.random.key_data(key)).tolist()
     return tuple(np.random.default_rng(child) for child in np.random.SeedSequence(words).spawn(count))

@@ -26,6 +26,7 @@ Cell = tuple[int, int]
 
 HALLWAYS: int = 3
 
+# RGB in full light. Rooms are brownish, hallways bluish; only the tiles of the dead end tell one hallway from another.
 _ROOM_FLOOR, _ROOM_WALL = (164, 148, 128), (214, 206, 188)
 _HALLWAY_FLOOR, _HALLWAY_WALL = (128, 132, 142), (188, 196, 206)
 _GREEN_TILES = ((40, 150, 70), (96, 196, 112))
@@ -65,6 +66,8 @@ class FirefightingConfig:
         tint: largest shift of each colour, per world; tint_noise: of the brightness, per cell (both of 255).
     """
 
+    # What the paper leaves open was chosen with eval.calibrate_firefighting on the calibration split, so that the mean
+    # costs of known map and baseline come near to those of its Table I. No learned planner was involved.
     room_width: int = 30
     room_height: int = 60
     hallway_length: int = 120
@@ -171,6 +174,7 @@ class Firefighting(Generator):
 
 def hallway_rows(config: FirefightingConfig, hallway: int) -> tuple[int, int]:
     """The rows of a hallway, as a half-open interval."""
+    # The three hallways are centred on the rooms' height; row 0 is the outer wall.
     used = (HALLWAYS - 1) * config.hallway_spacing + config.hallway_width
     first = 1 + (config.room_height - used) // 2 + hallway * config.hallway_spacing
     return first, first + config.hallway_width
@@ -188,20 +192,23 @@ def room_columns(config: FirefightingConfig, room: Room) -> tuple[int, int]:
 
 
 def _draw_layout(config: FirefightingConfig, rng: np.random.Generator) -> FirefightingLayout:
-    # One number a choice, always in this order.
+    # One number a choice, always in this order: a changed configuration moves nothing that it does not concern.
     side, mouth_chance, dead_end_chance, fire_chance, fire_share, *cell_chances = rng.random(8)
     robot_room = Room.LEFT if side < 0.5 else Room.RIGHT
     mouth = robot_room if mouth_chance < config.dead_end_opens_into_robot_room else robot_room.other
     dead_end, fire_hallway = int(dead_end_chance * HALLWAYS), int(fire_chance * HALLWAYS)
+    # A patch reaches beyond its middle, so its middle keeps a distance from the walls; the start is a single cell.
     start = _cell_at(_room_cells(config, robot_room, 0), cell_chances[0])
     far_cells = _room_cells(config, robot_room.other, config.patch_radius)
     extinguisher = _cell_at(far_cells, cell_chances[1])
+    # The patches of extinguisher and exit share no cell.
     apart = np.abs(far_cells - np.array(extinguisher)).max(axis=1) > 2 * config.patch_radius
     length = config.dead_end_length
     filled = config.hallway_length - length if config.stub_filled else config.dead_end_wall
-    room = length - config.alarm_depth if fire_hallway == dead_end else config.hallway_length
+    # In the dead end the fire lies between the mouth and the alarm, elsewhere anywhere in the hallway.
+    space = length - config.alarm_depth if fire_hallway == dead_end else config.hallway_length
     low, high = config.fire_range
-    fire = round((low + (high - low) * fire_share) * (room - config.fire_thickness))
+    fire = round((low + (high - low) * fire_share) * (space - config.fire_thickness))
     fire_from = mouth if fire_hallway == dead_end else Room.LEFT
     return FirefightingLayout(
         robot_room=robot_room,
@@ -247,6 +254,7 @@ def _walls(config: FirefightingConfig, layout: FirefightingLayout) -> Bool[np.nd
         occupied[1:-1, slice(*room_columns(config, room))] = False
     for hallway in range(HALLWAYS):
         occupied[slice(*hallway_rows(config, hallway)), slice(*hallway_columns(config))] = False
+    # Last, because it closes a hallway that has just been opened.
     occupied[slice(*hallway_rows(config, layout.dead_end)), slice(*layout.closed_columns)] = True
     return occupied
 
@@ -256,6 +264,7 @@ def _letters(
 ) -> Int32[np.ndarray, "H W"]:
     letters = np.zeros(config.shape, np.int32)
     bit = {name: np.int32(1 << index) for index, name in enumerate(propositions)}
+    # The fire burns over the whole width of its hallway, so that nobody walks past it.
     letters[slice(*hallway_rows(config, layout.fire_hallway)), slice(*layout.fire_columns)] |= bit["fire"]
     letters[slice(*hallway_rows(config, layout.dead_end)), slice(*layout.alarm_columns)] |= bit["alarm"]
     for name, (row, column) in (("extinguisher", layout.extinguisher), ("exit", layout.exit)):
@@ -278,8 +287,10 @@ def _appearance(
     green = np.zeros(config.shape, bool)
     green[slice(*hallway_rows(config, layout.dead_end)), slice(*layout.dead_end_columns)] = True
     even = (rows // config.tile_size + columns // config.tile_size) % 2 == 0
+    # Every world has its own shade of each colour: a network must not learn one by heart.
     tints = rng.integers(-config.tint, config.tint + 1, size=(6, 3))
     palette = np.array([_ROOM_FLOOR, _HALLWAY_FLOOR, *_GREEN_TILES, _ROOM_WALL, _HALLWAY_WALL]) + tints
+    # Indices into the palette.
     floor = np.where(green, np.where(even, 2, 3), np.where(in_hallways, 1, 0))
     wall = np.where(room_side, 4, 5)
     noise = rng.integers(-config.tint_noise, config.tint_noise + 1, size=(2, *config.shape, 1))
@@ -299,9 +310,11 @@ def _smoke(
     config: FirefightingConfig, layout: FirefightingLayout, occupied: Bool[np.ndarray, "H W"]
 ) -> Float32[np.ndarray, "H W"]:
     """Densest at the fire, thinner along its hallway; it does not pass the wall that closes a dead end."""
+    # In the dead end smoke stays behind the closing wall; in an open hallway it fills the whole length.
     burning = layout.dead_end_columns if layout.alarm_blocked else hallway_columns(config)
     columns = np.arange(config.shape[1])
     first, last = layout.fire_columns
+    # Columns from the nearest end of the fire, 0 inside of it.
     away = np.maximum(np.maximum(first - columns, columns - (last - 1)), 0)
     density = config.smoke_density * np.exp(-away / config.smoke_reach)
     smoke = np.zeros(config.shape, np.float32)
@@ -313,6 +326,7 @@ def _check(config: FirefightingConfig) -> None:
     used = (HALLWAYS - 1) * config.hallway_spacing + config.hallway_width
     low, high = config.fire_range
     patch = 2 * config.patch_radius + 1
+    # All that is wrong is said at once, so that a configuration is mended in one go.
     rules = (
         (config.hallway_width >= 1, "hallway_width must be at least 1"),
         (
@@ -332,7 +346,7 @@ def _check(config: FirefightingConfig) -> None:
         ),
         (
             config.dead_end_length + config.dead_end_wall <= config.hallway_length,
-            f"dead_end_fraction {config.dead_end_fraction} leaves no room for the closing wall",
+            f"dead_end_fraction {config.dead_end_fraction} leaves no space for the closing wall",
         ),
         (0 <= config.dead_end_opens_into_robot_room <= 1, "dead_end_opens_into_robot_room is a probability"),
         (0 <= low <= high <= 1, f"fire_range must be two shares in increasing order, found {config.fire_range}"),

@@ -19,14 +19,19 @@ def parse_options(
         options: the type of each option.
         usage: ends every message.
 
+    Returns:
+        The path, and the values of the options that are given, by name.
+
     Raises:
         MapError: the text is not of that form, or an option is unknown, given twice, or no number where it must be.
     """
+    # Names of files hold no comma, so the first one ends the path.
     path, *given = spec.removeprefix(prefix).split(",")
     if not spec.startswith(prefix) or not path:
         raise MapError(spec, "", f"names no {kind}; {usage}")
     values: dict[str, Any] = {}
     for text in given:
+        # Only known options match: a path's own "=" would otherwise pass for one.
         match = re.fullmatch(rf"({'|'.join(options)})=(.+)", text)
         if match is None or match[1] in values:
             raise MapError(spec, text, f"is no option, or given twice; {usage}")

@@ -67,12 +67,14 @@ class Rooms(Generator):
     def draw(self, key: PRNGKeyArray) -> World:
         """The floor of this key."""
         (rng,) = host_generators(key, 1)
+        # The size, then the walls, the doors, the start and the letters: the order of the draws is part of the world.
         height, width = (int(rng.integers(self.config.smallest, self.config.largest + 1)) for _ in range(2))
         rows, columns = (_walls(rng, size, self.config.room) for size in (height, width))
         occupied = _floor(rng, self.config, rows, columns)
         free = np.argwhere(~occupied)
         start = free[rng.integers(len(free))]
         world = make_world(occupied, _letters(rng, self.config, occupied), (int(start[0]), int(start[1])))
+        # All floors of a family have one array shape, so that one compilation serves them all.
         return pad_world(world, self.config.largest, self.config.largest)
 
 
@@ -87,6 +89,7 @@ def _tasks(propositions: tuple[str, ...]) -> dict[str, str]:
 def _walls(rng: np.random.Generator, size: int, room: int) -> list[int]:
     """Positions of the walls across one axis, both ends included, at least a room apart."""
     walls = [0]
+    # As long as two rooms and the wall between them fit; what remains at the end is the last room.
     while size - 1 - walls[-1] > 2 * (room + 1):
         walls.append(walls[-1] + 1 + int(rng.integers(room, min(2 * room, size - 2 - walls[-1] - room) + 1)))
     return [*walls, size - 1]
@@ -98,6 +101,7 @@ def _floor(
     occupied = np.zeros((rows[-1] + 1, columns[-1] + 1), bool)
     occupied[rows] = True
     occupied[:, columns] = True
+    # Three cells a side, in the middle of a room: small enough to leave a way around it in the smallest room.
     for i in range(len(rows) - 1):
         for j in range(len(columns) - 1):
             if rng.random() < config.obstacles:
@@ -114,10 +118,12 @@ def _doors(
     """Pairs of neighbouring rooms to join: a random spanning tree (Kruskal), and some of the others."""
     down = [((i, j), (i + 1, j)) for i in range(height - 1) for j in range(width)]
     pairs = down + [((i, j), (i, j + 1)) for i in range(height) for j in range(width - 1)]
+    # Union-find without ranks: there are at most some hundred rooms.
     group = {(i, j): (i, j) for i in range(height) for j in range(width)}
     joined = []
     for index in rng.permutation(len(pairs)):
         first, second = pairs[index]
+        # A door between two groups belongs to the tree; one inside of a group closes a loop.
         separate = group[first] != group[second]
         if separate or rng.random() < config.loops:
             joined.append((first, second))
@@ -137,6 +143,7 @@ def _carve(
     second: tuple[int, int],
 ) -> None:
     """Open a door in the wall between two neighbouring rooms."""
+    # ``first`` is above or to the left of ``second``, so the wall is the one after ``first``.
     (i, j), below = first, first[0] != second[0]
     along = (columns[j], columns[j + 1]) if below else (rows[i], rows[i + 1])
     start = int(rng.integers(along[0] + 1, along[1] - width + 1))
@@ -153,8 +160,10 @@ def _letters(
     letters = np.zeros(occupied.shape, np.int32)
     free = np.argwhere(~occupied)
     for bit in range(len(config.propositions)):
+        # Middles of patches are drawn from all free cells, with replacement: patches may coincide.
         for row, column in free[rng.integers(len(free), size=config.patches)]:
             reach = config.patch_radius
             patch = (slice(max(row - reach, 0), row + reach + 1), slice(max(column - reach, 0), column + reach + 1))
             letters[patch] |= 1 << bit
+    # Patches reach over walls; an obstacle has no letter.
     return np.where(occupied, 0, letters).astype(np.int32)

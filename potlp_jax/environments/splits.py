@@ -23,10 +23,12 @@ from jaxtyping import PRNGKeyArray
 
 from potlp_jax.errors import WorldError
 
+# The four highest bits number the split, which leaves space for sixteen.
 _INDEX_BITS = 28
 MAX_INDEX: int = 2**_INDEX_BITS - 1
 """Largest index of a world in a split."""
 
+# Any number would do; another one would make other worlds, and published results would not be comparable.
 _ROOT_SEED = 20210531
 
 
@@ -48,6 +50,7 @@ PARCELS_PREFIX = "parcels:"
 
 def usable_splits(family: str) -> tuple[Split, ...]:
     """The splits from which worlds of a family may be drawn."""
+    # By name, because a family says so itself nowhere else that a command line could look up before it reads a map.
     return (Split.TEST,) if family.startswith((FLOOR_PLAN_PREFIX, PARCELS_PREFIX)) else tuple(Split)
 
 
@@ -66,7 +69,15 @@ def check_split(split: Split, family: str) -> None:
 
 
 def world_key(split: Split | str, index: int, family: str) -> PRNGKeyArray:
-    """The typed key of world ``index`` of a split of a family of worlds.
+    """The key of a world.
+
+    Args:
+        split: what the world may be used for.
+        index: number of the world in the split.
+        family: name of the family (``Generator.name``).
+
+    Returns:
+        A typed key, of which ``Generator.generate`` makes the world.
 
     Raises:
         ValueError: where the index is negative or above ``MAX_INDEX``, or the split has no such name.
@@ -76,5 +87,7 @@ def world_key(split: Split | str, index: int, family: str) -> PRNGKeyArray:
     number = list(Split).index(Split(split))
     if not 0 <= index <= MAX_INDEX:
         raise ValueError(f"the index of a world must lie in 0..{MAX_INDEX}, found {index}")
+    # The implementation is named, so that no setting of jax changes the worlds; CRC-32, because Python's own hash of a
+    # text differs between processes.
     family_key = jax.random.fold_in(jax.random.key(_ROOT_SEED, impl="threefry2x32"), zlib.crc32(family.encode()))
     return jax.random.fold_in(family_key, number << _INDEX_BITS | index)

@@ -49,12 +49,13 @@ class Toy(Generator):
     tasks: Mapping[str, str] = MappingProxyType({"1": "F goal", "2": "!hazard U goal"})
 
     def __init__(self, config: ToyConfig | None = None) -> None:
-        self.config = ToyConfig() if config is None else config
+        self.config: ToyConfig = ToyConfig() if config is None else config
 
     def draw(self, key: PRNGKeyArray) -> World:
         """The world of this key. Raises WorldError where the configuration puts something on a wall."""
         config = self.config
         (rng,) = host_generators(key, 1)
+        # Rows and columns 0 and the last are the outer wall; the middle column is the wall between the rooms.
         middle = config.width // 2
         rows = np.arange(1, config.height - 1)
         occupied = np.ones((config.height, config.width), bool)
@@ -64,6 +65,7 @@ class Toy(Generator):
         left = [(int(row), column) for row in rows for column in range(1, middle)]
         right = [(int(row), column) for row in rows for column in range(middle + 1, config.width - 1)]
         start = _pick(rng, left, config.start, "the start")
+        # On the cell behind the door the hazard could not be avoided, and the second task would be impossible.
         sealing = (door[0], middle + 1)
         hazard = _pick(rng, [cell for cell in right if cell not in (sealing, config.goal)], config.hazard, "the hazard")
         goal = _pick(rng, [cell for cell in right if cell != hazard], config.goal, "the goal")
@@ -79,6 +81,7 @@ def _door(config: ToyConfig, middle: int) -> Cell | None:
 
 def _pick(rng: np.random.Generator, cells: list[Cell], fixed: Cell | None, what: str) -> Cell:
     """The fixed cell, or one drawn; the draw is made in any case, so that fixing one thing does not move the others."""
+    # A 32-bit number scaled to the list: the same draw whatever the number of cells, unlike that of rejection sampling.
     drawn = cells[int(rng.integers(2**32)) * len(cells) >> 32]
     if fixed is not None and fixed not in cells:
         raise WorldError(f"{what} of the toy world cannot be at {fixed}: allowed are {cells[0]} to {cells[-1]}")

@@ -6,7 +6,6 @@ writes to a temporary name and renames, so a process killed at any time leaves w
 This is the only module that imports Orbax: planning with a trained estimator does without.
 """
 
-import json
 import re
 import shutil
 import zlib
@@ -19,8 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
+from potlp_jax.codec import differences, json_copy
 from potlp_jax.errors import CheckpointError
-from potlp_jax.learning.serialization import array_shapes, differences, named_arrays
+from potlp_jax.learning.serialization import array_shapes, named_arrays
 
 CHECKPOINT_FORMAT: str = "potlp-checkpoint-1"
 """Changed when older checkpoints can no longer be read."""
@@ -47,8 +47,8 @@ def save_checkpoint(
     arrays = named_arrays(state)
     description = {
         "format": CHECKPOINT_FORMAT,
-        "identity": json.loads(json.dumps(identity)),
-        "progress": json.loads(json.dumps(progress)),
+        "identity": json_copy(identity),
+        "progress": json_copy(progress),
         "arrays": array_shapes(arrays),
         "checksum": _checksum(arrays),
     }
@@ -78,7 +78,7 @@ def load_checkpoint(
     if not isinstance(description, Mapping) or description.get("format") != CHECKPOINT_FORMAT:
         found = description.get("format") if isinstance(description, Mapping) else None
         raise CheckpointError(f"{path} has format {found!r}; this library reads {CHECKPOINT_FORMAT!r}")
-    found = differences(description["identity"], json.loads(json.dumps(identity)))
+    found = differences(description["identity"], json_copy(identity))
     found += differences(description["arrays"], array_shapes(wanted), "array")
     if found:
         raise CheckpointError(f"{path} is of another training; choose another folder. {'; '.join(found)}")

@@ -21,7 +21,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float32, Int8, Int32, UInt8
 
-from potlp_jax.errors import DatasetError
+from potlp_jax.codec import config_from_dict, differences, json_copy
+from potlp_jax.errors import ConfigurationError, DatasetError
 
 SCHEMA_VERSION: int = 1
 """Changes when a column or its meaning does."""
@@ -115,13 +116,15 @@ class DatasetMetadata:
                     f"schema version {version}; this library reads {SCHEMA_VERSION}: collect the dataset again, or use "
                     "the version of the library that wrote it"
                 )
-            return cls(**{**data, "propositions": tuple(data["propositions"])})
+            return config_from_dict(cls, data, "metadata")
         except (KeyError, TypeError, json.JSONDecodeError) as error:
             raise DatasetError(f"not the metadata of a dataset: {error!r}") from error
+        except ConfigurationError as error:
+            raise DatasetError(f"not the metadata of a dataset: {error}") from error
 
     def differences(self, other: "DatasetMetadata") -> list[str]:
-        """Names of what differs, with both values; dotted names inside of nested values."""
-        return _differences("", json.loads(self.to_json()), json.loads(other.to_json()))
+        """What differs, with both values: of this dataset, and of the other."""
+        return differences(json_copy(dataclasses.asdict(self)), json_copy(dataclasses.asdict(other)))
 
 
 @dataclass
@@ -176,6 +179,11 @@ def decode(image: bytes) -> UInt8[np.ndarray, "rows columns 3"]:
     if decoded is None:
         raise DatasetError(f"not an image: {len(image)} bytes that OpenCV does not decode")
     return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
+
+
+def writer_versions() -> dict[str, str]:
+    """Versions of the libraries that encode the images and write the files."""
+    return {"pyarrow": pa.__version__, "opencv": cv2.__version__}
 
 
 def views_file(folder: Path | str, shard: int) -> Path:
@@ -233,9 +241,9 @@ def read_metadata(folder: Path | str) -> DatasetMetadata:
     paths = [path(folder, shard) for shard in shards for path in (views_file, samples_file)]
     first = _metadata_of(paths[0], _schema_of(paths[0]))
     for path in paths[1:]:
-        differences = first.differences(_metadata_of(path, _schema_of(path)))
-        if differences:
-            raise DatasetError(f"{path.name} is from another dataset than {paths[0].name}: {'; '.join(differences)}")
+        found = first.differences(_metadata_of(path, _schema_of(path)))
+        if found:
+            raise DatasetError(f"{path.name} is from another dataset than {paths[0].name}: {'; '.join(found)}")
     return first
 
 
@@ -353,11 +361,3 @@ def _index_of(wanted: np.ndarray, views: np.ndarray, path: Path) -> Int32[np.nda
         return np.array([position[view] for view in wanted.tolist()], np.int32)
     except KeyError as error:
         raise _broken(path, f"has samples of view {error}, which is not in the shard") from error
-
-
-def _differences(name: str, one: Any, other: Any) -> list[str]:
-    if isinstance(one, dict) and isinstance(other, dict):
-        prefix = f"{name}." if name else ""
-        keys = sorted({*one, *other})
-        return [found for key in keys for found in _differences(prefix + key, one.get(key), other.get(key))]
-    return [] if one == other else [f"{name} is {one!r} in one and {other!r} in the other"]

@@ -18,17 +18,21 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float32, Int32, UInt8
 
-from potlp_jax.errors import CheckpointError
+from potlp_jax import plugins
+from potlp_jax.errors import CheckpointError, PluginError
 from potlp_jax.learning.memory import Views, look_of_subgoals, no_views, places_of_looks, remember
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
 from potlp_jax.learning.serialization import load_estimator, require_propositions
 from potlp_jax.planning.distances.product import product_distances
-from potlp_jax.planning.estimates import Estimates
+from potlp_jax.planning.estimates import Estimates, Estimator
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_STATE
 from potlp_jax.world.camera import bearing
 from potlp_jax.world.frontiers import Subgoals
 from potlp_jax.world.grid import BeliefMap
+
+GROUP: str = "potlp_jax.estimators"
+"""Entry points of this group are estimators of other packages."""
 
 MEMORY: int = 32
 """Panoramas that are remembered. A trial takes 14 to 100, of which seldom more than a dozen still show a frontier."""
@@ -177,6 +181,42 @@ def read_estimator(path: Path) -> TrainedEstimator:
     params, config, metadata = load_estimator(path)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
     return TrainedEstimator(params=params, config=config, metadata=metadata, name=path.stem, digest=digest)
+
+
+def named_estimator(name: str | Path) -> TrainedEstimator | Estimator:
+    """An estimator by the name that a command line or a sweep's file gives.
+
+    Args:
+        name: a file; or ``module:attribute``, or an entry point in the group ``potlp_jax.estimators``, of a
+            ``TrainedEstimator``, of a function or other pytree that can be called as an ``Estimator``, or of a class
+            without arguments whose objects can.
+
+    Returns:
+        The estimator.
+
+    Raises:
+        CheckpointError: there is no such file, or it is no estimator.
+        PluginError: it cannot be imported, or is no estimator.
+    """
+    path = Path(name)
+    # A file goes first: its name may well contain a colon.
+    if path.is_file() or not plugins.is_known(str(name), GROUP):
+        return read_estimator(path)
+    found = plugins.load(str(name), group=GROUP, kind="estimator")
+    estimator = found() if isinstance(found, type) else found
+    if not (isinstance(estimator, TrainedEstimator) or callable(estimator)):
+        raise PluginError(
+            f"estimator {name}: {type(estimator).__name__} cannot be called with belief, subgoals and task"
+        )
+    return estimator
+
+
+def identity_of(estimator: TrainedEstimator | Estimator) -> str:
+    """What records and stores know an estimator by: name and digest of a file, ``module:attribute`` of a function."""
+    if isinstance(estimator, TrainedEstimator):
+        return estimator.identity
+    # A plain function goes through jit as a ``Partial``, which is a pytree without leaves.
+    return plugins.reference_of(estimator.func if isinstance(estimator, functools.partial) else estimator)
 
 
 def shipped_estimator(propositions: tuple[str, ...]) -> TrainedEstimator | None:

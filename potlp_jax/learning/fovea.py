@@ -27,7 +27,7 @@ def bands_of(pixels: Float32[Array, "*B rows columns 3"]) -> Float32[Array, "*B 
     return jnp.mean(pixels.reshape(*batch, rows // BAND, BAND, columns, colours), axis=-3)
 
 
-def packed(bands: Float32[Array, "*B bands columns 3"], side: int) -> Float32[Array, "*B rows columns_out P"]:
+def packed(bands: Float32[Array, "*B bands columns 3"], side: int) -> Float32[Array, "*B rows columns_out packed"]:
     """The bands as channels of squares of ``side`` pixels, so that they travel with features of that size."""
     *batch, count, columns, colours = bands.shape
     high = side // BAND
@@ -35,7 +35,7 @@ def packed(bands: Float32[Array, "*B bands columns 3"], side: int) -> Float32[Ar
     return jnp.moveaxis(squares, -4, -3).reshape(*batch, count // high, columns // side, high * side * colours)
 
 
-def unpacked(squares: Float32[Array, "rows columns P"], side: int) -> Float32[Array, "bands columns_out 3"]:
+def unpacked(squares: Float32[Array, "rows columns packed"], side: int) -> Float32[Array, "bands columns_out 3"]:
     """The bands again, of one panorama."""
     rows, columns, _ = squares.shape
     high = side // BAND

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 
-from potlp_jax.planning.distances.product import LANES, arrivals_by_lane, distances_by_lane
+from potlp_jax.planning.distances.product import SOURCES_AT_ONCE, arrivals_per_source, distances_per_source
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_STATE
@@ -44,7 +44,7 @@ def true_labels(world: World, belief: BeliefMap, subgoals: Subgoals, task: TaskA
     distance of the farthest unobserved cell that can be reached while staying, one way, 0 if there is none.
     """
     count, states = subgoals.mask.shape[0], task.transitions.shape[0]
-    lanes = max(min(LANES, count * states), 1)
+    lanes = max(min(SOURCES_AT_ONCE, count * states), 1)
     stays = task.transitions == jnp.arange(states, dtype=jnp.int32)[:, None]
     # One state for each class, of those whose staying letters are the class's.
     same_stay = jnp.all(task.class_stay[:, None, :] == stays[None, :, :], axis=2)
@@ -115,11 +115,11 @@ def _labels_of_lanes(
         ]
     )
     start = jnp.where(real, PORCH, NO_STATE).astype(jnp.int32)
-    cost = distances_by_lane(transitions, free, subgoals.cells[subgoal], start, world.resolution)
+    cost = distances_per_source(transitions, free, subgoals.cells[subgoal], start, world.resolution)
 
     # The last move of a success: where it may lead from each phase, whatever the letter.
     ends = (hidden, hidden | way_back, ~hidden & ~own)
-    arrival = arrivals_by_lane(cost, free, world.resolution)
+    arrival = arrivals_per_source(cost, free, world.resolution)
     last = jnp.min(jnp.stack([jnp.where(way, arrival[phase], jnp.inf) for phase, way in enumerate(ends)]), axis=0)
 
     def cheapest(go: Bool[Array, " L"]) -> Float32[Array, " lanes"]:

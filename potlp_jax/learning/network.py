@@ -129,21 +129,6 @@ class NetworkConfig:
         rows, columns = self.image_shape
         return rows // STRIDE, columns // STRIDE, self.first_widths[-1] + (_FINE if self.fovea else 0)
 
-    def to_json(self) -> dict[str, Any]:
-        """The configuration as JSON-able values."""
-        return {
-            name: list(value) if isinstance(value, tuple) else value for name, value in dataclasses.asdict(self).items()
-        }
-
-    @classmethod
-    def from_json(cls, data: dict[str, Any]) -> "NetworkConfig":
-        """What ``to_json`` gave. Raises NetworkError where fields are missing, unknown or do not fit together."""
-        names = {field.name for field in dataclasses.fields(cls)}
-        if set(data) != names:
-            raise NetworkError(f"network configuration: fields {sorted(set(data) ^ names)} are missing or unknown")
-        fields: dict[str, Any] = {n: tuple(value) if isinstance(value, list) else value for n, value in data.items()}
-        return cls(**fields)
-
 
 @struct.dataclass(kw_only=True)
 class Answers:

@@ -6,7 +6,8 @@ tasks, the true P_S, R_S, R_F and the weights of the loss. ``docs/dataset.md`` d
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+import zlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -17,21 +18,30 @@ from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32, UInt8
 from scipy import ndimage
 
-from potlp_jax.learning.dataset import JPEG_QUALITY, SAMPLES_SCHEMA, VIEWS_SCHEMA, encode, view_id
+from potlp_jax.codec import json_copy
+from potlp_jax.learning.dataset import (
+    JPEG_QUALITY,
+    SAMPLES_SCHEMA,
+    VIEWS_SCHEMA,
+    DatasetMetadata,
+    encode,
+    view_id,
+    writer_versions,
+)
 from potlp_jax.learning.labels import true_labels
-from potlp_jax.learning.mistake_costs import WeightBounds, Weights, loss_weights
-from potlp_jax.learning.questions import Question, draw_questions, question_sheet
+from potlp_jax.learning.questions import Question, TaskDistribution, draw_questions, question_sheet
+from potlp_jax.learning.sample_weights import WeightBounds, Weights, loss_weights
 from potlp_jax.planning.distances.product import grid_distances
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.task.task import Task, TaskArrays
-from potlp_jax.world.camera import bearing
+from potlp_jax.world.camera import CameraConfig, Disturbance, bearing
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.sensing import SensorConfig, visible
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ViewConfig:
+class RecordingConfig:
     """What is recorded of a world.
 
     Attributes:
@@ -42,6 +52,9 @@ class ViewConfig:
         classes: outcome classes per view, at most; staying_sets: distinct sets of staying letters among them.
         image_format, quality: of the encoded images: ``jpeg`` or ``png``; quality is JPEG's.
         frontiers: which components of the frontier are subgoals.
+        seed: of everything but the worlds.
+        held_out: formulas whose languages are never drawn.
+        camera: takes the images.
     """
 
     views_per_world: int = 12
@@ -52,6 +65,40 @@ class ViewConfig:
     image_format: str = "jpeg"
     quality: int = JPEG_QUALITY
     frontiers: FrontierConfig = FrontierConfig()
+    seed: int = 0
+    held_out: tuple[str, ...] = ()
+    camera: CameraConfig = CameraConfig()
+
+
+def recording_metadata(
+    config: RecordingConfig, bounds: WeightBounds, versions: Mapping[str, str], **facts: Any
+) -> DatasetMetadata:
+    """What the shards of a dataset share.
+
+    Args:
+        config: becomes ``camera``, ``encoding`` and ``collection``, and ``disturbance`` where it has one.
+        bounds: of the samples' weights.
+        versions: of what the records depend on besides the libraries that write them.
+        facts: the other fields of ``DatasetMetadata``.
+    """
+    settings = json_copy(dataclasses.asdict(config))
+    return DatasetMetadata(
+        camera=settings.pop("camera"),
+        disturbance=settings.pop("disturbance", dataclasses.asdict(Disturbance())),
+        encoding={"format": settings.pop("image_format"), "quality": settings.pop("quality")},
+        weights=dataclasses.asdict(bounds),
+        versions={**versions, **writer_versions()},
+        collection=settings,
+        **facts,
+    )
+
+
+def draws_of_world(
+    config: RecordingConfig, split: str, index: int, tasks: TaskDistribution
+) -> tuple[np.random.Generator, list[Task]]:
+    """The random numbers of one world of a dataset and its pool of tasks; no other world shares them."""
+    rng = np.random.default_rng([config.seed, zlib.crc32(split.encode()), index])
+    return rng, [tasks.draw(rng) for _ in range(config.tasks_per_world)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,7 +173,7 @@ def settled(
 class Recorder:
     """Columns of the views and samples of one shard."""
 
-    def __init__(self, shard: int, config: ViewConfig, bounds: WeightBounds) -> None:
+    def __init__(self, shard: int, config: RecordingConfig, bounds: WeightBounds) -> None:
         self._shard, self._bounds = shard, bounds
         self.config = config
         self.views: dict[str, list[Any]] = {name: [] for name in VIEWS_SCHEMA.names}

@@ -5,6 +5,7 @@ training metadata and figures. One file, not a checkpoint's folder, because it i
 people: it is read with NumPy alone, needs no device topology, and the zip's checksums find damage.
 """
 
+import dataclasses
 import json
 import os
 import zipfile
@@ -17,7 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from potlp_jax.errors import CheckpointError, NetworkError
+from potlp_jax.codec import config_from_dict, differences
+from potlp_jax.errors import CheckpointError, ConfigurationError
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
 
 ESTIMATOR_FORMAT: str = "potlp-estimator-3"
@@ -27,21 +29,12 @@ ESTIMATOR_FORMAT: str = "potlp-estimator-3"
 _HEADER = "header"
 
 
-def differences(stored: Any, expected: Any, name: str = "") -> list[str]:
-    """What differs between two nested JSON values, by dotted name, with both values."""
-    if isinstance(stored, Mapping) and isinstance(expected, Mapping):
-        prefix = f"{name}." if name else ""
-        keys = sorted({*stored, *expected})
-        return [found for key in keys for found in differences(stored.get(key), expected.get(key), prefix + key)]
-    return [] if stored == expected else [f"{name} is {stored} in the file and {expected} here"]
-
-
 def save_estimator(path: Path | str, params: Params, config: NetworkConfig, metadata: Mapping[str, Any]) -> None:
     """Write an estimator, under a temporary name first; ``metadata`` is any JSON-able mapping."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     arrays = named_arrays(params)
-    header = json.dumps({"format": ESTIMATOR_FORMAT, "network": config.to_json(), "metadata": metadata})
+    header = json.dumps({"format": ESTIMATOR_FORMAT, "network": dataclasses.asdict(config), "metadata": metadata})
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("wb") as file:
         contents: dict[str, Any] = {_HEADER: np.frombuffer(header.encode(), np.uint8), **arrays}
@@ -62,15 +55,15 @@ def load_estimator(path: Path | str) -> tuple[Params, NetworkConfig, dict[str, A
             arrays = {name: file[name] for name in file.files}
         header = json.loads(arrays.pop(_HEADER).tobytes().decode())
     except FileNotFoundError as error:
-        raise CheckpointError(f"there is no estimator {path}: train one (python -m train.fit)") from error
+        raise CheckpointError(f"there is no estimator {path}: train one (potlp fit)") from error
     except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
         raise CheckpointError(f"{path} is not an estimator, or is damaged ({error}): get it again") from error
     if not isinstance(header, dict) or header.get("format") != ESTIMATOR_FORMAT:
         found = header.get("format") if isinstance(header, dict) else None
         raise CheckpointError(f"{path} has format {found!r}; this library reads {ESTIMATOR_FORMAT!r}: train it again")
     try:
-        config = NetworkConfig.from_json(header["network"])
-    except NetworkError as error:
+        config = config_from_dict(NetworkConfig, header["network"], "network")
+    except ConfigurationError as error:
         raise CheckpointError(f"{path}: {error}") from error
     like = jax.eval_shape(EstimatorNetwork(config).init, jax.random.key(0))
     wanted = named_leaves(like)

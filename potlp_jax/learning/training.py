@@ -28,12 +28,11 @@ from potlp_jax.learning.loss import DataScale, Evaluation, Sums, evaluation_of, 
 from potlp_jax.learning.network import EstimatorNetwork, Params
 
 
-@dataclasses.dataclass(frozen=True)
-class TrainingConfig:
-    """How to train.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainingOptions:
+    """How to train, apart from how long.
 
     Attributes:
-        steps: planned optimiser steps; the learning rate ends at 0 there.
         seed: of the parameters, the order of the data and the augmentation.
         views_per_batch, samples_per_view: panoramas in a batch, and samples of each; a view with more samples gives
             a new random choice in every epoch, one with fewer is padded.
@@ -50,7 +49,6 @@ class TrainingConfig:
         checkpoint_steps: steps between checkpoints; there is one after every epoch too.
     """
 
-    steps: int
     seed: int = 0
     views_per_batch: int = 16
     samples_per_view: int = 16
@@ -68,12 +66,31 @@ class TrainingConfig:
     checkpoint_steps: int = 200
 
     def __post_init__(self) -> None:
-        for name in ("steps", "views_per_batch", "samples_per_view", "checkpoint_steps"):
-            if getattr(self, name) < 1:
-                raise TrainingError(f"{name} is {getattr(self, name)}; give at least 1")
+        for name in ("views_per_batch", "samples_per_view", "checkpoint_steps"):
+            _require_one(name, getattr(self, name))
         for name in ("weighting", "mirror", "warmup", "average_decay"):
             if not 0 <= getattr(self, name) <= 1:
                 raise TrainingError(f"{name} is {getattr(self, name)}; give a number from 0 to 1")
+
+
+def _require_one(name: str, value: int) -> None:
+    if value < 1:
+        raise TrainingError(f"{name} is {value}; give at least 1")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainingConfig(TrainingOptions):
+    """How to train, and how long.
+
+    Attributes:
+        steps: planned optimiser steps; the learning rate ends at 0 there.
+    """
+
+    steps: int
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require_one("steps", self.steps)
 
 
 @struct.dataclass(kw_only=True)
@@ -275,7 +292,7 @@ def training_identity(
         return {"views": len(samples.images), "samples": len(samples.success), "split": samples.metadata.split}
 
     return {
-        "network": network.config.to_json(),
+        "network": dataclasses.asdict(network.config),
         "training": dataclasses.asdict(config),
         "training_data": data(training),
         "validation_data": data(validation),

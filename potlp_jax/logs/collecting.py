@@ -1,35 +1,34 @@
-"""Rows for training the estimator from robots' logs: the same files as ``train.collect`` writes."""
+"""Rows for training the estimator from robots' logs: the same files as ``potlp collect`` writes."""
 
 import dataclasses
-import json
-import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
-import pyarrow
 
 from potlp_jax.environments.ros.places import Places
 from potlp_jax.errors import DatasetError, LogError
 from potlp_jax.learning.dataset import DatasetMetadata, finished_shards, write_shard
-from potlp_jax.learning.mistake_costs import WeightBounds
 from potlp_jax.learning.questions import TaskDistribution
-from potlp_jax.learning.recording import Pose, Recorder, ViewConfig, record_views
-from potlp_jax.logs.drive import Drive, Eyes
+from potlp_jax.learning.recording import (
+    Pose,
+    Recorder,
+    RecordingConfig,
+    draws_of_world,
+    record_views,
+    recording_metadata,
+)
+from potlp_jax.learning.sample_weights import WeightBounds
+from potlp_jax.logs.drive import Drive, PanoramaReader
 from potlp_jax.trials.loop import versions
-from potlp_jax.world.camera import CameraConfig, Disturbance
 from potlp_jax.world.moves import step_lengths
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class LogCollectConfig(ViewConfig):
-    """What is recorded of each log. ``held_out``: formulas whose languages are never drawn; ``seed``: of the draws."""
+class LogCollectConfig(RecordingConfig):
+    """What is recorded of each log: more views than of a simulated world, for there are few logs."""
 
     views_per_world: int = 200
-    seed: int = 0
-    held_out: tuple[str, ...] = ()
-    camera: CameraConfig = dataclasses.field(default_factory=CameraConfig)
 
 
 def poses_of(drive: Drive) -> Iterator[Pose]:
@@ -64,9 +63,8 @@ def collect_drives(
     counts = []
     for number, drive in enumerate(drives):
         recorder = Recorder(number, config, WeightBounds(**metadata.weights))
-        rng = np.random.default_rng([config.seed, zlib.crc32(split.encode()), number])
-        pool = [tasks.draw(rng) for _ in range(config.tasks_per_world)]
-        eyes = Eyes(drive, config.camera)
+        rng, pool = draws_of_world(config, split, number, tasks)
+        reader = PanoramaReader(drive, config.camera)
         record_views(
             recorder,
             drive.world,
@@ -74,7 +72,7 @@ def collect_drives(
             poses_of(drive),
             pool,
             rng,
-            lambda pose, eyes=eyes: eyes.panorama(pose.step),
+            lambda pose, reader=reader: reader.panorama(pose.step),
             drive.unexplored(),
         )
         write_shard(folder, number, recorder.views, recorder.samples, metadata)
@@ -85,22 +83,16 @@ def collect_drives(
 def _metadata(
     drives: Sequence[Drive], places: Places, environment: str, split: str, config: LogCollectConfig
 ) -> DatasetMetadata:
-    settings = json.loads(json.dumps(dataclasses.asdict(config)))
-    camera = settings.pop("camera")
-    encoding = {"format": settings.pop("image_format"), "quality": settings.pop("quality")}
     resolution = float(drives[0].world.resolution)
     height, width = (max(drive.world.shape[axis] for drive in drives) for axis in (0, 1))
-    return DatasetMetadata(
+    return recording_metadata(
+        config,
+        WeightBounds.of_map(height, width, resolution),
+        versions(),
         propositions=places.names,
         environment=environment,
         generator={"logs": [drive.log.path.name for drive in drives], "labels": Path(places.source).name},
         split=split,
-        camera=camera,
-        disturbance=dataclasses.asdict(Disturbance()),
-        encoding=encoding,
-        weights=dataclasses.asdict(WeightBounds.of_map(height, width, resolution)),
-        collection=settings,
-        versions={**versions(), "pyarrow": pyarrow.__version__, "opencv": cv2.__version__},
         unit="metres",
         resolution=resolution,
         source="log",

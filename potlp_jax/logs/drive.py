@@ -78,7 +78,7 @@ class Drive:
         return edge & (np.bincount(labels.ravel())[labels] >= FrontierConfig().min_size)
 
 
-class Eyes:
+class PanoramaReader:
     """Panoramas of a drive. Pictures are read in the order in which they were taken: asking backward starts again."""
 
     def __init__(self, drive: Drive, camera: CameraConfig) -> None:

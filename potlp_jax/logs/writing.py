@@ -18,11 +18,12 @@ from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
+from potlp_jax.codec import config_from_dict
 from potlp_jax.environments.ros.map_files import FREE, OCCUPIED, UNKNOWN, GridFrame
 from potlp_jax.errors import LogError
 from potlp_jax.logs.log import FIXED_TOPIC, IMAGE_TYPE, MAP_TYPE, ODOMETRY_TYPE, SECOND, TRANSFORM_TYPES, typestore
 from potlp_jax.logs.transforms import Quaternion, quaternion_of
-from potlp_jax.trials.config import trial_config_from_dict
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import Trial, belief_seen_by
 from potlp_jax.trials.robot import photograph
 from potlp_jax.world.camera import CameraConfig
@@ -59,7 +60,7 @@ def write_trial(trial: Trial, out: Path, kind: BagFormat, labels: Path, height: 
     Raises:
         LogError: there is something at ``out`` already, or the world has no place for a proposition.
     """
-    config = trial_config_from_dict(trial.config)
+    config = config_from_dict(TrialConfig, trial.config, "trial record")
 
     def look(step: int) -> UInt8[np.ndarray, "rows columns 3"]:
         cell = jax.numpy.asarray(trial.path[step], jax.numpy.int32)

@@ -13,12 +13,15 @@ References:
 
 import dataclasses
 from enum import StrEnum
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
+from potlp_jax import plugins
+from potlp_jax.errors import PluginError
 from potlp_jax.planning.commitment import Intention, apply_commitment, intention_of
 from potlp_jax.planning.distances.paths import KnownPath, shortest_path
 from potlp_jax.planning.distances.product import (
@@ -34,11 +37,14 @@ from potlp_jax.planning.estimates import Estimates, Estimator, ask
 from potlp_jax.planning.history import ActionTerms, action_terms, initial_history
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import Plan, plan_actions
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig, UctConfig
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_ACTION, NO_STATE, Status, status_array, status_if
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
 from potlp_jax.world.grid import BeliefMap
+
+GROUP: str = "potlp_jax.policies"
+"""Entry points of this group are policies of other packages."""
 
 
 class Policy(StrEnum):
@@ -75,7 +81,7 @@ class DecisionConfig:
     its way turns to it; 0: at once, as published."""
 
     frontiers: FrontierConfig = FrontierConfig()
-    search: SearchConfig = SearchConfig()
+    search: SearchConfig | UctConfig = SearchConfig()
     dead_end_factor: float = 4.0
     commitment: float = 0.15
     path_horizon: int | None = None
@@ -177,26 +183,109 @@ def decide(
     key: PRNGKeyArray,
     intention: Intention | None = None,
     *,
-    policy: Policy,
+    policy: "Policy | PolicyFunction",
     config: DecisionConfig,
 ) -> Move:
-    """The next move of ``policy``: pure, for jit and vmap (``policy`` and ``config`` static).
+    """The next move of ``policy``: pure, for jit and vmap.
 
-    ``estimator`` answers P_S, R_S and R_F for the policies that search and is None for the others. ``intention`` is
-    that of the move before; without one the robot chooses afresh.
+    Args:
+        belief: what is known of the map.
+        cell: the robot's cell.
+        state: the automaton's state, the letter of the robot's cell read.
+        task: arrays of the task.
+        estimator: answers P_S, R_S and R_F for the policies that ask; None for the others.
+        key: drives the search.
+        intention: that of the move before; without one the robot chooses afresh.
+        policy: one of the library's or a function of the user's; static.
+        config: settings; static.
+
+    Returns:
+        The move; its path has length 0 where the target is out of reach.
+
+    Raises:
+        ValueError: the policy searches and there is no estimator.
     """
     situation = assess(belief, cell, state, task, config.frontiers)
-    if not policy.searches:
-        return direct_move(situation, policy, config)
-    if estimator is None:
-        raise ValueError(f"policy {policy.value!r} needs an estimator")
-    estimates = ask(estimator, belief, situation.subgoals, task, state)
-    return search_move(situation, estimates, key, config, intention)
+    estimates = None if estimator is None else ask(estimator, belief, situation.subgoals, task, state)
+    intention = Intention.none() if intention is None else intention
+    return policy_function(policy)(situation, estimates, key, config, intention)
+
+
+@runtime_checkable
+class PolicyFunction(Protocol):
+    """What a policy is: from a situation to a move. Any function of this signature can be given to ``run_trial``,
+    ``run_robot`` and ``run_batch`` in place of a ``Policy``.
+
+    It is traced by jit, and by vmap in batches: pure, without Python branches on array values. It is a static argument,
+    so that a function that is made anew for every trial is compiled anew for every trial.
+
+    Args:
+        situation: belief, task, robot's cell and automaton state, subgoals, distances in known space and the nearest
+            end of the task in it.
+        estimates: P_S, R_S and R_F of the subgoals in ``situation.subgoals``; None where the trial has no estimator.
+        key: of this decision; for whatever the policy draws.
+        config: settings.
+        intention: ``Move.intention`` of the decision before.
+
+    Returns:
+        The move; ``move_to`` makes one from a target.
+    """
+
+    def __call__(
+        self,
+        situation: Situation,
+        estimates: Estimates | None,
+        key: PRNGKeyArray,
+        config: DecisionConfig,
+        intention: Intention,
+        /,
+    ) -> Move: ...
+
+
+def policy_function(policy: Policy | PolicyFunction) -> PolicyFunction:
+    """The function of a policy: that of the name, or the function itself."""
+    if not isinstance(policy, Policy):
+        return policy
+    if policy.searches:
+        return search_move
+    return lambda situation, _estimates, _key, config, _intention: direct_move(situation, policy, config)
 
 
 def direct_move(situation: Situation, policy: Policy, config: DecisionConfig) -> Move:
     """The move of a policy that does not search."""
     return _optimistic(situation, config) if policy is Policy.OPTIMISTIC else _finish_or_frontier(situation, config)
+
+
+def named_policy(policy: Policy | PolicyFunction | str) -> Policy | PolicyFunction:
+    """The policy of a name, or the function itself.
+
+    Args:
+        policy: a function; or the name of one of the library's policies; or ``module:attribute``, or an entry point in
+            the group ``potlp_jax.policies``, of a function.
+
+    Returns:
+        One of the library's policies, or a function.
+
+    Raises:
+        PluginError: there is none of the name, or it is no function.
+    """
+    if not isinstance(policy, str):
+        return policy
+    # ``known_map`` is as good as ``known-map``.
+    own = policy.strip().replace("_", "-")
+    if own in list(Policy):
+        return Policy(own)
+    found = plugins.load(policy, group=GROUP, kind="policy", known=list(Policy))
+    if not callable(found):
+        raise PluginError(f"policy {policy!r}: {type(found).__name__} is no function (PolicyFunction)")
+    return found
+
+
+def policy_name(policy: Policy | PolicyFunction) -> str:
+    """What a policy is called in records: its name, or ``module:attribute`` of a function."""
+    if isinstance(policy, Policy):
+        return policy.value
+    return plugins.reference_of(policy)
 
 
 def planning_problem(situation: Situation, estimates: Estimates, config: DecisionConfig) -> PlanningProblem:
@@ -263,12 +352,12 @@ def _finish_or_frontier(situation: Situation, config: DecisionConfig) -> Move:
     kind = jnp.where(finishes, MoveKind.FINISH, jnp.where(jnp.isfinite(value), MoveKind.FRONTIER, MoveKind.NONE))
     target_cell = jnp.where(finishes, situation.finish_cell, frontier_cell)
     target_state = jnp.where(finishes, situation.finish_state, frontier_state)
-    return _move(situation, config, kind, target_cell, target_state, value)
+    return move_to(situation, config, kind, target_cell, target_state, value)
 
 
 def search_move(
     situation: Situation,
-    estimates: Estimates,
+    estimates: Estimates | None,
     key: PRNGKeyArray,
     config: DecisionConfig,
     intention: Intention | None = None,
@@ -277,6 +366,8 @@ def search_move(
 
     ``estimates`` are those of the situation's subgoals. Where no action is available: the nearest frontier.
     """
+    if estimates is None:
+        raise ValueError("a policy that searches needs an estimator")
     problem = planning_problem(situation, estimates, config)
     plan = plan_actions(problem, key, config.search)
     return planned_move(situation, problem, plan, Intention.none() if intention is None else intention, config)
@@ -301,7 +392,7 @@ def planned_move(
     target_state = jnp.where(acts, plan.from_state, frontier_state)
     target_state = jnp.where(finishes, situation.finish_state, target_state)
     status = plan.status | status_if(falls_back, Status.FALLBACK)
-    return _move(
+    return move_to(
         situation,
         config,
         kind,
@@ -377,7 +468,7 @@ def _nearest_frontier(situation: Situation) -> tuple[Int32[Array, "2"], Int32[Ar
     return cell, state, jnp.min(cost)
 
 
-def _move(
+def move_to(
     situation: Situation,
     config: DecisionConfig,
     kind: Int32[Array, ""],
@@ -389,6 +480,23 @@ def _move(
     intention: Intention | None = None,
     status: UInt32[Array, ""] | None = None,
 ) -> Move:
+    """The move to a product state in known space: the shortest path there, and what goes into the record.
+
+    Args:
+        situation: of the decision.
+        config: settings; ``config.path_horizon`` limits the path.
+        kind: one of ``MoveKind``; NONE stays where the robot is.
+        target_cell: where to go; a known free cell.
+        target_state: the automaton's state in which to arrive there, such that ``situation.distances`` is finite.
+        value: what the policy expects the task to cost from here; for the record.
+        action: index of the chosen action, where the policy searches.
+        search: what it considered, where it searches.
+        intention: for the next decision.
+        status: bits to report beside those of the subgoals.
+
+    Returns:
+        The move; its path has length 0 where the target is out of reach.
+    """
     goes = kind != MoveKind.NONE
     cell = jnp.where(goes, target_cell, situation.cell).astype(jnp.int32)
     state = jnp.where(goes, target_state, situation.state).astype(jnp.int32)

@@ -1,16 +1,86 @@
-"""What a store holds, paired: the same worlds for every policy."""
+"""What a store holds, paired by world: the same worlds for every policy."""
 
+import dataclasses
 from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
 
 from potlp_jax.sweep.statistics import Comparison, TrialResult
-from potlp_jax.sweep.store import Row
+from potlp_jax.sweep.store import Row, Store
 
 Pair = Mapping[str, Row]
 """The rows of one world by policy."""
 
 
+@dataclasses.dataclass(frozen=True)
+class CellResults:
+    """What is finished of one environment and task.
+
+    Attributes:
+        environment, task: as in the specification.
+        pairs: the worlds that all policies have finished, by number.
+        redrawn: worlds before the last of the pairs that were left out, because the task is impossible in them.
+        comparison: the statistics of the pairs.
+    """
+
+    environment: str
+    task: str
+    pairs: Sequence[Pair]
+    redrawn: int
+    comparison: Comparison
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able values."""
+        return {
+            "environment": self.environment,
+            "task": self.task,
+            "world_numbers": [world_of(pair) for pair in self.pairs],
+            "redrawn": self.redrawn,
+            **self.comparison.to_dict(),
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class Results:
+    """What is finished of a sweep, with its specification as ``Specification.to_dict`` wrote it."""
+
+    specification: Mapping[str, Any]
+    cells: tuple[CellResults, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able values."""
+        return {"specification": self.specification, "cells": [cell.to_dict() for cell in self.cells]}
+
+
+def read_results(store: Store) -> Results:
+    """The results of a sweep, finished or not."""
+    specification = store.facts()["specification"]
+    policies, cells = specification["policies"], []
+    for cell in specification["cells"]:
+        pairs = pair_rows(store.rows(cell["environment"], cell["task"]), policies)
+        possible = store.possible(cell["environment"], cell["task"])
+        # Beyond the last pair workers may have looked at worlds that the sweep does not need.
+        last = world_of(pairs[-1]) if pairs else -1
+        cells.append(
+            CellResults(
+                environment=cell["environment"],
+                task=cell["task"],
+                pairs=pairs,
+                redrawn=sum(not is_possible for world, is_possible in possible.items() if world < last),
+                comparison=compare_pairs(pairs, policies),
+            )
+        )
+    return Results(specification, tuple(cells))
+
+
+def world_of(pair: Pair) -> int:
+    """The number of a pair's world."""
+    # All rows of a pair are of one world.
+    return next(iter(pair.values())).item.world
+
+
 def pair_rows(rows: Sequence[Row], policies: Sequence[str]) -> list[Pair]:
     """The worlds in which every policy has a row, by number. A pair is there for all policies or for none."""
+    # Of an unfinished sweep some policies have no row yet in the last worlds; those worlds are not compared.
     by_world: dict[int, dict[str, Row]] = {}
     for row in rows:
         by_world.setdefault(row.item.world, {})[row.item.policy] = row
@@ -24,8 +94,16 @@ def pair_rows(rows: Sequence[Row], policies: Sequence[str]) -> list[Pair]:
 def compare_pairs(
     pairs: Sequence[Pair], policies: Sequence[str], clusters: Sequence[Hashable] | None = None
 ) -> Comparison:
-    """The paired comparison (docs/model.md, section 8). ``clusters`` names, for each pair, what it shares with others,
-    such as its building."""
+    """The paired comparison (docs/model.md, section 8).
+
+    Args:
+        pairs: worlds with the rows of at least these policies.
+        policies: in the order of the comparison.
+        clusters: names, for each pair, what it shares with others, such as its building; None: nothing.
+
+    Returns:
+        The comparison.
+    """
     results = {policy: [_result(pair[policy]) for pair in pairs] for policy in policies}
     return Comparison.from_results(results, clusters=clusters)
 

@@ -1,4 +1,4 @@
-"""A finished trial as the row that the statistics need of it."""
+"""A finished trial as a row of the store."""
 
 import subprocess
 from collections.abc import Mapping
@@ -13,27 +13,11 @@ from potlp_jax.sweep.specification import configuration_hash
 from potlp_jax.sweep.store import Item, Row
 from potlp_jax.trials.batch import Finished
 from potlp_jax.trials.config import TrialConfig
-from potlp_jax.trials.record import Trial
 from potlp_jax.world.grid import World
 from potlp_jax.world.moves import NEIGHBOURS
 
 
-def trial_row(item: Item, trial: Trial, key: PRNGKeyArray, config: TrialConfig, seconds: float) -> Row:
-    """The row of a trial that was run with this key and configuration and took so many seconds."""
-    finished = Finished(
-        name=item,
-        outcome=trial.outcome,
-        cost=trial.cost,
-        path=np.asarray(trial.path, np.int32),
-        decisions=len(trial.decisions),
-        fallbacks=sum(decision.fallback for decision in trial.decisions),
-        status=trial.status,
-        seconds=seconds,
-    )
-    return batch_row(item, finished, trial.world, key, config, trial.versions)
-
-
-def batch_row(
+def trial_row(
     item: Item,
     trial: Finished,
     world: World,
@@ -41,7 +25,19 @@ def batch_row(
     config: TrialConfig,
     versions: Mapping[str, str],
 ) -> Row:
-    """The row of a trial that ran in a batch; ``versions`` are those of the libraries and of what it looked with."""
+    """The row of a finished trial.
+
+    Args:
+        item: which trial of the sweep it was.
+        trial: how it went.
+        world: in which it ran.
+        key: the trial's own, before any folding; the row keeps its words, so that the trial can be run again.
+        config: its settings; the row keeps their hash.
+        versions: of the libraries, and of the estimator that was asked.
+
+    Returns:
+        The row, with the commit of the sources that run now.
+    """
     return Row(
         item=item,
         outcome=trial.outcome.value,
@@ -62,11 +58,13 @@ def batch_row(
 
 def trial_budget(world: World, factor: float) -> float:
     """The cost at which a trial in this world is given up (docs/model.md, section 7)."""
+    # On the host and in metres; `trials.rules.budget` is the same on the device, in cells.
     return factor * float(np.sum(np.asarray(world.extent))) * float(world.resolution)
 
 
 def path_text(path: Int32[np.ndarray, "steps 2"]) -> str:
     """A path as text: its first cell, and one digit for each move, by its place in ``world.moves.NEIGHBOURS``."""
+    # A byte a move instead of a dozen: rows of thousands of trials with paths of hundreds of cells stay small.
     numbers = {move: str(number) for number, move in enumerate(NEIGHBOURS)}
     moves = np.diff(path, axis=0).tolist()
     return f"{path[0, 0]},{path[0, 1]}:" + "".join(numbers[row, column] for row, column in moves)
@@ -84,6 +82,7 @@ def source_commit() -> str:
     """The commit that the package was run from, with ``+`` where files were changed; empty outside of a repository."""
     folder = Path(__file__).parents[1]
 
+    # Once a process: a worker that runs for hours writes the commit it was started from.
     def git(*arguments: str) -> str:
         done = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=True)
         return done.stdout.strip()
@@ -95,5 +94,6 @@ def source_commit() -> str:
 
 
 def _words(key: PRNGKeyArray) -> tuple[int, int]:
+    # Threefry keys have two words; keys of another kind would not unpack, rather than lose a word.
     first, second = np.asarray(jax.random.key_data(key)).tolist()
     return int(first), int(second)

@@ -1,36 +1,40 @@
-"""Runs a sweep: workers, one pinned to each core, take trials from the store until none is left.
+"""Runs a sweep: workers, one pinned to each core, take trials from the store until none remains.
 
-Each worker looks at the store, claims a few trials at a time and runs them as one batch (``trials.batch``), in
-which a trial that has ended makes room for the next. A row is written as soon as its trial has ended. A worker needs
-nothing else, so workers may be killed, started again, or belong to several commands on one store.
+Each worker reads the store, claims a few trials at a time and runs them as one batch (``trials.batch``), in which a
+trial that has ended makes room for the next. A row is written as soon as its trial has ended. A worker needs nothing
+but the store, so workers may be killed, started again, or belong to several commands on one store.
 """
 
 import dataclasses
 import itertools
+import logging
 import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
 
 import jax
 
-from potlp_jax.environments.base import Generator
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, world_key
 from potlp_jax.errors import WorldError
-from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, read_estimator
-from potlp_jax.planning.policies import Policy
-from potlp_jax.sweep.rows import batch_row
+from potlp_jax.learning.estimator import TrainedEstimator, identity_of, named_estimator
+from potlp_jax.planning.estimates import Estimator
+from potlp_jax.planning.policies import Policy, named_policy
+from potlp_jax.sweep.rows import trial_row
 from potlp_jax.sweep.specification import Cell, Specification
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store
 from potlp_jax.task.task import Task, TaskArrays, TaskSizes
 from potlp_jax.trials.batch import Finished, Start, run_batch
-from potlp_jax.trials.loop import run_trial, trial_key, versions
+from potlp_jax.trials.loop import run_trial, versions
 from potlp_jax.trials.record import Outcome, Trial
+from potlp_jax.trials.rules import estimator_of, trial_key
 from potlp_jax.world.grid import World
+
+logger = logging.getLogger(__name__)
 
 RESULTS: str = "results.sqlite"
 """Name of the store in a sweep's folder."""
@@ -38,19 +42,23 @@ RESULTS: str = "results.sqlite"
 IMPOSSIBLE_IN_A_ROW: int = 100
 """Worlds after which a task is taken to be impossible in all of them."""
 
+# A worker that holds more would starve the others at the end of a portion; fewer would leave slots of its batch empty.
 BLOCK: int = 8
-"""Trials, or worlds to look at, that a worker claims at once."""
+"""Trials, or worlds to examine, that a worker claims at once."""
 
+# Compiled programs differ by policy: a small portion would switch between them often, a large one would let the pairs
+# of the first worlds wait.
 PORTION: int = 32
 """Worlds of each task that all policies visit before the next ones."""
 
+# Short beside a trial, long beside a reading.
 WAIT: float = 0.3
-"""Seconds between looks at the store while there is nothing to claim."""
+"""Seconds between readings of the store while there is nothing to claim."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """Where a sweep stands: trials done of all, and since when."""
+    """Where a sweep stands: trials done, of all."""
 
     done: int
     total: int
@@ -62,6 +70,10 @@ class Sweep:
     def __init__(self, specification: Specification, folder: Path) -> None:
         self.specification = specification
         self.store = Store(folder / RESULTS)
+        # Every policy visits the worlds of a block, and making one may take a second. The caches are the sweep's own: a
+        # family that is defined anew under the same name, as in a notebook, is not mistaken for the old one.
+        self._generator = lru_cache(maxsize=None)(make)
+        self._world = lru_cache(maxsize=4 * BLOCK)(self._make_world)
         self.store.agree({"specification": specification.to_dict(), "estimator": self._estimator_identity()})
 
     @property
@@ -70,7 +82,8 @@ class Sweep:
         return len(self.specification.cells) * len(self.specification.policies) * self.specification.worlds
 
     def finished(self) -> bool:
-        """Whether as many trials have rows; there are more once another process has made the sweep longer."""
+        """Whether as many trials have rows as the specification asks for."""
+        # There are more once another process has made the sweep longer.
         return self.store.count() >= self.total
 
     def step(self) -> bool:
@@ -79,17 +92,20 @@ class Sweep:
         Raises:
             WorldError: a task is impossible in too many worlds in a row.
         """
-        return self._look_for_worlds() or self._run_trials()
+        # Worlds first: which trials there are depends on them.
+        return self._examine_worlds() or self._run_trials()
 
-    def _look_for_worlds(self) -> bool:
+    def _examine_worlds(self) -> bool:
         """Find out in which of the next worlds a task is possible."""
         for cell in self.specification.cells:
             known = self.store.possible(cell.environment, cell.task)
             found = len(self._worlds(known))
             if found < self.specification.worlds:
-                looked = self.store.claim(self._unknown_worlds(cell, known, found), BLOCK)
-                if looked:
-                    self.store.set_possible(cell.environment, cell.task, self.possible(looked))
+                claimed = self.store.claim(self._unknown_worlds(cell, known, found), BLOCK)
+                if claimed:
+                    possible = self.possible(claimed)
+                    self.store.set_possible(cell.environment, cell.task, possible)
+                    logger.debug("%s, %s: possible in worlds %s", cell.environment, cell.task, _true_of(possible))
                     return True
         return False
 
@@ -97,33 +113,37 @@ class Sweep:
         """Run the missing trials of one policy in a portion of the worlds; each is written as soon as it has ended.
 
         All policies visit a portion before the next one: the pairs of the first worlds are complete early, and the
-        rate so far tells the time left.
+        rate so far tells the time remaining.
         """
         environments = dict.fromkeys(cell.environment for cell in self.specification.cells)
         for first in range(0, self.specification.worlds, PORTION):
             for environment, policy in itertools.product(environments, self.specification.policies):
                 any_ran = False
+                # The claims are an iterator, so that a batch claims more only when it has room.
                 for row in self.rows(self._claimed(environment, policy, first), environment, policy):
                     self.store.finish([row])
+                    logger.debug("world %d, %s: %s at cost %.1f", row.item.world, policy, row.outcome, row.cost)
                     any_ran = True
                 if any_ran:
                     return True
         return False
 
-    def _claimed(self, environment: str, policy: Policy, first: int) -> Iterator[Item]:
+    def _claimed(self, environment: str, policy: str, first: int) -> Iterator[Item]:
         """Trials that are missing in the portion from the ``first`` world on, claimed a few at a time."""
         for cell in self.specification.cells:
             if cell.environment != environment:
                 continue
             worlds = self._worlds(self.store.possible(environment, cell.task))[first : first + PORTION]
-            missing = [Item(environment, cell.task, policy.value, world) for world in worlds]
+            missing = [Item(environment, cell.task, policy, world) for world in worlds]
             while missing and (block := self.store.claim(missing, BLOCK)):
                 yield from block
+                # What stands before the block is finished, or others work on it: not asked about again.
                 missing = missing[missing.index(block[-1]) + 1 :]
 
     def _worlds(self, known: dict[int, bool]) -> list[int]:
         """The first worlds in which the task is possible, as far as that is known without a gap."""
         found: list[int] = []
+        # At the first gap the list ends: a world in it, once known, would come before those that follow.
         for world in range(self.specification.first_world, MAX_INDEX + 1):
             if world not in known or len(found) == self.specification.worlds:
                 break
@@ -132,9 +152,10 @@ class Sweep:
         return found
 
     def _unknown_worlds(self, cell: Cell, known: dict[int, bool], found: int) -> list[Item]:
-        """The next worlds to look at: as many as are missing."""
+        """The next worlds to examine: as many as are missing."""
         missing = self.specification.worlds - found
         last = max(known, default=self.specification.first_world - 1)
+        # Unknown worlds count as possible: what another worker still examines is no reason to give up.
         tail = [known.get(world, True) for world in range(last - IMPOSSIBLE_IN_A_ROW + 1, last + 1)]
         if not any(tail):
             raise WorldError(
@@ -149,39 +170,44 @@ class Sweep:
         trials = self._trials(items, items[0].environment, Policy.KNOWN_MAP)
         return {item.world: trial.outcome is Outcome.SATISFIED for item, trial in trials}
 
-    def rows(self, items: Iterable[Item], environment: str, policy: Policy) -> Iterator[Row]:
+    def rows(self, items: Iterable[Item], environment: str, policy: str) -> Iterator[Row]:
         """The rows of trials of one environment and policy, as they end."""
         config = self.specification.config
-        trained = self._trained(environment) if policy is Policy.POTLP else None
+        asked = self._asked(environment, policy)
         for item, trial in self._trials(items, environment, policy):
-            world = _world(environment, self.specification.split.value, item.world)
-            yield batch_row(item, trial, world, self._key(item.world), config, versions(trained))
+            world = self._world(environment, item.world)
+            # Made again, or from the cache: a batch returns arrays of its own and not the world.
+            yield trial_row(item, trial, world, self._key(item.world), config, versions(asked))
 
-    def _trials(self, items: Iterable[Item], environment: str, policy: Policy) -> Iterator[tuple[Item, Finished]]:
+    def _trials(self, items: Iterable[Item], environment: str, policy: str) -> Iterator[tuple[Item, Finished]]:
         def start(item: Item) -> Start:
-            world = _world(environment, self.specification.split.value, item.world)
+            world = self._world(environment, item.world)
             return Start(world, self._tasks[environment, item.task][1], self._key(item.world), name=item)
 
-        trained = self._trained(environment) if policy is Policy.POTLP else None
-        for trial in run_batch(map(start, items), policy, self.specification.config, estimator=trained):
+        asked = self._asked(environment, policy)
+        for trial in run_batch(map(start, items), policy, self.specification.config, estimator=asked):
+            # A batch hands back the name that `start` gave, whatever it is.
             assert isinstance(trial.name, Item)
             yield trial.name, trial
 
     def trial(self, item: Item) -> Trial:
         """The whole record of a trial, run or made again."""
-        policy = Policy(item.policy)
         task, arrays = self._tasks[item.environment, item.task]
         return run_trial(
-            _world(item.environment, self.specification.split.value, item.world),
+            self._world(item.environment, item.world),
             task,
-            policy,
+            item.policy,
             self._key(item.world),
             self.specification.config,
             environment=f"{item.environment}/{self.specification.split.value}",
             seed=item.world,
             arrays=arrays,
-            estimator=self._trained(item.environment) if policy is Policy.POTLP else None,
+            estimator=self._asked(item.environment, item.policy),
         )
+
+    def _make_world(self, environment: str, number: int) -> World:
+        generator = self._generator(environment)
+        return generator.generate(world_key(self.specification.split, number, generator.name))
 
     def _key(self, world: int) -> jax.Array:
         """Of all trials in a world: it makes no world, and folded by name it serves planning and sensing."""
@@ -191,28 +217,33 @@ class Sweep:
     def _tasks(self) -> dict[tuple[str, str], tuple[Task, TaskArrays]]:
         """Tasks by environment and formula, padded per environment to one size: one compilation serves all."""
         tasks = {
-            (cell.environment, cell.task): Task.of_formula(cell.task, _generator(cell.environment).propositions)
+            (cell.environment, cell.task): self._generator(cell.environment).task(cell.task)
             for cell in self.specification.cells
         }
+        # Sizes differ by environment at most: maps have other shapes there, so that programs differ anyway.
         sizes: dict[str, TaskSizes] = {}
         for (environment, _), task in tasks.items():
             sizes[environment] = sizes.get(environment, task.sizes).union(task.sizes)
         return {key: (task, task.padded(sizes[key[0]])) for key, task in tasks.items()}
 
     @cached_property
-    def _estimator(self) -> TrainedEstimator | None:
-        path = self.specification.estimator
-        return None if path is None else read_estimator(path)
+    def _estimator(self) -> TrainedEstimator | Estimator | None:
+        name = self.specification.estimator
+        return None if name is None else named_estimator(name)
 
-    def _trained(self, environment: str) -> TrainedEstimator:
-        return estimator_for(_generator(environment).propositions, self._estimator)
+    def _asked(self, environment: str, policy: str) -> TrainedEstimator | Estimator | None:
+        """What a policy asks in the worlds of an environment; None where it asks nothing."""
+        return estimator_of(named_policy(policy), self._generator(environment).propositions, self._estimator)
 
     def _estimator_identity(self) -> str | None:
-        """Of the network, so that a store never mixes two. Raises CheckpointError where there is none for a task."""
-        if Policy.POTLP not in self.specification.policies:
-            return None
-        found = [self._trained(name) for name in sorted({cell.environment for cell in self.specification.cells})]
-        return ", ".join(dict.fromkeys(estimator.identity for estimator in found))
+        """Of all that policies ask, so that a store never mixes two. Raises CheckpointError where there is none."""
+        environments = sorted({cell.environment for cell in self.specification.cells})
+        asked = [self._asked(*pair) for pair in itertools.product(environments, self.specification.policies)]
+        return ", ".join(dict.fromkeys(identity_of(estimator) for estimator in asked if estimator is not None)) or None
+
+
+def _true_of(possible: Mapping[int, bool]) -> list[int]:
+    return [world for world, is_possible in possible.items() if is_possible]
 
 
 def run_sweep(
@@ -221,9 +252,13 @@ def run_sweep(
     processes: int,
     report: Callable[[Progress], None] = lambda progress: None,
 ) -> None:
-    """Run what is missing of a sweep, with as many pinned processes; returns when every trial has a row.
+    """Run what is missing of a sweep; returns when every trial has a row.
 
-    ``report`` is called now and then with the progress.
+    Args:
+        specification: what to run.
+        folder: of the store; the same folder again continues.
+        processes: workers, each pinned to a core; 1 works in this process, on all of its cores.
+        report: is called now and then with the progress.
 
     Raises:
         StoreError: the folder holds another sweep.
@@ -248,6 +283,7 @@ def _work_here(sweep: Sweep, report: Callable[[Progress], None]) -> None:
 
 
 def _work_in_processes(sweep: Sweep, folder: Path, processes: int, report: Callable[[Progress], None]) -> None:
+    # Spawned, not forked: a fork of a process in which jax has started its threads may hang.
     context = multiprocessing.get_context("spawn")
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
     workers = [
@@ -259,10 +295,12 @@ def _work_in_processes(sweep: Sweep, folder: Path, processes: int, report: Calla
             worker.start()
         while any(worker.is_alive() for worker in workers):
             report(Progress(sweep.store.count(), sweep.total))
+            # One worker's error is the others' error soon: their trials are of the same sweep.
             if any(worker.exitcode for worker in workers):
                 break
             time.sleep(WAIT)
     finally:
+        # Also after an interrupt: claims of a process that is gone are void, so that nothing has to be given back.
         for worker in workers:
             worker.terminate()
             worker.join()
@@ -283,19 +321,8 @@ def _work(specification: Specification, folder: Path, core: int | None) -> None:
     enable_compilation_cache()
     sweep, parent = Sweep(specification, folder), multiprocessing.parent_process()
     while not sweep.finished():
+        # The parent may have been killed, and then nobody ends this process.
         if parent is not None and not parent.is_alive():
             return
         if not sweep.step():
             time.sleep(WAIT)
-
-
-@lru_cache(maxsize=8)
-def _generator(environment: str) -> Generator:
-    return make(environment)
-
-
-@lru_cache(maxsize=4 * BLOCK)
-def _world(environment: str, split: str, world: int) -> World:
-    """The worlds of a block, which every policy visits."""
-    generator = _generator(environment)
-    return generator.generate(world_key(split, world, generator.name))

@@ -7,7 +7,7 @@
     split: validation              # optional, as are all below
     first_world: 0
     estimator: out/fit/estimator.npz
-    settings:                      # any field of TrialConfig; others are what the environment calls for
+    settings:                      # any field of TrialConfig; the other fields are what the environment calls for
       replan_distance: 4
       decision: {search: {simulations: 300}}
 
@@ -17,26 +17,23 @@
 import dataclasses
 import hashlib
 import json
-import types
-import typing
 from collections.abc import Mapping, Sequence
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from potlp_jax import plugins
+from potlp_jax.codec import config_from_dict, json_copy, read_settings, settings_file, with_settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
-from potlp_jax.errors import SpecificationError, WorldError
-from potlp_jax.planning.policies import Policy
-from potlp_jax.task.task import Task
-from potlp_jax.trials.config import TrialConfig, trial_config_for, trial_config_from_dict
+from potlp_jax.errors import PluginError, SpecificationError, TaskError, WorldError
+from potlp_jax.learning.estimator import GROUP as ESTIMATORS
+from potlp_jax.planning.policies import Policy, named_policy
+from potlp_jax.trials.config import TrialConfig, trial_config_for
 
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """One cell of the sweep's grid: ``worlds`` trials of every policy. ``task`` is a formula."""
+    """One cell of the sweep's grid: ``worlds`` trials of every policy. ``task`` is a formula or a ``.hoa`` file."""
 
     environment: str
     task: str
@@ -48,20 +45,20 @@ class Specification:
 
     Attributes:
         cells: environments × tasks, in the order of the file.
-        policies: known map and baseline first.
+        policies: names (``planning.policies.named_policy``), known map and baseline first.
         worlds: worlds per cell in which the task is possible.
         split, first_world: from which worlds they are taken, in increasing order.
-        estimator: file of the trained network; None for the shipped one.
+        estimator: a name (``learning.estimator.named_estimator``); None for the shipped one.
         config: settings of every trial.
         seed: of the trials' keys (not of the worlds).
     """
 
     cells: tuple[Cell, ...]
-    policies: tuple[Policy, ...]
+    policies: tuple[str, ...]
     worlds: int
     split: Split = Split.VALIDATION
     first_world: int = 0
-    estimator: Path | None = None
+    estimator: str | None = None
     config: TrialConfig = TrialConfig()
     seed: int = 0
 
@@ -69,11 +66,11 @@ class Specification:
         """JSON-able; equal specifications give equal dictionaries."""
         return {
             "cells": [dataclasses.asdict(cell) for cell in self.cells],
-            "policies": [policy.value for policy in self.policies],
+            "policies": list(self.policies),
             "worlds": self.worlds,
             "split": self.split.value,
             "first_world": self.first_world,
-            "estimator": None if self.estimator is None else str(self.estimator),
+            "estimator": self.estimator,
             "settings": dataclasses.asdict(self.config),
             "seed": self.seed,
         }
@@ -83,40 +80,32 @@ def specification_from_store(data: Mapping[str, Any]) -> Specification:
     """The specification that ``Specification.to_dict`` wrote."""
     return Specification(
         cells=tuple(Cell(**cell) for cell in data["cells"]),
-        policies=tuple(Policy(name) for name in data["policies"]),
+        policies=tuple(data["policies"]),
         worlds=data["worlds"],
         split=Split(data["split"]),
         first_world=data["first_world"],
-        estimator=None if data["estimator"] is None else Path(data["estimator"]),
-        config=trial_config_from_dict(data["settings"]),
+        estimator=data["estimator"],
+        config=config_from_dict(TrialConfig, data["settings"], "settings"),
         seed=data["seed"],
     )
 
 
 def configuration_hash(config: TrialConfig) -> str:
     """Twelve hexadecimal digits that tell settings apart."""
-    text = json.dumps(dataclasses.asdict(config), sort_keys=True, default=str)
+    # 48 bits: among a million settings the chance that two share a hash is 0.2 %.
+    text = json.dumps(json_copy(dataclasses.asdict(config)), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def read_specification(path: Path) -> Specification:
-    """Read and check a specification.
+def read_specification(given: str | Path) -> Specification:
+    """Read and check a specification: a file, or the name of one that is shipped (``potlp_jax/sweep/data``).
 
     Raises:
-        SpecificationError: the file or one of its entries is wrong.
+        ConfigurationError: there is no such file, or one of its entries is wrong.
         TaskError, WorldError: a formula or an environment is.
     """
-    return specification_from_dict(_read_yaml(path), str(path), path.parent)
-
-
-def _read_yaml(path: Path) -> Mapping[str, Any]:
-    try:
-        data = yaml.safe_load(path.read_text("utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise SpecificationError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(data, Mapping):
-        raise SpecificationError(f"{path}: give a mapping with environments, tasks, policies and worlds")
-    return data
+    path = settings_file(given, "potlp_jax.sweep")
+    return specification_from_dict(read_settings(path), str(path), path.parent)
 
 
 _REQUIRED = ("environments", "tasks", "policies", "worlds")
@@ -124,7 +113,21 @@ _OPTIONAL = ("split", "first_world", "estimator", "settings", "seed")
 
 
 def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = Path()) -> Specification:
-    """Check the entries of a specification; ``where`` names it in messages, ``folder`` is where its files are."""
+    """Check the entries of a specification.
+
+    Args:
+        data: the entries, as in the file.
+        where: names the specification in messages.
+        folder: what names of files are relative to.
+
+    Returns:
+        The specification, with tasks as formulas and known map and baseline among the policies.
+
+    Raises:
+        SpecificationError: an entry is missing, unknown or wrong.
+        ConfigurationError: a setting is.
+    """
+    # Unknown entries first: a misspelt one is then named, rather than the right one reported as missing.
     for name in data:
         if name not in (*_REQUIRED, *_OPTIONAL):
             raise SpecificationError(f"{where}: unknown entry {name!r}; known: {', '.join((*_REQUIRED, *_OPTIONAL))}")
@@ -139,20 +142,21 @@ def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = 
         for environment in environments
         for task in _list(data, "tasks", where)
     ]
+    # Task 1 and its formula are the same cell; run twice, its rows would overwrite each other.
     for cell in cells:
         if cells.count(cell) > 1:
             raise SpecificationError(f"{where}: {cell.environment} with {cell.task!r} is there twice")
     estimator = data.get("estimator")
     if estimator is not None and not isinstance(estimator, str):
-        raise SpecificationError(f"{where}: estimator: give the name of a file, found {estimator!r}")
+        raise SpecificationError(f"{where}: estimator: give a file or module:attribute, found {estimator!r}")
     return Specification(
         cells=tuple(cells),
         policies=policies,
         worlds=_number(data, "worlds", 1, where),
         split=split,
         first_world=_number(data, "first_world", 0, where, default=0),
-        estimator=None if estimator is None else folder / estimator,
-        config=_settings(_common_config(environments, where), data.get("settings", {}), f"{where}: settings"),
+        estimator=None if estimator is None else _estimator(estimator, folder),
+        config=with_settings(_common_config(environments, where), data.get("settings", {}), f"{where}: settings"),
         seed=_number(data, "seed", 0, where, default=0),
     )
 
@@ -169,17 +173,29 @@ _EXAMPLES = {"environments": "firefighting", "tasks": "1, 2", "policies": "basel
 
 def _number(data: Mapping[str, Any], name: str, least: int, where: str, default: int | None = None) -> int:
     value = data.get(name, default)
+    # To Python, True is a whole number; in a file it is a mistake.
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= MAX_INDEX:
         raise SpecificationError(f"{where}: {name}: give a whole number of at least {least}, found {value!r}")
     return value
 
 
-def _policies(names: list[Any], where: str) -> tuple[Policy, ...]:
-    known = [policy.value for policy in Policy]
-    for name in names:
-        if name not in known:
-            raise SpecificationError(f"{where}: policies: unknown policy {name!r}; choose from: {', '.join(known)}")
-    return tuple(dict.fromkeys([Policy.KNOWN_MAP, Policy.BASELINE, *map(Policy, names)]))
+def _policies(names: list[Any], where: str) -> tuple[str, ...]:
+    # Savings are measured between these two, so they run whether named or not.
+    found = [Policy.KNOWN_MAP.value, Policy.BASELINE.value]
+    for name in map(str, names):
+        try:
+            policy = named_policy(name)
+        except PluginError as error:
+            raise SpecificationError(f"{where}: policies: {error}") from error
+        # Functions keep the name that was given: workers find them by it.
+        found.append(policy.value if isinstance(policy, Policy) else name)
+    return tuple(dict.fromkeys(found))
+
+
+def _estimator(name: str, folder: Path) -> str:
+    """A file beside the specification, or a name as it stands."""
+    beside = folder / name
+    return name if plugins.is_known(name, ESTIMATORS) and not beside.is_file() else str(beside)
 
 
 def _split(name: Any, environments: Sequence[str], where: str) -> Split:
@@ -195,19 +211,19 @@ def _split(name: Any, environments: Sequence[str], where: str) -> Split:
 
 
 def _formula(environment: str, task: Any, where: str) -> str:
-    """The formula of a task that is given by number, or as a formula. Raises for formulas that are no task."""
+    """A task by number as its formula, any other (a formula, a ``.hoa`` file) as it is. Raises for what is no task."""
     generator = make(environment)
-    text = str(task)
-    formula = generator.tasks.get(text, text)
-    if text.isdecimal() and formula == text:
-        known = ", ".join(generator.tasks) or "none"
-        raise SpecificationError(f"{where}: tasks: {environment} has no task {text}; it has: {known}")
-    Task.of_formula(formula, generator.propositions)
-    return formula
+    # Compiled here only to be checked, so that a wrong task ends the command and not a worker.
+    try:
+        generator.task(task)
+    except TaskError as error:
+        raise SpecificationError(f"{where}: tasks: {error}") from error
+    return generator.tasks.get(str(task), str(task))
 
 
 def _common_config(environments: Sequence[str], where: str) -> TrialConfig:
     """What all environments call for."""
+    # Cells of one sweep are shown in one table, so that their settings must not differ without being named.
     configs = {name: trial_config_for(make(name)) for name in environments}
     first = configs[environments[0]]
     for name, config in configs.items():
@@ -217,40 +233,3 @@ def _common_config(environments: Sequence[str], where: str) -> TrialConfig:
                 "has one; make a sweep of each"
             )
     return first
-
-
-def _settings(config: Any, data: Any, where: str) -> Any:
-    """A frozen configuration with some of its fields changed."""
-    if not isinstance(data, Mapping):
-        raise SpecificationError(f"{where}: give a mapping, found {data!r}")
-    hints = typing.get_type_hints(type(config))
-    for name in data:
-        if name not in hints:
-            raise SpecificationError(f"{where}: unknown field {name!r}; known: {', '.join(hints)}")
-    values = {
-        name: _setting(hints[name], getattr(config, name), value, f"{where}.{name}") for name, value in data.items()
-    }
-    try:
-        return dataclasses.replace(config, **values)
-    except ValueError as error:
-        raise SpecificationError(f"{where}: {error}") from error
-
-
-def _setting(hint: Any, current: Any, value: Any, where: str) -> Any:
-    if dataclasses.is_dataclass(hint):
-        return _settings(current, value, where)
-    if isinstance(hint, type) and issubclass(hint, Enum):
-        known = [entry.value for entry in hint]
-        if value not in known:
-            raise SpecificationError(f"{where}: choose from: {', '.join(map(str, known))}; found {value!r}")
-        return hint(value)
-    if typing.get_origin(hint) is tuple:
-        value = tuple(value) if isinstance(value, list) else value
-        hint = tuple
-    allowed = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-    if float in allowed and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
-    if not isinstance(value, tuple(allowed)) or (isinstance(value, bool) and bool not in allowed):
-        names = " or ".join("null" if kind is type(None) else kind.__name__ for kind in allowed)
-        raise SpecificationError(f"{where}: give a {names}, found {value!r}")
-    return value

@@ -1,7 +1,10 @@
 """Paired statistics of policies over the same worlds (docs/model.md, section 8).
 
-Costs are in units of resolution. A pair - one world with one trial of every policy - is dropped for all policies or
-for none. The savings tables are host objects: nothing here is traced.
+Costs are in the unit of the resolution. A pair is one world with one trial of every policy; it is dropped for all
+policies or for none. The savings tables are host objects: nothing here is traced.
+
+References:
+  Liang and Zeger, Longitudinal data analysis using generalized linear models, Biometrika 1986 (errors by clusters).
 """
 
 import dataclasses
@@ -15,26 +18,43 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.stats import DegenerateDataWarning, bootstrap
 
+from potlp_jax.codec import finite_or_null
 from potlp_jax.types import Status
 
+# Names as rows hold them. The enumerations that define them (`planning.policies`, `trials.record`) load the planner,
+# which statistics of finished trials do not need.
 BASELINE = "baseline"
 KNOWN_MAP = "known-map"
 SATISFIED = "satisfied"
 
-LOSSES: Status = Status.SUBGOAL_OVERFLOW | Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW | Status.NOT_CONVERGED
+LOSSES: Status = Status.SUBGOAL_OVERFLOW | Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW
 """Status bits by which a fixed-size array or loop took something away from a trial; they are counted."""
 
-UNRELIABLE: Status = Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW | Status.NOT_CONVERGED
+UNRELIABLE: Status = Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW
 """Losses after which a trial is not what its planner would have done. It is never averaged in. (That only the nearest
 subgoals are kept is part of the model, docs/model.md section 6.)"""
 
 CONFIDENCE: float = 0.95
+# With 9,999 resamples the 2.5 % tails hold 250 values each. 10,000 less one, so that the quantiles are resamples.
 RESAMPLES: int = 9_999
+
+# Numbers that SciPy draws at once: three float64 arrays of this many entries take 48 MB.
+_DRAWN_AT_ONCE: int = 2_000_000
+
+# Attainable savings below this share of the baseline's cost are rounding: costs are sums of float32 moves.
+_NOTHING: float = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
 class TrialResult:
-    """What the statistics need of one trial. ``budget`` is the cost at which the trial would have been given up."""
+    """What the statistics need of one trial.
+
+    Attributes:
+        cost: what it travelled.
+        outcome: the name of how it ended.
+        budget: the cost at which it would have been given up, which an unsatisfied trial is charged.
+        status: ``Status`` bits.
+    """
 
     cost: float
     outcome: str
@@ -97,40 +117,60 @@ class Comparison:
     ) -> "Comparison":
         """Compare the policies that are the keys of ``results``; entry ``i`` of each is its trial in world ``i``.
 
-        ``clusters[i]`` names what world ``i`` shares with others, such as its building; None: every world is by itself.
+        Args:
+            results: the trials of each policy, all in the same order of worlds.
+            clusters: ``clusters[i]`` names what world ``i`` shares with others, such as its building; None: every world
+                is independent of the others.
+            resamples: of the bootstrap.
+            seed: of the bootstrap.
 
-        Raises ValueError where the baseline or the known map is missing, or the policies have unequally many trials.
+        Returns:
+            The comparison, policies in the order of ``results``.
+
+        Raises:
+            ValueError: the baseline or the known map is missing, or the policies have unequally many trials.
         """
         _check(results)
-        cluster = _numbered(clusters, len(results[BASELINE]))
+        bootstrapped = _Bootstrap(_numbered(clusters, len(results[BASELINE])), resamples, seed)
         costs = {policy: np.array([trial.cost for trial in trials], float) for policy, trials in results.items()}
         budgets = {policy: np.array([trial.budget for trial in trials], float) for policy, trials in results.items()}
         ended = {
             policy: np.array([trial.outcome == SATISFIED for trial in trials], bool)
             for policy, trials in results.items()
         }
+        # One policy's full tree drops the world for all: otherwise policies would be compared over different worlds.
         lost = [np.array([trial.status & UNRELIABLE != 0 for trial in trials], bool) for trials in results.values()]
         kept = np.all(list(ended.values()), axis=0) & ~np.any(lost, axis=0)
+        # Giving up must not look cheap, so that a trial that stopped early is charged all that it might have spent.
         charged = {policy: np.where(ended[policy], costs[policy], budgets[policy]) for policy in results}
         return cls(
             worlds=len(kept),
             satisfied=_table(
-                {policy: values[kept] for policy, values in costs.items()}, cluster[kept], len(kept), resamples, seed
+                {policy: values[kept] for policy, values in costs.items()}, bootstrapped.of(kept), len(kept)
             ),
-            charged=_table(charged, cluster, len(kept), resamples, seed),
+            charged=_table(charged, bootstrapped, len(kept)),
             outcomes={policy: _count([trial.outcome for trial in trials]) for policy, trials in results.items()},
             losses={policy: _count_losses(trials) for policy, trials in results.items()},
         )
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able values; undefined figures become None."""
-        return _defined(dataclasses.asdict(self))
+        return finite_or_null(dataclasses.asdict(self))
 
 
 def attainable_share(
     ours: Float64[np.ndarray, "*B"], baseline: Float64[np.ndarray, "*B"], known_map: Float64[np.ndarray, "*B"]
 ) -> float:
-    """Share of the attainable savings over the given trials; NaN where the baseline leaves nothing to attain."""
+    """Share of the attainable savings over the given trials (docs/model.md, section 8).
+
+    Args:
+        ours: costs of a policy, a world an entry.
+        baseline: costs of the baseline in the same worlds.
+        known_map: costs with the map known, the least possible.
+
+    Returns:
+        (Σ baseline - Σ ours) / (Σ baseline - Σ known map); NaN where the baseline leaves nothing to attain.
+    """
     return float(_share(ours, baseline, known_map))
 
 
@@ -143,12 +183,21 @@ def attainable_interval(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> tuple[float, float]:
-    """95 % paired bootstrap percentile interval of ``attainable_share``; NaNs where it is undefined.
-
-    ``clusters`` numbers what is resampled as a whole; None: each trial is.
+    """95 % paired bootstrap percentile interval of ``attainable_share``.
 
     A resample that holds no attainable savings counts toward both tails: where more than a tail is made of such
     resamples there is no interval, rather than one that looks narrow because it ignores them.
+
+    Args:
+        ours: costs of a policy, a world an entry.
+        baseline: costs of the baseline in the same worlds.
+        known_map: costs with the map known.
+        clusters: numbers what is resampled as a whole; None: each world is.
+        resamples: how many.
+        seed: of the draws.
+
+    Returns:
+        Lower and upper end; NaNs where there is no interval.
     """
     if clusters is not None:
         # The share is a ratio of sums, so a cluster counts by the sums of its trials.
@@ -166,12 +215,13 @@ def attainable_interval(
             paired=True,
             vectorized=True,
             n_resamples=resamples,
-            batch=max(1, 2_000_000 // len(ours)),
+            batch=max(1, _DRAWN_AT_ONCE // len(ours)),
             method="percentile",
             rng=np.random.default_rng(seed),
         )
     shares = result.bootstrap_distribution
     tail = (1 - CONFIDENCE) / 2
+    # "lower" and "higher" return resamples: between an infinity and a number there is nothing to interpolate.
     low = np.quantile(np.where(np.isnan(shares), -np.inf, shares), tail, method="lower")
     high = np.quantile(np.where(np.isnan(shares), np.inf, shares), 1 - tail, method="higher")
     if not (np.isfinite(low) and np.isfinite(high)):
@@ -181,33 +231,37 @@ def attainable_interval(
 
 def _share(ours: np.ndarray, baseline: np.ndarray, known_map: np.ndarray, axis: int = -1) -> np.ndarray:
     attainable = baseline.sum(axis) - known_map.sum(axis)
-    # Rounding of float32 costs must not pass for something to attain.
-    some = attainable > 1e-6 * baseline.sum(axis)
+    some = attainable > _NOTHING * baseline.sum(axis)
+    # The inner `where` keeps the division quiet where its result is not taken.
     return np.where(some, (baseline.sum(axis) - ours.sum(axis)) / np.where(some, attainable, 1.0), np.nan)
 
 
-def _table(
-    costs: Mapping[str, np.ndarray], clusters: Int64[np.ndarray, " B"], worlds: int, resamples: int, seed: int
-) -> Table:
+@dataclasses.dataclass(frozen=True)
+class _Bootstrap:
+    """How intervals are made: the number of each world's cluster, the resamples and their seed."""
+
+    clusters: Int64[np.ndarray, " B"]
+    resamples: int
+    seed: int
+
+    def of(self, kept: np.ndarray) -> "_Bootstrap":
+        """For the worlds of a mask."""
+        return dataclasses.replace(self, clusters=self.clusters[kept])
+
+
+def _table(costs: Mapping[str, np.ndarray], bootstrapped: _Bootstrap, worlds: int) -> Table:
     pairs = len(costs[BASELINE])
-    rows = tuple(
-        _row(policy, ours, costs[BASELINE], costs[KNOWN_MAP], clusters, resamples, seed)
-        for policy, ours in costs.items()
-    )
+    rows = tuple(_row(policy, costs, bootstrapped) for policy in costs)
     return Table(pairs=pairs, dropped=worlds - pairs, rows=rows)
 
 
-def _row(
-    policy: str,
-    ours: np.ndarray,
-    baseline: np.ndarray,
-    known_map: np.ndarray,
-    clusters: Int64[np.ndarray, " B"],
-    resamples: int,
-    seed: int,
-) -> PolicyRow:
-    pairs = len(ours)
-    low, high = attainable_interval(ours, baseline, known_map, clusters=clusters, resamples=resamples, seed=seed)
+def _row(policy: str, costs: Mapping[str, np.ndarray], bootstrapped: _Bootstrap) -> PolicyRow:
+    ours, baseline, known_map = costs[policy], costs[BASELINE], costs[KNOWN_MAP]
+    pairs, clusters = len(ours), bootstrapped.clusters
+    # The same seed for every policy: their intervals come from the same resamples, so that they can be compared.
+    low, high = attainable_interval(
+        ours, baseline, known_map, clusters=clusters, resamples=bootstrapped.resamples, seed=bootstrapped.seed
+    )
     # Where the baseline has nothing to walk, the task held at the start and nothing can be saved.
     savings = 1 - np.divide(ours, baseline, out=np.ones(pairs), where=baseline > 0)
     return PolicyRow(
@@ -230,6 +284,7 @@ def _error_of_mean(values: Float64[np.ndarray, " B"], clusters: Int64[np.ndarray
     count = len(np.unique(clusters))
     if count < 2:
         return math.nan
+    # Deviations within a cluster are added before they are squared: what its worlds share does not average out.
     deviations = np.bincount(clusters, values - values.mean())
     return float(math.sqrt(count / (count - 1) * np.sum(deviations**2)) / len(values))
 
@@ -239,6 +294,7 @@ def _numbered(clusters: Sequence[Hashable] | None, count: int) -> Int64[np.ndarr
         return np.arange(count)
     if len(clusters) != count:
         raise ValueError(f"{len(clusters)} clusters are named for {count} worlds; name one for each")
+    # In order of first appearance, so that the draws do not depend on how clusters are named.
     numbers = {name: number for number, name in enumerate(dict.fromkeys(clusters))}
     return np.array([numbers[name] for name in clusters], np.int64)
 
@@ -259,13 +315,3 @@ def _count(names: Sequence[str]) -> dict[str, int]:
 def _count_losses(trials: Sequence[TrialResult]) -> dict[str, int]:
     bits = [bit for trial in trials for bit in Status(trial.status & LOSSES)]
     return _count([str(bit.name).lower() for bit in bits])
-
-
-def _defined(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {key: _defined(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_defined(entry) for entry in value]
-    return value

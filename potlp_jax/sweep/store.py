@@ -1,8 +1,8 @@
 """Results of a sweep in one SQLite file: one row a trial, written whole or not at all, shared by several processes.
 
-Work is handed out as claims. A claim belongs to a process and is void once that process is gone (or, of another host,
-once it is ``LEASE`` seconds old), so what a killed process had begun is begun again by another, and
-two processes on one store do not run the same trial. Should they all the same, the first row stays.
+Work is handed out as claims. A claim belongs to a process. It is void once that process is gone or, of another host,
+once it is ``LEASE`` seconds old. So what a killed process had begun is begun again by another, and two processes on one
+store do not run the same trial. If two should run the same trial nevertheless, the first row stays.
 """
 
 import contextlib
@@ -17,9 +17,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from potlp_jax.codec import differences, json_copy
 from potlp_jax.errors import StoreError
 
+# Counts up whenever the tables change; a store of another format is refused, not converted.
 FORMAT = "potlp-sweep-2"
+
+# Ten minutes: trials take seconds, so that only a worker that is gone holds a claim so long.
 LEASE: float = 600.0
 """Seconds after which a claim of another host is void."""
 
@@ -86,6 +90,7 @@ CREATE TABLE claims (
 """
 
 
+# All four, so that SQLite looks the row up by the primary key instead of reading the table.
 _THE_ITEM = "environment = ? AND task = ? AND policy = ? AND world = ?"
 """Condition on the primary key of a trial or a claim."""
 
@@ -96,9 +101,13 @@ class Store:
     def __init__(self, file: Path) -> None:
         self.file = file
         try:
+            # Without an isolation level the module begins no transactions of its own.
             self._connection = sqlite3.connect(file, timeout=PATIENCE, isolation_level=None)
+            # A write-ahead log lets others read while one writes; FULL syncs at every commit, so that a row that was
+            # written is there after a power failure too.
             self._connection.execute("PRAGMA journal_mode=WAL")
             self._connection.execute("PRAGMA synchronous=FULL")
+            # Two processes that open a new file at once must not both make its tables.
             with self._transaction():
                 self._prepare()
         except sqlite3.DatabaseError as error:
@@ -126,9 +135,11 @@ class Store:
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
         """All or nothing; other processes wait."""
+        # IMMEDIATE takes the lock for writing at once: a transaction that read first and wrote later could be refused.
         self._connection.execute("BEGIN IMMEDIATE")
         try:
             yield
+        # An interrupt too must not leave half a transaction.
         except BaseException:
             self._connection.execute("ROLLBACK")
             raise
@@ -143,13 +154,14 @@ class Store:
         with self._transaction():
             written = self.facts()
             for name, value in facts.items():
-                text = json.dumps(value, sort_keys=True)
-                given = json.loads(text)
+                given = json_copy(value)
                 if name not in written or _is_longer(given, written[name]):
-                    self._connection.execute("INSERT OR REPLACE INTO facts VALUES (?, ?)", (name, text))
+                    self._connection.execute(
+                        "INSERT OR REPLACE INTO facts VALUES (?, ?)", (name, json.dumps(given, sort_keys=True))
+                    )
                 elif given != written[name]:
                     raise StoreError(
-                        f"{self.file}: was begun with another {name}: {_difference(written[name], given)}. "
+                        f"{self.file}: was begun with another {name}: {', '.join(differences(written[name], given))}. "
                         "Give the sweep a folder of its own, or the specification that this one was begun with"
                     )
 
@@ -159,8 +171,15 @@ class Store:
         return {name: json.loads(value) for name, value in rows}
 
     def set_possible(self, environment: str, task: str, possible: Mapping[int, bool]) -> None:
-        """Write down in which worlds a task is possible, and give up the claims on finding out."""
+        """Write down in which worlds a task is possible, and give up the claims on finding out.
+
+        Args:
+            environment: of the cell.
+            task: of the cell.
+            possible: by the number of the world.
+        """
         with self._transaction():
+            # Two processes find the same, so that the first answer may stay.
             for world, is_possible in possible.items():
                 self._connection.execute(
                     "INSERT OR IGNORE INTO worlds VALUES (?, ?, ?, ?)", (environment, task, world, int(is_possible))
@@ -177,6 +196,7 @@ class Store:
     def claim(self, items: Sequence[Item], count: int) -> list[Item]:
         """Up to ``count`` of the items, in their order, that have no row and that no living process has claimed."""
         with self._transaction():
+            # Lazily, up to as many as are wanted: each question reads the store, which may hold 10,000s of rows.
             free = list(itertools.islice(filter(self._is_free, items), count))
             now = time.time()
             self._connection.executemany(
@@ -188,8 +208,9 @@ class Store:
     def finish(self, rows: Iterable[Row]) -> None:
         """Write rows and give up their claims, all or nothing. A row that is there stays."""
         with self._transaction():
+            # Columns are in the order of the fields of `Row`, after those of `Item`.
             for row in rows:
-                values = {**{field.name: getattr(row, field.name) for field in dataclasses.fields(row)}}
+                values = {field.name: getattr(row, field.name) for field in dataclasses.fields(row)}
                 del values["item"]
                 values |= {"key": json.dumps(row.key), "versions": json.dumps(dict(row.versions), sort_keys=True)}
                 marks = ", ".join("?" * (4 + len(values)))
@@ -199,7 +220,8 @@ class Store:
                 self._give_up(row.item)
 
     def rows(self, environment: str | None = None, task: str | None = None) -> list[Row]:
-        """Finished trials, in order of environment, task, policy and world."""
+        """Finished trials of an environment and task (None: of all), ordered by environment, task, policy, world."""
+        # "commit" is a word of SQL, so that names of columns are quoted.
         names = ", ".join(f'"{field.name}"' for field in dataclasses.fields(Row) if field.name != "item")
         found = self._connection.execute(
             f"SELECT environment, task, policy, world, {names} FROM trials "
@@ -244,6 +266,7 @@ def _row(entry: tuple[Any, ...]) -> Row:
 
 def _alive(host: str, process: int, started: float, claimed: float) -> bool:
     """Whether the owner of a claim still works on it."""
+    # Processes of another host cannot be seen, so that only the age of their claims counts.
     if host == socket.gethostname():
         return process_start(process) == started
     return time.time() - claimed < LEASE
@@ -267,7 +290,7 @@ def process_start(process: int) -> float | None:
         stat = Path(f"/proc/{process}/stat").read_text()
     except FileNotFoundError:
         return None
-    # The name, in brackets, may hold anything.
+    # Fields of /proc/PID/stat: number, name in brackets (which may hold anything), state, and as the 22nd the start.
     state, *fields = stat.rpartition(")")[2].split()
     return None if state == "Z" else float(fields[18])
 
@@ -276,16 +299,5 @@ def _is_longer(given: Any, written: Any) -> bool:
     """Whether a specification differs from the one that is written by more worlds alone."""
     if not (isinstance(given, Mapping) and isinstance(written, Mapping) and "worlds" in given):
         return False
+    # More worlds only append: worlds are taken in increasing order, so that the rows that are there stay right.
     return {**written, "worlds": given["worlds"]} == given and given["worlds"] > written["worlds"]
-
-
-def _difference(written: Any, given: Any) -> str:
-    if isinstance(written, Mapping) and isinstance(given, Mapping):
-        names = sorted(name for name in written.keys() | given.keys() if written.get(name) != given.get(name))
-        return ", ".join(f"{name} was {_short(written.get(name))}, is {_short(given.get(name))}" for name in names)
-    return f"was {_short(written)}, is {_short(given)}"
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value, default=str)
-    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -1,4 +1,12 @@
-"""Deterministic automata as dense arrays, in one canonical form for every co-safe language."""
+"""Deterministic automata as dense arrays, in one canonical form for every co-safe language.
+
+Spot delivers a Büchi automaton, which accepts infinite words. A robot's word is finite, and a co-safe task is satisfied
+by a finite word as soon as every continuation of it is accepted. ``canonical_dfa`` turns the one into the other.
+
+References:
+    Kupferman and Vardi, Model checking of safety properties, FMSD 2001 (co-safe languages).
+    Moore, Gedanken-experiments on sequential machines, 1956 (minimal automata by refining a partition).
+"""
 
 from dataclasses import dataclass
 
@@ -39,6 +47,7 @@ def translate(formula: Formula) -> str:
     Raises:
         TaskError: Spot is missing.
     """
+    # "BA" puts acceptance on states. "deterministic" is a preference to Spot; for co-safe formulas it is always met.
     automaton = load_spot().translate(formula.parsed, "BA", "deterministic", "complete")
     return automaton.to_str("hoa")
 
@@ -51,32 +60,42 @@ def canonical_dfa(transitions: Int[np.ndarray, "Z L"], accepting: Bool[np.ndarra
         accepting: states that an accepted run visits infinitely often.
         initial: where runs begin.
 
+    Returns:
+        The DFA in its canonical form: equal languages give equal arrays.
+
     Raises:
         TaskError: the language is not co-safe; names a state that shows it.
     """
-    _, letter_class, representative = _letter_classes(transitions)
+    # A task over 16 propositions has 65,536 letters, most of which act alike: all the work is done on one of each kind.
+    letter_class, representative = _letter_classes(transitions)
     reduced = transitions[:, representative]
+    # From here on a state accepts if it accepts whatever follows; the Büchi condition is needed no more.
     satisfied = _satisfied_states(reduced, accepting)
     _check_co_safe(reduced, accepting, satisfied, initial)
     block = _refine(reduced, satisfied)
     order, number = _breadth_first(reduced, block, initial)
+    # One representative of each block, its successors renumbered, and the columns expanded to all letters again.
     minimal = number[block[reduced[order]]][:, letter_class]
     accepted = satisfied[order]
     return Dfa(
         transitions=np.ascontiguousarray(minimal, dtype=np.int32),
         accepting=accepted,
+        # No word leads from a trap to acceptance. All such states are equivalent, so the minimal automaton has at most
+        # one.
         trap=~_reaches(_adjacency(minimal), accepted),
         initial=0,
     )
 
 
-def _letter_classes(transitions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Letters that act alike: distinct columns, each letter's column, each column's first letter, in letter order."""
-    columns, first, inverse = np.unique(transitions, axis=1, return_index=True, return_inverse=True)
+def _letter_classes(transitions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Letters that act alike, by equal columns: the class of each letter, and the first letter of each class."""
+    _, first, inverse = np.unique(transitions, axis=1, return_index=True, return_inverse=True)
+    # ``np.unique`` sorts columns by content. Classes are numbered by their first letter instead, because the canonical
+    # numbering of states follows letters in increasing order.
     rank = np.argsort(first)
     position = np.empty_like(rank)
     position[rank] = np.arange(rank.size)
-    return columns[:, rank], position[inverse.ravel()], first[rank]
+    return position[inverse.ravel()], first[rank]
 
 
 def _adjacency(transitions: np.ndarray) -> np.ndarray:
@@ -99,6 +118,8 @@ def _reaches(adjacency: np.ndarray, target: np.ndarray) -> np.ndarray:
 def _satisfied_states(transitions: np.ndarray, accepting: np.ndarray) -> np.ndarray:
     """States from which every infinite word is accepted: no run ends up avoiding ``accepting`` for ever."""
     adjacency = _adjacency(transitions)
+    # The greatest fixed point: states that can stay outside of ``accepting`` for one more step, again and again. Some
+    # word is rejected from exactly those states that can reach one of them.
     avoiding = ~accepting
     while True:
         shrunk = avoiding & (adjacency & avoiding).any(axis=1)
@@ -108,9 +129,11 @@ def _satisfied_states(transitions: np.ndarray, accepting: np.ndarray) -> np.ndar
 
 
 def _check_co_safe(transitions: np.ndarray, accepting: np.ndarray, satisfied: np.ndarray, initial: int) -> None:
-    """Raises if an accepted run need never reach a satisfied state: then no finite word settles the task."""
+    """Raises if an accepted run need never reach a satisfied state: then no finite word decides the task."""
     adjacency = _adjacency(transitions)
     reachable = _reaches(adjacency.T, np.arange(accepting.size) == initial)
+    # An accepted run that avoids satisfied states visits some accepting state infinitely often, so one that lies on a
+    # cycle. No satisfied state lies on that cycle: from a satisfied state only satisfied ones can be reached.
     for state in np.flatnonzero(reachable & accepting & ~satisfied):
         if _reaches(adjacency, np.arange(accepting.size) == state)[transitions[state]].any():
             raise TaskError(
@@ -124,9 +147,11 @@ def _refine(transitions: np.ndarray, satisfied: np.ndarray) -> np.ndarray:
     block = satisfied.astype(np.int64)
     count = 0
     while True:
+        # States stay together if they were together and all their successors are. Including the own block means that
+        # blocks are only ever split, so an unchanged count is an unchanged partition.
         signature = np.concatenate([block[:, None], block[transitions]], axis=1)
         distinct, block = np.unique(signature, axis=0, return_inverse=True)
-        block = block.ravel()
+        block = block.ravel()  # numpy 2.0 returns a column here
         if distinct.shape[0] == count:
             return block
         count = distinct.shape[0]
@@ -134,10 +159,12 @@ def _refine(transitions: np.ndarray, satisfied: np.ndarray) -> np.ndarray:
 
 def _breadth_first(transitions: np.ndarray, block: np.ndarray, initial: int) -> tuple[np.ndarray, np.ndarray]:
     """Representatives of the reachable blocks in breadth-first order, and each block's number (-1 unreachable)."""
+    # The numbering depends on the language alone: letters are tried in increasing order, and which state represents a
+    # block does not matter, since equivalent states have equivalent successors.
     number = np.full(block.max() + 1, -1)
     number[block[initial]] = 0
     order = [initial]
-    for state in order:
+    for state in order:  # grows while it is walked: the queue of the search
         for successor in transitions[state]:
             if number[block[successor]] < 0:
                 number[block[successor]] = len(order)

@@ -26,7 +26,16 @@ _CARET_INDENT = 4
 
 
 def error_at(message: str, text: str, column: int) -> TaskError:
-    """An error that points into ``text``: ``column`` counts from 1, the caret stands under it."""
+    """An error that points into a text.
+
+    Args:
+        message: what is wrong.
+        text: one line.
+        column: where, counted from 1; the caret stands under it.
+
+    Returns:
+        The error, to be raised.
+    """
     return TaskError(f"{message} (column {column})\n  {text}\n  {' ' * (column - 1)}^")
 
 
@@ -51,6 +60,7 @@ def load_spot() -> Any:
     Raises:
         TaskError: Spot is missing, or another package of that name is installed.
     """
+    # Imported by name: neither the type checker nor the tests of layers need Spot to be there.
     try:
         spot = importlib.import_module("spot")
     except ImportError as error:
@@ -92,9 +102,12 @@ def parse_formula(text: str, propositions: Sequence[str] | None = None) -> Formu
         TaskError: empty text, syntax, unknown proposition, too many propositions (all with column and caret where
             they have one), a formula that is not syntactically co-safe, or Spot missing.
     """
+    # One line, of unchanged length: columns of errors refer to the text as it was given, and the caret is printed
+    # below.
     line = re.sub(r"\s", " ", text)
     if not line.strip():
         raise error_at("the formula is empty", line, 1)
+    # Wrong propositions are reported before Spot is asked for.
     known = None if propositions is None else check_propositions(propositions)
     spot = load_spot()
     parsed = _parse(spot, line, known or ())
@@ -113,11 +126,13 @@ def _parse(spot: Any, line: str, known: tuple[str, ...]) -> Any:
     result = spot.parse_infix_psl(quoted)
     if not result.errors:
         return result.f
+    # Spot reports an error in three lines: the formula, carets below it, the message.
     stream = spot.ostringstream()
     result.format_errors(stream)
     _, carets, message = stream.str().splitlines()[:3]
     column = carets.index("^") - _CARET_INDENT
-    column = min(column - sum(place < column for place in added), len(line)) + 1
+    # Quotes that were added before the column have moved it to the right.
+    column = min(column - sum(quote < column for quote in added), len(line)) + 1
     raise error_at(f"syntax error in the formula: {message.removeprefix('syntax error, ')}", line, column)
 
 
@@ -133,6 +148,7 @@ def _quote_known_names(line: str, known: tuple[str, ...]) -> tuple[str, list[int
     added: list[int] = []
     for piece in _WORD_OR_STRING.findall(line):
         operand = _OPERATOR_PREFIX.sub("", piece)
+        # Only F, G and X are left of the word (``operand`` is empty): these are operators, whatever is known.
         if piece in known and operand not in ("", piece, *known):
             start = sum(map(len, pieces))
             added += [start, start + len(piece) + 1]
@@ -144,6 +160,7 @@ def _quote_known_names(line: str, known: tuple[str, ...]) -> tuple[str, list[int
 def _unknown_proposition(name: str, known: tuple[str, ...], line: str) -> TaskError:
     """Points at the name and lists the known propositions."""
     message = f"unknown proposition '{name}'; known: {', '.join(known) or 'none'}{_operator_hint(line)}"
+    # The name as a whole word, perhaps in quotes, perhaps with operators written in front of it.
     pattern = rf'(?<![A-Za-z0-9_.])[FGX]*("?)(?P<name>{re.escape(name)})\1(?![A-Za-z0-9_.])'
     match = re.search(pattern, line)
     return error_at(message, line, 1 + (match.start("name") if match else 0))
@@ -151,19 +168,22 @@ def _unknown_proposition(name: str, known: tuple[str, ...], line: str) -> TaskEr
 
 def _operator_hint(line: str) -> str:
     """What may have gone wrong if a name in capitals was taken apart."""
+    # A word in capitals that begins with F, G or X and has a letter that is none of them, such as FIRE.
     match = re.search(r'(?<![\w".])[FGX][A-Z_]*[A-EH-WY-Z][A-Z0-9_]+(?![\w"])', line)
     return "" if match is None else f'; F, G and X at the start of a name are operators: quote it, "{match.group()}"'
 
 
 def _check_co_safe(spot: Any, parsed: Any, line: str) -> None:
     """Raises unless the negation normal form is syntactically co-safe (a 'guarantee', in Spot's words)."""
+    # "Guarantee" is Manna and Pnueli's class that the field calls co-safe. The check is of syntax: a formula that is
+    # co-safe for subtler reasons is refused, which is why the message says what may be used.
     normal_form = spot.negative_normal_form(parsed)
     if normal_form.is_syntactic_guarantee():
         return
     offender = _offending_part(normal_form)
     raise TaskError(
         f"the formula is not co-safe: its negation normal form holds '{offender}', which no finite word can "
-        f"settle as true; use X, F, U, M, &, | and negated propositions only"
+        f"make true; use X, F, U, M, &, | and negated propositions only"
         f"{_operator_hint(line)}\n  {line}"
     )
 

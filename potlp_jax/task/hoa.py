@@ -31,6 +31,7 @@ _TOKEN = re.compile(
     re.VERBOSE | re.DOTALL,
 )
 _UNKNOWN = -1
+"""A number that has not been read yet: successor of a letter, initial state."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +95,16 @@ def read_hoa(text: str) -> HoaAutomaton:
 
 
 def write_hoa(dfa: Dfa, propositions: Sequence[str], name: str) -> str:
-    """The DFA as a deterministic complete Büchi automaton; edge labels are canonical covers."""
+    """The DFA as a deterministic complete Büchi automaton; edge labels are canonical covers.
+
+    Args:
+        dfa: the automaton.
+        propositions: names of the bits of a letter, in order.
+        name: text of the ``name:`` header; by it a formula is found again.
+
+    Returns:
+        HOA text that ``read_hoa`` reads back. Equal automata give equal texts.
+    """
     quoted = "".join(f" {_quote(proposition)}" for proposition in propositions)
     lines = [
         "HOA: v1",
@@ -102,6 +112,7 @@ def write_hoa(dfa: Dfa, propositions: Sequence[str], name: str) -> str:
         f"States: {dfa.num_states}",
         f"Start: {dfa.initial}",
         f"AP: {len(propositions)}{quoted}",
+        # The accepting state is absorbing, so visiting it once or infinitely often is the same ("terminal").
         "acc-name: Buchi",
         "Acceptance: 1 Inf(0)",
         "properties: trans-labels explicit-labels state-acc deterministic complete terminal",
@@ -129,6 +140,7 @@ def _label(cubes: Sequence[Phi]) -> str:
 
 def _tokens(text: str) -> list[_Token]:
     """Splits the text; the last token marks the end."""
+    # The end token repeats for ever (see ``_take``), so that no reader has to check for running out of tokens.
     tokens: list[_Token] = []
     position, line = 0, 1
     while position < len(text):
@@ -153,6 +165,7 @@ class _Reader:
         self._tokens = tokens
         self._position = 0
         self._header = _Header()
+        # Without an ``AP:`` header there is one letter, in which no proposition holds.
         self._letters = np.zeros(1, dtype=np.int64)
         self._where: list[np.ndarray] = []  # per proposition the letters that hold it
 
@@ -175,6 +188,7 @@ class _Reader:
         return token
 
     def _accept(self, text: str) -> bool:
+        # A quoted name may read like a keyword.
         found = self._next.text == text and self._next.kind != "string"
         self._position += found
         return found
@@ -266,7 +280,7 @@ class _Reader:
             raise _error(token.line, f"acceptance '{' '.join(parts)}' is not supported: it must be Büchi, '1 Inf(0)'")
         self._header.acceptance = condition
 
-    # Labels: sets of letters
+    # Labels: sets of letters. By the format ! binds stronger than &, and & stronger than |.
 
     def _disjunction(self) -> np.ndarray:
         letters = self._conjunction()
@@ -294,6 +308,7 @@ class _Reader:
             return self._header.aliases[token.text]
         if token.text in ("t", "f"):
             return np.full(self._letters.size, token.text == "t")
+        # A negation of nothing, an alias that comes later, a name where a number belongs: all end here.
         raise _error(token.line, f"{token.text} is not a label: expected a proposition's number, an alias, t or f")
 
     def _proposition(self, token: _Token) -> np.ndarray:
@@ -307,6 +322,7 @@ class _Reader:
             return None
         letters = self._disjunction()
         self._expect_symbol("]")
+        # An alias may stand before ``AP:``, when there was one letter; constants are all that it can hold then.
         return np.broadcast_to(letters, self._letters.shape)
 
     # Body
@@ -329,6 +345,7 @@ class _Reader:
             raise _error(line, f"state {index} is described twice")
         if self._next.kind == "string":
             self._take()
+        # Rows of the table are filled edge by edge, which shows both what is described twice and what is missing.
         table = np.full(self._letters.size, _UNKNOWN)
         states[index] = state = _State(line, self._acceptance_sets(), label, table)
         while self._next.text == "[" or self._next.kind == "number":
@@ -353,6 +370,7 @@ class _Reader:
             raise self._error("universal branching: alternating automata are not supported")
         if self._next.text == "{":
             raise self._error("acceptance on an edge: only state-based acceptance is supported")
+        # Two edges for one letter are harmless where they lead to the same state.
         clash = np.flatnonzero(letters & (state.table >= 0) & (state.table != target))
         if clash.size:
             raise _error(
@@ -374,6 +392,7 @@ class _Reader:
             raise self._error("an edge without label beside edges with labels")
         if state.label is not None:
             return state.label
+        # Implicit labels: the i-th edge belongs to letter i.
         state.implicit_edges += 1
         if state.implicit_edges > self._letters.size:
             raise self._error(f"more than {self._letters.size} edges with implicit labels")
@@ -395,6 +414,7 @@ class _Reader:
                     f"state {index} is not complete: letter {self._letter_text(int(missing[0]))} leads nowhere "
                     "(Spot completes automata with the option 'complete')",
                 )
+        # ``t`` accepts every run; ``f`` none, and then no state can be a member.
         transitions = np.stack([states[index].table for index in range(count)])
         members = np.array([states[index].accepting for index in range(count)])
         return transitions, members | (self._header.acceptance == "0t")

@@ -1,6 +1,6 @@
 """What an attempt beyond a subgoal can need: edges, conditions, outcome classes and what implies what.
 
-Definitions (MODEL: sections 3 and 4; Bradley et al. 2021, sections III-B and IV-A):
+Definitions (docs/model.md sections 3 and 4; Bradley et al. 2021, sections III-B and IV-A):
 
 * An **edge** z' -> z'' can be attempted: z'' differs from z', z'' is no trap, z' is not accepting and has at least one
   letter that stays.
@@ -21,7 +21,9 @@ from potlp_jax.task.automaton import Dfa
 from potlp_jax.task.guards import Phi, cube_letters, hull, minimal_cover
 
 MAX_CLASSES: int = 4096
-"""Outcome classes of a task, at most: each is asked of an estimator, and stored with its letters."""
+"""Outcome classes of a task, at most: each is asked of an estimator, and stored with its letters.
+
+The relation ``implies`` is square in them; a task of this size is a mistake in the formula."""
 
 
 class OutcomeClass(NamedTuple):
@@ -38,7 +40,7 @@ class Condition:
     """What must be found beyond a subgoal for an attempt to succeed.
 
     Attributes:
-        stay: letters that may be read on the way.
+        stay: letters that may be read on the path.
         go: letters that end it.
         classes: indices of the outcome classes whose cubes make up ``go``, increasing.
     """
@@ -77,8 +79,9 @@ class Outcomes:
     def implies(self) -> Bool[np.ndarray, "M M"]:
         """``[a, b]``: (stay, go) of a implies that of b, iff go_a in go_b and stay_a in stay_b or go_b.
 
-        On a way that makes a hold, the first letter outside stay_b is then in go_b, or the last one is.
+        On a path that makes a hold, the first letter outside stay_b is then in go_b, or the last one is.
         """
+        # Subset tests on bits: the sets of one condition against those of all others at once.
         stay = _packed([condition.stay for condition in self.conditions])
         go = _packed([condition.go for condition in self.conditions])
         implies = np.zeros((len(go), len(go)), dtype=bool)
@@ -110,24 +113,31 @@ def find_outcomes(dfa: Dfa, max_positive_literals: int | None = None) -> Outcome
     Args:
         dfa: the task's automaton.
         max_positive_literals: cubes that need more propositions to hold at one cell are dropped (None: none are).
-            An edge's ``go`` is the union of the cubes that are left; edges that lose all cubes do not exist.
+            An edge's ``go`` is the union of the remaining cubes; edges that lose all cubes do not exist.
+
+    Returns:
+        Edges in lexicographic order, their conditions, and the outcome classes that these are made of.
 
     Raises:
         TaskError: acceptance becomes unreachable because of ``max_positive_literals``, or there are more than
             ``MAX_CLASSES`` outcome classes.
     """
+    # Before cubes are dropped: afterwards a state without edges may as well be one that no letter keeps.
     if max_positive_literals is not None:
         _check_reachable(dfa, max_positive_literals)
     edges = _find_edges(dfa, max_positive_literals)
+    # Two edges share a class if their cubes and the letters that stay agree; phi_stay alone may be coarser than these.
     stays = {key: edge.stay for edge in edges for key in edge.class_keys}
     keys = sorted(stays)
     if len(keys) > MAX_CLASSES:
         raise TaskError(f"the task has {len(keys)} outcome classes, more than {MAX_CLASSES}: use a simpler formula")
+    # One condition per class, with the class's own index: what is learnt of a cube is kept under that index.
     conditions = [Condition(stays[key], cube_letters(key[1]), (c,)) for c, key in enumerate(keys)]
     number = {key: c for c, key in enumerate(keys)}
     known = {_letter_sets(condition): c for c, condition in enumerate(conditions)}
     edge_condition = []
     for edge in edges:
+        # Without ``max_positive_literals`` the union of the cubes is the guard; with it, what remains of the guard.
         classes = tuple(number[key] for key in edge.class_keys)
         condition = Condition(edge.stay, np.any([conditions[c].go for c in classes], axis=0), classes)
         index = known.setdefault(_letter_sets(condition), len(conditions))
@@ -144,10 +154,12 @@ def find_outcomes(dfa: Dfa, max_positive_literals: int | None = None) -> Outcome
 
 def _find_edges(dfa: Dfa, max_positive_literals: int | None) -> list[_Edge]:
     """Edges in lexicographic order, with the cubes that are kept."""
+    # Many edges of an automaton have the same guard, and covers are the expensive part.
     covers: dict[bytes, tuple[Phi, ...]] = {}
     edges = []
     for source, row in enumerate(dfa.transitions):
         stay = row == source
+        # A state that no letter keeps is left with the next cell, whatever that is: nothing can be explored in it.
         if dfa.accepting[source] or dfa.trap[source] or not stay.any():
             continue
         for target in np.unique(row):
@@ -164,6 +176,7 @@ def _find_edges(dfa: Dfa, max_positive_literals: int | None) -> list[_Edge]:
 
 def _packed(guards: list[np.ndarray]) -> np.ndarray:
     """Sets of letters as rows of bits; no rows where there are no guards."""
+    # An accepting or impossible initial state leaves a task without edges.
     return np.packbits(np.reshape(guards, (len(guards), -1)) if guards else np.zeros((0, 1), bool), axis=1)
 
 
@@ -185,11 +198,12 @@ def _check_reachable(dfa: Dfa, max_positive_literals: int) -> None:
     if max_positive_literals < 0:
         raise TaskError(f"max_positive_literals is {max_positive_literals}: it must be None or at least 0")
     letters = [letter for letter in range(dfa.transitions.shape[1]) if letter.bit_count() <= max_positive_literals]
-    reached, frontier = {dfa.initial}, [dfa.initial]
-    for state in frontier:
+    reached, queue = {dfa.initial}, [dfa.initial]
+    for state in queue:
         successors = {int(target) for target in dfa.transitions[state, letters]} - reached
         reached |= successors
-        frontier += sorted(successors)
+        queue += sorted(successors)
+    # A task that is impossible from the start is a task all the same; the limit is not to blame.
     if not dfa.trap[dfa.initial] and not dfa.accepting[list(reached)].any():
         raise TaskError(
             f"acceptance is unreachable with max_positive_literals={max_positive_literals}: the task needs more "

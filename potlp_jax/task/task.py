@@ -125,12 +125,16 @@ class Task:
             propositions: Sigma, a superset of the formula's names; default: these names, sorted.
             max_positive_literals: drops cubes that need more propositions to hold at one cell.
 
+        Returns:
+            The task; its ``arrays`` are what the planner takes.
+
         Raises:
             TaskError: anything wrong with the formula, with column and caret; Spot missing; acceptance unreachable
                 because of ``max_positive_literals``. A formula that no word satisfies is a task whose initial state
                 is a trap.
         """
         formula = parse_formula(text, propositions)
+        # Through HOA text, so that formulas and files take one path and a shipped file is what Spot would deliver.
         automaton = read_hoa(translate(formula))
         return cls._compile(text, formula.propositions, automaton, max_positive_literals)
 
@@ -144,6 +148,9 @@ class Task:
             text: a deterministic complete automaton with state-based Büchi acceptance and a co-safe language.
             propositions: Sigma, a superset of the automaton's; default: the automaton's, in its order.
             max_positive_literals: drops cubes that need more propositions to hold at one cell.
+
+        Returns:
+            The task; its text is the automaton's name.
 
         Raises:
             TaskError: what is wrong with the automaton, with the line where it has one.
@@ -168,11 +175,20 @@ class Task:
     def of_formula(cls, text: str, propositions: Sequence[str]) -> "Task":
         """The task of a formula over Sigma: without Spot where a task that ships has this very formula.
 
+        Args:
+            text: the formula.
+            propositions: Sigma, a superset of the formula's names.
+
+        Returns:
+            The same task with and without Spot: shipped automata were made by Spot and are read as such.
+
         Raises:
             TaskError: as ``from_formula``.
         """
         for hoa in _shipped_hoa().values():
-            if read_hoa(hoa).name == text:
+            shipped = read_hoa(hoa)
+            # A shipped automaton may have propositions that its formula does not mention, and Sigma not contain.
+            if shipped.name == text and set(shipped.propositions) <= set(propositions):
                 return cls.from_hoa(hoa, propositions)
         return cls.from_formula(text, propositions)
 
@@ -184,6 +200,8 @@ class Task:
         unknown = [name for name in automaton.propositions if name not in propositions]
         if unknown:
             raise TaskError(f"unknown proposition '{unknown[0]}'; known: {', '.join(propositions) or 'none'}")
+        # Sigma may be larger and in another order: each of its letters is looked up by the bits that the automaton
+        # knows.
         bits = [propositions.index(name) for name in automaton.propositions]
         letters = np.arange(2 ** len(propositions))
         own_letters = sum(((letters >> bit & 1) << i for i, bit in enumerate(bits)), np.zeros_like(letters))
@@ -247,6 +265,7 @@ class Task:
 
     def describe(self) -> dict[str, Any]:
         """The task for people and programs; JSON-able. Guards are canonical covers in words."""
+        # Indices are those of the arrays, so that a planner's values can be looked up here.
         dfa = self.dfa
         return {
             "formula": self.text,
@@ -294,9 +313,13 @@ def stack_tasks(tasks: Sequence[Task], sizes: TaskSizes | None = None) -> TaskAr
         tasks: at least one task.
         sizes: padded sizes; default: the largest of each.
 
+    Returns:
+        The arrays of all tasks, each field with the leading axis ``len(tasks)``.
+
     Raises:
         TaskError: no task, different propositions, or a task that does not fit.
     """
+    # Tasks of other propositions could be padded too, but a letter would mean different things from row to row.
     if not tasks:
         raise TaskError("there is no task to stack")
     for task in tasks:
@@ -305,6 +328,7 @@ def stack_tasks(tasks: Sequence[Task], sizes: TaskSizes | None = None) -> TaskAr
                 f"stacked tasks must have the same propositions in the same order: {tasks[0].propositions} and "
                 f"{task.propositions}"
             )
+    # Propositions are the same, so letters mean the same in every row of the stack; the other sizes may differ.
     if sizes is None:
         sizes = tasks[0].sizes
         for task in tasks:
@@ -327,12 +351,14 @@ def _shipped_hoa() -> dict[str, str]:
 
 def _cube_text(cube: Phi, propositions: Sequence[str]) -> str:
     """A cube in words; names that Spot would not read as they stand are quoted."""
+    # F, G and X at the start of a name are operators to Spot.
     names = [name if name.isidentifier() and name[0] not in "FGX" else f'"{name}"' for name in propositions]
     return " & ".join(("" if sign > 0 else "!") + names[i] for i, sign in enumerate(cube) if sign) or "true"
 
 
 def _on_device(fields: dict[str, np.ndarray]) -> TaskArrays:
     """Concrete arrays, also where a trace is under way: a task keeps its arrays, and may not keep tracers."""
+    # ``Task.arrays`` is cached; a first use within a jitted function would otherwise cache that trace's constants.
     with jax.ensure_compile_time_eval():
         return TaskArrays(**{name: jnp.asarray(value) for name, value in fields.items()})
 
@@ -348,6 +374,7 @@ def _padded_fields(task: Task, sizes: TaskSizes) -> dict[str, np.ndarray]:
 
 def _state_fields(task: Task, sizes: TaskSizes) -> dict[str, np.ndarray]:
     dfa = task.dfa
+    # Padded states loop: no real state leads to them, and as traps they are never entered.
     transitions = np.repeat(np.arange(sizes.states, dtype=np.int32)[:, None], 2**sizes.propositions, axis=1)
     transitions[: dfa.num_states] = _ignore_padded_propositions(dfa.transitions, sizes)
     return {
@@ -361,6 +388,7 @@ def _state_fields(task: Task, sizes: TaskSizes) -> dict[str, np.ndarray]:
 
 def _edge_fields(task: Task, sizes: TaskSizes) -> dict[str, np.ndarray]:
     outcomes, count = task.outcomes, task.sizes
+    # Conditions of several cubes follow the padded classes and so move up by the padding.
     compound = outcomes.edge_condition >= count.classes
     condition = outcomes.edge_condition + np.int32(sizes.classes - count.classes) * compound
     return {
@@ -375,15 +403,15 @@ def _condition_fields(task: Task, sizes: TaskSizes) -> dict[str, np.ndarray]:
     outcomes, count = task.outcomes, task.sizes
     phi = np.zeros((sizes.classes, 2, sizes.propositions), dtype=np.int8)
     phi[: count.classes, :, : count.propositions] = np.reshape(outcomes.classes, (count.classes, 2, count.propositions))
-    place = np.arange(len(outcomes.conditions))
-    place[count.classes :] += sizes.classes - count.classes
+    row_of = np.arange(len(outcomes.conditions))
+    row_of[count.classes :] += sizes.classes - count.classes
     total = sizes.classes + sizes.compound
     classes = np.full((total, sizes.cubes), NO_CLASS, dtype=np.int32)
-    for row, condition in zip(place, outcomes.conditions, strict=True):
+    for row, condition in zip(row_of, outcomes.conditions, strict=True):
         classes[row, : len(condition.classes)] = condition.classes
     mask, implies = np.zeros(total, dtype=bool), np.zeros((total, total), dtype=bool)
-    mask[place] = True
-    implies[np.ix_(place, place)] = outcomes.implies
+    mask[row_of] = True
+    implies[np.ix_(row_of, row_of)] = outcomes.implies
     own = outcomes.conditions[: count.classes]
     return {
         "class_phi": phi,
@@ -403,6 +431,7 @@ def _class_letters(guards: Sequence[np.ndarray], count: TaskSizes, sizes: TaskSi
 
 def _ignore_padded_propositions(table: np.ndarray, sizes: TaskSizes) -> np.ndarray:
     """Repeats the letters (last axis): the bits above the task's own do not matter."""
+    # Padded propositions are the highest bits, so a letter's own bits repeat with the period of the table.
     return np.tile(table, (1, 2**sizes.propositions // table.shape[1]))
 
 

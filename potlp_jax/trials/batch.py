@@ -2,12 +2,11 @@
 
 A slot holds one running trial. Whenever a trial ends, its slot is given the next one, so that none stays idle while
 there is work; whatever their tasks and starts, trials of one policy, configuration and array shape share one
-compilation. A trial takes the decisions of ``trial.run_trial`` with the same arguments; what it leaves behind is its
-outcome and path, from which the rest can be made again. The step itself is in ``batch_step``.
+compilation. A trial takes the decisions of ``loop.run_trial`` with the same arguments; what it leaves behind is its
+outcome and path, from which the rest can be made again. The step itself is in ``slots``.
 """
 
 import dataclasses
-import math
 import time
 from collections.abc import Hashable, Iterable, Iterator
 from functools import partial
@@ -16,18 +15,20 @@ from itertools import chain
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int32, PRNGKeyArray
+from jaxtyping import Array, Bool, Int32, PRNGKeyArray
 
 from potlp_jax.errors import BatchError
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.memory import Views
-from potlp_jax.learning.network import Params
-from potlp_jax.planning.policies import Policy
+from potlp_jax.planning.estimates import Estimator
+from potlp_jax.planning.policies import Policy, PolicyFunction, named_policy
 from potlp_jax.task.task import TaskArrays
-from potlp_jax.trials.batch_step import EMPTY, OUTCOMES, Progress, Rules, Scene, begin, step
-from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials import rules
+from potlp_jax.trials.config import TrialConfig, config_in
 from potlp_jax.trials.record import Outcome
+from potlp_jax.trials.slots import EMPTY, Asked, Progress, Scene, Setup, begin, step
 from potlp_jax.world.grid import World
+from potlp_jax.world.moves import length_of
 
 SLOTS: int = 8
 """Trials that run at a time; what is best on a CPU (docs/sweeps.md)."""
@@ -35,9 +36,13 @@ SLOTS: int = 8
 
 @dataclasses.dataclass(frozen=True)
 class Start:
-    """A trial to run; ``arrays`` are its task's, ``key`` is that of ``run_trial``, ``name`` comes back with the result.
+    """A trial to run. All worlds of a batch have one shape (``grid.pad_world``), all tasks one size (``Task.padded``).
 
-    All worlds of a batch have one shape (``grid.pad_world``), all tasks one size (``Task.padded``).
+    Attributes:
+        world: the true map.
+        arrays: of the task.
+        key: as in ``run_trial``.
+        name: comes back with the result.
     """
 
     world: World
@@ -48,9 +53,17 @@ class Start:
 
 @dataclasses.dataclass(frozen=True)
 class Finished:
-    """A trial that has ended. ``path`` has one cell per entry, the start first; ``cost`` is in the world's unit.
+    """A trial that has ended.
 
-    ``seconds`` is its share of the time in which its slots ran.
+    Attributes:
+        name: of its ``Start``.
+        outcome: how it ended.
+        cost: length of the path in the unit of the world's resolution.
+        path: cells in order, the start first.
+        decisions: number of decisions.
+        fallbacks: decisions that fell back on the nearest frontier.
+        status: bits of ``Status`` of all decisions.
+        seconds: its share of the time in which the slots ran.
     """
 
     name: Hashable
@@ -65,55 +78,66 @@ class Finished:
 
 def run_batch(
     starts: Iterable[Start],
-    policy: Policy | str,
+    policy: Policy | PolicyFunction | str,
     config: TrialConfig | None = None,
     *,
     slots: int = SLOTS,
-    estimator: TrainedEstimator | None = None,
+    estimator: TrainedEstimator | Estimator | None = None,
 ) -> Iterator[Finished]:
-    """Run trials of ``policy``, ``slots`` at a time, and give each as soon as it has ended.
+    """Run trials of one policy, several at a time, and give each as soon as it has ended.
 
-    ``starts`` is asked for the next trial whenever a slot is free, so it may decide late. ``estimator`` is what the
-    policy ``potlp`` looks with.
+    Args:
+        starts: the trials. Asked for the next one whenever a slot is free, so that it may decide late.
+        policy: one of the library's, or a function of one's own (``planning.policies.PolicyFunction``).
+        config: settings, which all trials share; by default what their worlds call for.
+        slots: trials that run at a time.
+        estimator: what the policy asks, as in ``run_trial``; ``potlp`` has no default here.
+
+    Returns:
+        The trials in the order in which they end.
 
     Raises:
-        BatchError: a world or task has another shape than the first one, or ``potlp`` has no estimator.
+        BatchError: a world or task has another shape than the first one, its world is of a family with other
+            propositions or settings, or ``potlp`` has no estimator.
     """
-    policy = Policy(policy)
+    policy = named_policy(policy)
     if slots < 1:
         raise BatchError(f"slots is {slots}, must be at least 1")
-    if (policy is Policy.POTLP) and estimator is None:
+    if policy is Policy.POTLP and estimator is None:
         raise BatchError("policy potlp needs an estimator (learning.estimator.estimator_for)")
-    config = TrialConfig() if config is None else config
-    if policy is Policy.KNOWN_MAP:
-        config = dataclasses.replace(config, revealed=True)
-    trained = estimator if policy is Policy.POTLP else None
-    rules = Rules(policy=policy, config=config, network=None if trained is None else trained.config)
-    yield from _run(iter(starts), rules, slots, trained)
-
-
-def _run(starts: Iterator[Start], rules: Rules, count: int, trained: TrainedEstimator | None) -> Iterator[Finished]:
+    starts = iter(starts)
     first = next(starts, None)
     if first is None:
         return
-    starts = chain([first], starts)
-    views = None if trained is None else trained.start(*first.world.shape).views
-    params = None if trained is None else trained.params
-    slots: tuple[Scene, Progress] = _empty_slots(first, views, rules, count)
+    config = rules.config_of(policy, config_in(first.world, config))
+    asked = rules.asked_of(policy, estimator)
+    network = asked.config if isinstance(asked, TrainedEstimator) else None
+    yield from _run(first, starts, Setup(policy=policy, config=config, network=network), slots, asked)
+
+
+def _run(
+    first: Start, others: Iterator[Start], setup: Setup, count: int, asked: TrainedEstimator | Estimator | None
+) -> Iterator[Finished]:
+    starts = chain([first], others)
+    views, shared = None, asked
+    if isinstance(asked, TrainedEstimator):
+        # Parameters are the same in all slots; what a robot has seen is its own.
+        views, shared = asked.start(*first.world.shape).views, asked.params
+    slots: tuple[Scene, Progress] = _empty_slots(first, views, setup, count)
     held: list[Start | None] = [None] * count
     seconds = np.zeros(count)
     while True:
         for slot in range(count):
             while held[slot] is None and (start := next(starts, None)) is not None:
                 _check_shapes(start, first)
-                slots = _fill(slots, jnp.int32(slot), start.world, start.arrays, start.key, views, rules=rules)
+                slots = _fill(slots, jnp.int32(slot), start.world, start.arrays, start.key, views, setup=setup)
                 held[slot], seconds[slot] = start, 0.0
         occupied = [slot for slot, start in enumerate(held) if start is not None]
         if not occupied:
             return
         began = time.perf_counter()
-        slots = _run_until_one_ends(slots, params, rules=rules)
-        ended = ~np.asarray(slots[1].running)
+        slots = _run_until_one_ends(slots, shared, setup=setup)
+        ended = ~np.asarray(slots[1].tally.running)
         seconds[occupied] += (time.perf_counter() - began) / len(occupied)
         for slot in occupied:
             start = held[slot]
@@ -123,6 +147,11 @@ def _run(starts: Iterator[Start], rules: Rules, count: int, trained: TrainedEsti
 
 
 def _check_shapes(start: Start, first: Start) -> None:
+    for what in ("propositions", "settings"):
+        mine, other = getattr(start.world, what), getattr(first.world, what)
+        # They are static parts of the arrays: JAX could not put both into one batch, and would say so obscurely.
+        if mine != other:
+            raise BatchError(f"trial {start.name!r}: its world has the {what} {mine}, the first of the batch {other}")
     for what, mine, other in (("world", start.world, first.world), ("task", start.arrays, first.arrays)):
         found, expected = ([leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (mine, other))
         if found != expected:
@@ -133,31 +162,32 @@ def _check_shapes(start: Start, first: Start) -> None:
 
 
 def _finished(start: Start, progress: Progress, slot: int, seconds: float) -> Finished:
-    names = ("outcome", "straight", "diagonal", "path", "decisions", "fallbacks", "status")
-    outcome, straight, diagonal, path, decisions, fallbacks, status = (
-        np.asarray(getattr(progress, name)[slot]) for name in names
-    )
-    cells = int(straight) + int(diagonal) * math.sqrt(2.0)
+    tally = progress.tally
+
+    def number(counts: Array) -> int:
+        return int(counts[slot])
+
+    straight, diagonal = number(tally.straight), number(tally.diagonal)
     return Finished(
         name=start.name,
-        outcome=OUTCOMES[int(outcome)],
-        cost=cells * float(start.world.resolution),
-        path=path[: int(straight) + int(diagonal) + 1].astype(np.int32),
-        decisions=int(decisions),
-        fallbacks=int(fallbacks),
-        status=int(status),
+        outcome=rules.OUTCOMES[number(tally.outcome)],
+        cost=length_of(straight, diagonal) * float(start.world.resolution),
+        path=np.asarray(progress.path[slot])[: straight + diagonal + 1].astype(np.int32),
+        decisions=number(tally.decisions),
+        fallbacks=number(tally.fallbacks),
+        status=number(tally.status),
         seconds=seconds,
     )
 
 
-def _empty_slots(first: Start, views: Views | None, rules: Rules, count: int) -> tuple[Scene, Progress]:
+def _empty_slots(first: Start, views: Views | None, setup: Setup, count: int) -> tuple[Scene, Progress]:
     """Slots without trials, of the shape of ``first``."""
-    scene, progress = begin(first.world, first.arrays, first.key, views, rules=rules)
-    progress = dataclasses.replace(progress, outcome=jnp.int8(EMPTY))
+    scene, progress = begin(first.world, first.arrays, first.key, views, setup=setup)
+    progress = dataclasses.replace(progress, tally=dataclasses.replace(progress.tally, outcome=jnp.int8(EMPTY)))
     return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], count, axis=0), (scene, progress))
 
 
-@partial(jax.jit, static_argnames="rules", donate_argnums=0)
+@partial(jax.jit, static_argnames="setup", donate_argnums=0)
 def _fill(
     slots: tuple[Scene, Progress],
     slot: Int32[Array, ""],
@@ -166,18 +196,18 @@ def _fill(
     key: PRNGKeyArray,
     views: Views | None,
     *,
-    rules: Rules,
+    setup: Setup,
 ) -> tuple[Scene, Progress]:
-    new = begin(world, arrays, key, views, rules=rules)
+    new = begin(world, arrays, key, views, setup=setup)
     return jax.tree.map(lambda leaf, entry: leaf.at[slot].set(entry), slots, new)
 
 
-@partial(jax.jit, static_argnames="rules", donate_argnums=0)
-def _run_until_one_ends(
-    slots: tuple[Scene, Progress], params: Params | None, *, rules: Rules
-) -> tuple[Scene, Progress]:
+@partial(jax.jit, static_argnames="setup", donate_argnums=0)
+def _run_until_one_ends(slots: tuple[Scene, Progress], asked: Asked, *, setup: Setup) -> tuple[Scene, Progress]:
     scene, progress = slots
-    running = jnp.sum(progress.running)
-    one_decision = partial(step, scene, params, rules)
-    progress = jax.lax.while_loop(lambda now: (jnp.sum(now.running) == running) & (running > 0), one_decision, progress)
-    return scene, progress
+    running = jnp.sum(progress.tally.running)
+
+    def all_still_run(now: Progress) -> Bool[Array, ""]:
+        return (jnp.sum(now.tally.running) == running) & (running > 0)
+
+    return scene, jax.lax.while_loop(all_still_run, partial(step, scene, asked, setup), progress)

@@ -1,14 +1,15 @@
-"""Settings of a trial, and how they are read back from a record."""
+"""Settings of a trial."""
 
 import dataclasses
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterator, Mapping
 from typing import Any
 
+from potlp_jax.codec import with_settings
 from potlp_jax.environments.base import Generator
+from potlp_jax.errors import PotlpWarning
 from potlp_jax.planning.policies import DecisionConfig
-from potlp_jax.planning.search.graph import SearchConfig, SearchMode
 from potlp_jax.world.camera import CameraConfig, Disturbance
-from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import World
 from potlp_jax.world.sensing import SensorConfig
 
@@ -30,45 +31,37 @@ class TrialConfig:
     revealed: bool = False
 
 
-def with_settings(config: Any, settings: Mapping[str, Any]) -> Any:
-    """A configuration with some of its fields changed, nested mappings for nested configurations.
-
-    For settings that are known to be right, such as a generator's; ``sweep.specification`` checks those of users.
-    """
-    changes = {
-        name: with_settings(getattr(config, name), value) if isinstance(value, Mapping) else value
-        for name, value in settings.items()
-    }
-    return dataclasses.replace(config, **changes)
-
-
 def trial_config_for(source: World | Generator) -> TrialConfig:
-    """What trials in a world, or in the worlds of a family, call for."""
+    """The settings that trials in a world, or in the worlds of a family, call for: defaults but for ``settings``."""
     return with_settings(TrialConfig(), source.settings)
 
 
-def trial_config_from_dict(data: Mapping[str, Any]) -> TrialConfig:
-    """The configuration that a record keeps, as ``dataclasses.asdict`` wrote it."""
-    decision = data["decision"]
-    return TrialConfig(
-        **{
-            **data,
-            "sensor": SensorConfig(**data["sensor"]),
-            "camera": _camera_from_dict(data.get("camera", {})),
-            "disturbance": Disturbance(**data.get("disturbance", {})),
-            "decision": DecisionConfig(
-                **{
-                    "commitment": 0.0,  # of records older than the setting
-                    **decision,
-                    "frontiers": FrontierConfig(**decision["frontiers"]),
-                    "search": SearchConfig(**{**decision["search"], "mode": SearchMode(decision["search"]["mode"])}),
-                }
-            ),
-        }
-    )
+def config_in(world: World, given: TrialConfig | None) -> TrialConfig:
+    """The settings of a trial in a world: those given, by default what the world calls for.
+
+    Warns:
+        PotlpWarning: the settings given have defaults where the world calls for something else. Twelve subgoals where
+            32 are needed end no trial and raise no error: they only make every planner worse.
+    """
+    if given is None:
+        return trial_config_for(world)
+    unheeded = list(_unheeded(world.settings, given, TrialConfig()))
+    if unheeded:
+        warnings.warn(
+            f"the world calls for {', '.join(unheeded)}, and the configuration has the defaults; begin with "
+            "trial_config_for(world) and change what you need",
+            PotlpWarning,
+            stacklevel=3,
+        )
+    return given
 
 
-def _camera_from_dict(data: Mapping[str, Any]) -> CameraConfig:
-    """JSON has lists where the configuration has tuples."""
-    values: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
-    return CameraConfig(**values)
+def _unheeded(settings: Mapping[str, Any], given: Any, default: Any) -> Iterator[str]:
+    """Settings of which the defaults are given although something else is called for."""
+    for name, wanted in settings.items():
+        value, usual = getattr(given, name), getattr(default, name)
+        if isinstance(wanted, Mapping):
+            yield from (f"{name}.{entry}" for entry in _unheeded(wanted, value, usual))
+        elif value == usual != wanted:
+            # A value that is neither was chosen by somebody, who may know better than the world.
+            yield f"{name}={wanted}"

@@ -6,7 +6,6 @@ step at which the cell was first seen, so that the belief at any step - and with
 
 import dataclasses
 import json
-import math
 import zlib
 from collections.abc import Mapping
 from enum import StrEnum
@@ -16,7 +15,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int32
 
+from potlp_jax.codec import finite_or_text
 from potlp_jax.errors import RecordError
+from potlp_jax.types import status_names
 from potlp_jax.world.grid import (
     BeliefMap,
     World,
@@ -26,6 +27,7 @@ from potlp_jax.world.grid import (
     world_from_dict,
     world_to_dict,
 )
+from potlp_jax.world.moves import Cell
 
 FORMAT = "potlp-trial-1"
 NEVER_SEEN: int = -1
@@ -69,13 +71,26 @@ class ActionRecord:
 class Decision:
     """One decision: where the robot stood, what it considered, what it chose.
 
-    ``kind`` is ``"action"`` (toward a subgoal), ``"finish"`` (acceptance in known space), ``"frontier"`` (nearest
-    frontier: the baseline's move), ``"fallback"`` (the same as liveness rule of a planner without available action) or
-    ``"none"``. ``choice`` is the index of the chosen action, None unless the policy searches. ``path`` is the part of
-    the known-space path that may be executed before the next decision, starting at ``cell``. ``looks`` holds, per
-    subgoal, the decision at which the panorama was taken that its estimates come from; empty where none is used.
-    ``preferred`` is the index of the action that the search found, which the robot may not have turned to; None unless
-    the policy searches, and in records that are older than it.
+    Attributes:
+        index: number of the decision, from 0.
+        step: index into the trial's path.
+        cell, state: where the robot stood, and the automaton's state there.
+        key: words of the decision's random key.
+        kind: ``"action"`` (toward a subgoal), ``"finish"`` (acceptance in known space), ``"frontier"`` (nearest
+            frontier: the baseline's move), ``"fallback"`` (the same as liveness rule of a planner without available
+            action), ``"optimistic"`` or ``"none"``.
+        choice: index of the chosen action; None unless the policy searches.
+        target, target_state: where the path leads; None where there is no move.
+        value: expected cost from here, as the policy sees it.
+        fallback: whether ``kind`` is ``"fallback"``.
+        status: bits of ``Status``.
+        subgoals: cells of the subgoals, in their order.
+        actions: those that were available; empty unless the policy searches.
+        path: the part of the known-space path that may be executed before the next decision, from ``cell`` on.
+        observations: per subgoal, the decision at which the panorama was taken that its estimates come from; empty
+            where none is used.
+        preferred: index of the action that the search found best. The robot commits to its former target unless that
+            one is cheaper by enough, so that ``choice`` may differ. None unless the policy searches.
     """
 
     index: int
@@ -93,31 +108,54 @@ class Decision:
     subgoals: tuple[tuple[int, int], ...]
     actions: tuple[ActionRecord, ...]
     path: tuple[tuple[int, int], ...]
-    looks: tuple[int, ...] = ()
+    observations: tuple[int, ...] = ()
     preferred: int | None = None
 
     @property
-    def kept_from(self) -> ActionRecord | None:
-        """What the search found where the robot kept to what it was on its way to instead; else None."""
+    def overruled(self) -> ActionRecord | None:
+        """The action that the search found best, where the robot's commitment overruled it; otherwise None."""
         if self.preferred is None or self.preferred == self.choice:
             return None
         return next(action for action in self.actions if action.index == self.preferred)
 
 
-@dataclasses.dataclass(frozen=True)
-class Trial:
-    """A finished trial. ``path``, ``states`` and ``word`` have one entry per visited cell, the start included.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunRecord:
+    """What a robot did for a task: all that is known of it without the true map.
 
-    ``word[i]`` is the letter of ``path[i]`` and ``states[i]`` the automaton's state after reading it.
-    ``first_seen[row, column]`` is the index into ``path`` at which the cell was first observed, or ``NEVER_SEEN``.
+    Attributes:
+        outcome: how it ended.
+        cost: length of the path in the unit of the map's resolution.
+        path: cells in order, the start first.
+        word: letter of each cell of the path.
+        states: the automaton's state after reading each letter of the word.
+        decisions: all that were taken, in order.
+        status: bits of ``Status`` of all decisions.
     """
 
     outcome: Outcome
     cost: float
-    path: tuple[tuple[int, int], ...]
+    path: tuple[Cell, ...]
     word: tuple[int, ...]
     states: tuple[int, ...]
     decisions: tuple[Decision, ...]
+    status: int
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Trial(RunRecord):
+    """A finished trial: a run, with the true map and all that it was made with.
+
+    Attributes:
+        first_seen: index into ``path`` at which each cell was first observed, or ``NEVER_SEEN``.
+        world: the true map.
+        task_text, task_hoa, propositions: the task, also as an automaton, so that it is read without Spot.
+        policy: a name, or ``module:attribute`` of a function.
+        environment, seed: where the world comes from.
+        config: the settings, as ``dataclasses.asdict`` makes them.
+        versions: of what the figures depend on.
+    """
+
     first_seen: Int32[np.ndarray, "H W"]
     world: World
     task_text: str
@@ -126,7 +164,6 @@ class Trial:
     policy: str
     environment: str
     seed: int | None
-    status: int
     config: Mapping[str, Any]
     versions: Mapping[str, str]
 
@@ -146,7 +183,7 @@ class Trial:
             "task": self.task_text,
             "environment": self.environment,
             "seed": self.seed,
-            "status": self.status,
+            "status": list(status_names(self.status)),
         }
 
     def to_dict(self) -> dict[str, Any]:
@@ -160,7 +197,7 @@ class Trial:
         data["decisions"] = [dataclasses.asdict(decision) for decision in self.decisions]
         data["first_seen"] = pack_array(self.first_seen)
         data["world"] = world_to_dict(self.world)
-        return _finite({"format": FORMAT, **data})
+        return finite_or_text({"format": FORMAT, **data})
 
     def save(self, path: Path) -> None:
         """Write the record as JSON."""
@@ -214,11 +251,11 @@ def _decision_from_dict(data: Mapping[str, Any]) -> Decision:
     values["value"] = float(data["value"])
     values["subgoals"] = _cells(data["subgoals"])
     values["path"] = _cells(data["path"])
-    values["looks"] = tuple(data.get("looks", ()))
+    values["observations"] = tuple(data["observations"])
     values["actions"] = tuple(_action_from_dict(action) for action in data["actions"])
     listed = {action.index for action in values["actions"]}
     for name in ("choice", "preferred"):
-        if values.get(name) is not None and values[name] not in listed:
+        if values[name] is not None and values[name] not in listed:
             raise ValueError(f"decision {values['index']}: {name} {values[name]} is none of its actions")
     return Decision(**values)
 
@@ -233,14 +270,3 @@ def _action_from_dict(data: Mapping[str, Any]) -> ActionRecord:
 
 def _cells(rows: list[list[int]]) -> tuple[tuple[int, int], ...]:
     return tuple((int(row), int(column)) for row, column in rows)
-
-
-def _finite(value: Any) -> Any:
-    """JSON knows no infinities; they are written as strings, which ``float`` reads back."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else str(value)
-    if isinstance(value, Mapping):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
-    return value

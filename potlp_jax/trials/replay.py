@@ -1,11 +1,13 @@
-"""Decisions of recorded trials, made again: from the world, the beliefs and the looks that the record implies."""
+"""Decisions of recorded trials, made again: from the world, the beliefs and the panoramas that the record implies."""
 
 from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int32, UInt8
 
+from potlp_jax.codec import config_from_dict
 from potlp_jax.errors import CheckpointError, RecordError
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, look
 from potlp_jax.learning.labels import TrueMapEstimator
@@ -14,8 +16,9 @@ from potlp_jax.planning.policies import DecisionConfig, Policy, assess, planning
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import Plan, search_tree
 from potlp_jax.planning.search.graph import Tree
+from potlp_jax.planning.search.uct import UctTree
 from potlp_jax.task.task import Task, TaskArrays
-from potlp_jax.trials.config import TrialConfig, trial_config_from_dict
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import LOG_PREFIX, Decision, Trial
 from potlp_jax.trials.robot import photograph
 from potlp_jax.world.camera import Disturbance
@@ -24,22 +27,29 @@ from potlp_jax.world.grid import BeliefMap
 
 def replay_decision(
     trial: Trial, index: int, estimator: TrainedEstimator | None = None
-) -> tuple[PlanningProblem, Plan, Tree]:
-    """Search again as in decision ``index`` of a recorded trial: its problem, plan and searched tree.
+) -> tuple[PlanningProblem, Plan, Tree | UctTree]:
+    """Search again as in one decision of a recorded trial.
 
-    ``estimator`` is the one of the trial, where its policy uses one; by default the shipped one.
+    Args:
+        trial: from ``run_trial`` or ``load_trial``.
+        index: number of the decision.
+        estimator: the one of the trial, where its policy asks one; by default the shipped one.
+
+    Returns:
+        The planning problem of the decision, its plan and the searched tree.
 
     Raises:
-        ValueError: the trial has no such decision, or its policy does not search.
+        RecordError: the trial has no such decision, or its policy does not search.
         CheckpointError: the estimator is not the trial's.
     """
     if not 0 <= index < len(trial.decisions):
-        raise ValueError(f"the trial has decisions 0 to {len(trial.decisions) - 1}; there is no decision {index}")
-    if not Policy(trial.policy).searches:
-        raise ValueError(f"policy {trial.policy!r} does not search: its decisions have no tree")
+        raise RecordError(f"the trial has decisions 0 to {len(trial.decisions) - 1}; there is no decision {index}")
+    # A policy of the user's own is known by its name alone: what it searches, if anything, cannot be searched again.
+    if trial.policy not in (Policy.ORACLE, Policy.POTLP):
+        raise RecordError(f"policy {trial.policy!r} does not search: its decisions have no tree")
     decision = trial.decisions[index]
     task = Task.from_hoa(trial.task_hoa, propositions=trial.propositions)
-    config = trial_config_from_dict(trial.config)
+    config = config_from_dict(TrialConfig, trial.config, "trial record")
     problem = _replayed_problem(
         trial.belief_at(decision.step),
         jnp.asarray(decision.cell, jnp.int32),
@@ -56,7 +66,7 @@ def replay_decision(
 def _replayed_estimator(
     trial: Trial, index: int, task: Task, estimator: TrainedEstimator | None, config: TrialConfig
 ) -> Estimator | None:
-    """The estimator with all that it had seen at a decision: the looks are taken again."""
+    """The estimator with all that it had seen at a decision: the panoramas are taken again."""
     if trial.policy != Policy.POTLP:
         return TrueMapEstimator(world=trial.world)
     trained = estimator_for(task.propositions, estimator)
@@ -65,25 +75,43 @@ def _replayed_estimator(
             f"the trial was made with the estimator {trial.versions.get('estimator')}, not {trained.identity}: "
             "give that one"
         )
-    eyes = trained.start(*trial.world.shape)
+    asked = trained.start(*trial.world.shape)
     for decision in trial.decisions[: index + 1]:
         cell = jnp.asarray(decision.cell, jnp.int32)
-        eyes = look(eyes, panorama_at(trial, decision, config), trial.belief_at(decision.step), cell)
-    return eyes
+        asked = look(asked, panorama_at(trial, decision, config), trial.belief_at(decision.step), cell)
+    return asked
 
 
 def panorama_at(trial: Trial, decision: Decision, config: TrialConfig | None = None) -> UInt8[Array, "rows columns 3"]:
-    """What the camera saw at a decision of a trial in simulation. Raises RecordError where the trial is from a log."""
+    """What the camera saw at a decision of a trial in simulation.
+
+    Args:
+        trial: from ``run_trial`` or ``load_trial``.
+        decision: one of the trial's.
+        config: the trial's; read from its record where it is None.
+
+    Returns:
+        The panorama, in the frame of the map.
+
+    Raises:
+        RecordError: the trial is from a log, or its camera was disturbed.
+    """
     if trial.environment.startswith(LOG_PREFIX):
         raise RecordError(
             f"the trial is the replay of a robot's log, {trial.environment.removeprefix(LOG_PREFIX)}: its panoramas "
             "are in the log, and in the page that `potlp log replay` wrote"
         )
-    config = trial_config_from_dict(trial.config) if config is None else config
+    config = config_from_dict(TrialConfig, trial.config, "trial record") if config is None else config
     if config.disturbance != Disturbance():
-        raise ValueError("the trial's camera was disturbed: its panoramas cannot be made again without the trial's key")
+        raise RecordError("the trial's camera was disturbed: its panoramas cannot be made without the trial's key")
     cell = jnp.asarray(decision.cell, jnp.int32)
     return photograph(trial.world, cell, jax.random.key(0), config.camera, config.disturbance)
+
+
+def panoramas_of(trial: Trial) -> dict[int, UInt8[np.ndarray, "rows columns 3"]]:
+    """What the camera saw at the decisions whose panoramas were used, by number; none for policies that do not look."""
+    used = sorted({number for decision in trial.decisions for number in decision.observations})
+    return {number: np.asarray(panorama_at(trial, trial.decisions[number])) for number in used}
 
 
 @partial(jax.jit, static_argnames=("config",))
@@ -96,5 +124,6 @@ def _replayed_problem(
     config: DecisionConfig,
 ) -> PlanningProblem:
     situation = assess(belief, cell, state, task, config.frontiers)
+    # The same two calls as in ``policies.decide``: the problem is what its search saw, bit by bit.
     estimates = ask(estimator, belief, situation.subgoals, task, state)
     return planning_problem(situation, estimates, config)

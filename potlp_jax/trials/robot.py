@@ -1,88 +1,94 @@
 """What the loop of a trial asks of a robot, and the robot that is simulated.
 
-The loop knows a ``Robot`` only; a real robot is another observe and advance.
+The loop knows a ``Robot`` only: a real one is another class with these three methods (``potlp_jax.logs.replaying`` has
+one that follows a log).
 """
 
 import dataclasses
-import math
 from functools import partial
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
-from jaxtyping import Array, Bool, Float32, Int32, PRNGKeyArray, UInt8
+from jaxtyping import Array, Int32, PRNGKeyArray, UInt8
 
 from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import NEVER_SEEN
+from potlp_jax.trials.rules import Knowledge, Stop
 from potlp_jax.world.camera import CameraConfig, Disturbance, disturb
 from potlp_jax.world.grid import BeliefMap, World
+from potlp_jax.world.moves import Cell, as_cell, step_length
 from potlp_jax.world.renderer import render
 from potlp_jax.world.sensing import SensorConfig, observe
-
-DIAGONAL: float = math.sqrt(2.0)
-
-
-@struct.dataclass(kw_only=True)
-class Stop:
-    """When a robot that follows a path hands back control.
-
-    ``replan_distance`` (cells) applies once the map has changed since the decision: while nothing new is known there
-    is nothing to decide, and keeping to the target is what makes every policy reach it (liveness).
-    ``budget`` is what may still be travelled, in cells. ``is_frontier`` tells that the target is one, so that the
-    robot stops when nothing unobserved is left beside it.
-    """
-
-    replan_distance: Float32[Array, "*batch"]
-    budget: Float32[Array, "*batch"]
-    is_frontier: Bool[Array, "*batch"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Leg:
-    """Cells entered on one advance, in order, the start left out."""
+    """What a robot did on one advance.
 
-    cells: tuple[tuple[int, int], ...]
+    Attributes:
+        cells: entered, in order, the start left out.
+        ended: the robot will not move again: the log is at its end, the battery is empty, someone took over.
+    """
+
+    cells: tuple[Cell, ...]
+    ended: bool = False
 
 
 @runtime_checkable
 class Robot(Protocol):
-    """What the loop asks of a robot: a simulated one, or a real one."""
+    """What the loop asks of a robot: a simulated one, or a real one.
 
-    def observe(self) -> tuple[BeliefMap, tuple[int, int]]:
+    The map that a robot reports has one shape throughout a trial. Every cell that it enters must be free there, and
+    its letter known.
+    """
+
+    def observe(self) -> tuple[BeliefMap, Cell]:
         """The map as it is known now and the robot's cell."""
         ...
 
     def panorama(self) -> UInt8[Array, "rows columns 3"]:
-        """What the camera sees from the robot's cell, in the frame of the map (``world.camera``)."""
+        """What the camera sees from the robot's cell, in the frame of the map (``world.camera``).
+
+        Asked once before each decision, and only by policies whose estimator takes panoramas.
+        """
         ...
 
     def advance(self, path: KnownPath, stop: Stop) -> Leg:
-        """Follow ``path`` through known space, observing at every cell, until it ends or ``stop`` says so."""
+        """Follow ``path`` through known space, observing at every cell, until it ends or ``stop.is_due``.
+
+        At least one move is made where the path has one: otherwise nothing would change before the next decision.
+        """
         ...
 
 
 class SimulatedRobot:
-    """A robot in a known ``World`` that sees along lines of sight. ``key`` drives what disturbs its camera."""
+    """A robot in a known ``World`` that sees along lines of sight."""
 
     def __init__(self, world: World, config: TrialConfig, key: PRNGKeyArray | None = None) -> None:
+        """Put the robot at the world's start.
+
+        Args:
+            world: the true map.
+            config: the sensor, the camera and whether the map is revealed.
+            key: drives what disturbs the camera.
+        """
         self._world = world
         self._config = config
         self._key = jax.random.key(0) if key is None else key
         self._cell = world.start
         self._steps = 0
-        start = BeliefMap.revealed(world) if config.revealed else BeliefMap.unobserved(world)
-        self._belief = _observe(start, world, world.start, config.sensor)
-        self._first_seen = jnp.where(self._belief.unknown, NEVER_SEEN, 0).astype(jnp.int32)
+        self._belief = _observe(initial_belief(world, config), world, world.start, config.sensor)
+        self._first_seen = first_seen_at_start(self._belief)
 
     @property
     def first_seen(self) -> Int32[np.ndarray, "H W"]:
         """Step at which each cell was first observed, ``NEVER_SEEN`` where it was not."""
         return np.asarray(self._first_seen)
 
-    def observe(self) -> tuple[BeliefMap, tuple[int, int]]:
+    def observe(self) -> tuple[BeliefMap, Cell]:
         """The map as it is known now and the robot's cell."""
         return self._belief, as_cell(self._cell)
 
@@ -92,7 +98,7 @@ class SimulatedRobot:
         return photograph(self._world, self._cell, key, self._config.camera, self._config.disturbance)
 
     def advance(self, path: KnownPath, stop: Stop) -> Leg:
-        """Follow ``path`` through known space, observing at every cell, until it ends or ``stop`` says so."""
+        """Follow ``path`` through known space, observing at every cell, until it ends or ``stop.is_due``."""
         self._belief, self._first_seen, moved = follow(
             self._world, self._belief, self._first_seen, path, jnp.int32(self._steps), stop, self._config.sensor
         )
@@ -103,9 +109,14 @@ class SimulatedRobot:
         return Leg(cells=tuple(as_cell(cell) for cell in cells))
 
 
-def as_cell(cell: Any) -> tuple[int, int]:
-    """Row and column as Python numbers."""
-    return int(cell[0]), int(cell[1])
+def initial_belief(world: World, config: TrialConfig) -> BeliefMap:
+    """What a simulated robot knows before its first observation."""
+    return BeliefMap.revealed(world) if config.revealed else BeliefMap.unobserved(world)
+
+
+def first_seen_at_start(belief: BeliefMap) -> Int32[Array, "H W"]:
+    """Step at which each cell was first observed, after the observation at the start."""
+    return jnp.where(belief.unknown, NEVER_SEEN, 0).astype(jnp.int32)
 
 
 _observe = jax.jit(observe, static_argnames=("config",))
@@ -115,7 +126,18 @@ _observe = jax.jit(observe, static_argnames=("config",))
 def photograph(
     world: World, cell: Int32[Array, "2"], key: PRNGKeyArray, camera: CameraConfig, disturbance: Disturbance
 ) -> UInt8[Array, "rows columns 3"]:
-    """What the camera sees from a cell."""
+    """What the camera sees from a cell.
+
+    Args:
+        world: the true map.
+        cell: where the camera stands.
+        key: drives the disturbance; unused where there is none.
+        camera: size and optics; static.
+        disturbance: of the picture; static.
+
+    Returns:
+        RGB, the columns by bearing in the frame of the map.
+    """
     image = render(world, cell, camera)
     return image if disturbance == Disturbance() else disturb(image, key, disturbance)
 
@@ -130,45 +152,38 @@ def follow(
     stop: Stop,
     config: SensorConfig,
 ) -> tuple[BeliefMap, Int32[Array, "H W"], Int32[Array, ""]]:
-    """Move along the path cell by cell, ``steps`` made before.
+    """Move along a path cell by cell, observing, until it ends or ``stop.is_due``.
 
-    Returns the belief, the step at which each cell was first seen, and the moves made. ``config`` is static.
+    Args:
+        world: the true map.
+        belief: what is known at the start of the path.
+        first_seen: step at which each cell was first observed, ``NEVER_SEEN`` where it was not.
+        path: through known space, from the robot's cell on.
+        steps: moves made before.
+        stop: when to stop early.
+        config: the sensor; static.
+
+    Returns:
+        The belief, the step at which each cell was first observed, and the number of moves made.
     """
-    known_before = jnp.sum(~belief.unknown)
-    propositions_before = _propositions_seen(belief)
+    before = Knowledge.of(belief)
     target = path.cells[path.length]
 
     def goes_on(carry):
         belief, _, moved, travelled = carry
-        changed = jnp.sum(~belief.unknown) > known_before
-        due = changed & (travelled >= stop.replan_distance)
-        surprised = (_propositions_seen(belief) & ~propositions_before) != 0
-        gone = stop.is_frontier & ~_beside_unobserved(belief, target)
-        stopped = due | surprised | gone | (travelled >= stop.budget)
+        stopped = stop.is_due(before, belief, target, travelled)
+        # The first move is always made: a robot that stood still would decide the same again.
         return (moved < path.length) & ((moved == 0) | ~stopped)
 
     def step(carry):
         belief, first_seen, moved, travelled = carry
         here, there = path.cells[moved], path.cells[moved + 1]
-        # On a map that holds no secret there is nothing to look for.
-        look = partial(observe, world=world, cell=there, config=config)
-        belief = jax.lax.cond(jnp.any(belief.unknown), look, lambda belief: belief, belief)
+        # On a map that is wholly known there is nothing to observe.
+        observed = partial(observe, world=world, cell=there, config=config)
+        belief = jax.lax.cond(jnp.any(belief.unknown), observed, lambda belief: belief, belief)
         first_seen = jnp.where((first_seen == NEVER_SEEN) & ~belief.unknown, steps + moved + 1, first_seen)
-        diagonal = jnp.all(here != there)
-        return belief, first_seen, moved + 1, travelled + jnp.where(diagonal, DIAGONAL, 1.0).astype(jnp.float32)
+        return belief, first_seen, moved + 1, travelled + step_length(here, there)
 
     start = (belief, first_seen, jnp.int32(0), jnp.float32(0.0))
     belief, first_seen, moved, _ = jax.lax.while_loop(goes_on, step, start)
     return belief, first_seen, moved
-
-
-def _propositions_seen(belief: BeliefMap) -> Int32[Array, ""]:
-    """Bits of the propositions that hold at some observed cell."""
-    return jax.lax.reduce(belief.letters, np.int32(0), jax.lax.bitwise_or, (0, 1))
-
-
-def _beside_unobserved(belief: BeliefMap, cell: Int32[Array, "2"]) -> Bool[Array, ""]:
-    """Whether a 4-neighbour of the cell is unobserved; outside of the array counts as unobserved."""
-    padded = jnp.pad(belief.unknown, 1, constant_values=True)
-    row, column = cell[0] + 1, cell[1] + 1
-    return padded[row - 1, column] | padded[row + 1, column] | padded[row, column - 1] | padded[row, column + 1]

@@ -11,27 +11,45 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from potlp_jax.sweep.results import Pair
-from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, SATISFIED, Comparison, PolicyRow, Table
+from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, SATISFIED, Comparison, PolicyRow
 from potlp_jax.view.style import FAINT, INK, PolicyStyle, new_figure, policy_styles
 
+FEW_WORLDS: int = 30
+"""Below so many worlds a comparison is shown with a warning: percentile intervals of few pairs are too narrow."""
 
-def savings_table(table: Table, title: str) -> RichTable:
-    """The figures of all policies, the share of attainable savings first."""
-    nothing = any(math.isnan(row.attainable_share) for row in table.rows)
+
+def comparison_table(comparison: Comparison) -> RichTable:
+    """All that a comparison says of each policy, in one table.
+
+    Costs and savings are those of the worlds in which every policy satisfied the task. Where that leaves worlds out,
+    a last column has the share of attainable savings over all worlds, with unsatisfied trials charged their budget.
+    """
+    satisfied, charged = comparison.satisfied, comparison.charged
+    nothing = any(math.isnan(row.attainable_share) for row in satisfied.rows)
     shown = RichTable(
-        title=title,
-        title_justify="left",
         box=SIMPLE_HEAD,
         pad_edge=False,
-        caption="-: the baseline leaves nothing to attain" if nothing and table.pairs else None,
+        caption="-: the baseline leaves nothing to attain" if nothing and satisfied.pairs else None,
         caption_justify="left",
     )
     shown.add_column("policy", no_wrap=True)
-    for name in ("attainable\nsavings", "95%\ninterval", "net\nsavings", "savings\nper trial", "mean\ncost"):
+    names = [
+        "task\nsatisfied",
+        "mean\ncost",
+        "attainable\nsavings",
+        "95%\ninterval",
+        "net\nsavings",
+        "savings\nper trial",
+    ]
+    if satisfied.dropped:
+        names.append("attainable,\nall worlds")
+    for name in names:
         shown.add_column(name, justify="right", no_wrap=True)
-    styles = policy_styles(row.policy for row in table.rows)
-    for row in table.rows:
-        shown.add_row(_policy_name(row.policy, styles), *_cells(row))
+    styles = policy_styles(row.policy for row in satisfied.rows)
+    for row, of_all in zip(satisfied.rows, charged.rows, strict=True):
+        ended = comparison.outcomes[row.policy].get(SATISFIED, 0)
+        last = (_percent(of_all.attainable_share),) if satisfied.dropped else ()
+        shown.add_row(_policy_name(row.policy, styles), f"{ended} of {comparison.worlds}", *_cells(row), *last)
     return shown
 
 
@@ -45,11 +63,11 @@ def _cells(row: PolicyRow) -> tuple[str, ...]:
     low, high = (_percent(share, unit="") for share in (row.attainable_low, row.attainable_high))
     error = "" if math.isnan(row.trial_savings_error) else f" ± {100 * row.trial_savings_error:.1f}%"
     return (
+        "-" if math.isnan(row.mean_cost) else f"{row.mean_cost:.1f}",
         _percent(row.attainable_share),
         "-" if math.isnan(row.attainable_low) else f"{low} .. {high}%",
         _percent(row.net_savings),
         _percent(row.trial_savings, unit="" if error else "%") + error,
-        "-" if math.isnan(row.mean_cost) else f"{row.mean_cost:.1f}",
     )
 
 
@@ -58,18 +76,23 @@ def _percent(share: float, unit: str = "%") -> str:
     return "-" if math.isnan(share) else f"{round(100 * share, 1) + 0.0:.1f}{unit}"
 
 
-def outcome_table(comparison: Comparison) -> RichTable:
-    """How the trials of each policy ended."""
-    endings = sorted({SATISFIED, *(name for counts in comparison.outcomes.values() for name in counts)})
-    endings.sort(key=lambda name: name != SATISFIED)
-    shown = RichTable(title="how trials ended", title_justify="left", box=SIMPLE_HEAD)
-    shown.add_column("policy", no_wrap=True)
-    for name in endings:
-        shown.add_column(name, justify="right")
-    styles = policy_styles(comparison.outcomes)
+def remark_lines(comparison: Comparison) -> list[str]:
+    """What qualifies the table: worlds left out, how other trials ended, arrays that were full, and too few worlds."""
+    satisfied = comparison.satisfied
+    lines = []
+    if satisfied.dropped:
+        lines.append(
+            f"Costs and savings are of the {satisfied.pairs} worlds in which every policy satisfied the task "
+            f"({satisfied.dropped} left out); 'all worlds' charges an unsatisfied trial its budget."
+        )
     for policy, counts in comparison.outcomes.items():
-        shown.add_row(_policy_name(policy, styles), *(str(counts.get(name, 0)) for name in endings))
-    return shown
+        others = [f"{count} {name}" for name, count in counts.items() if name != SATISFIED]
+        if others:
+            lines.append(f"{policy}: {', '.join(others)}")
+    lines += loss_lines(comparison)
+    if 0 < satisfied.pairs < FEW_WORLDS:
+        lines.append(f"{satisfied.pairs} worlds are few: the interval says how little they settle.")
+    return lines
 
 
 def loss_lines(comparison: Comparison) -> list[str]:
@@ -77,7 +100,7 @@ def loss_lines(comparison: Comparison) -> list[str]:
     return [
         f"{policy}: "
         + ", ".join(f"{count} trials with {name.replace('_', ' ')}" for name, count in counts.items())
-        + " (left out of the first table)"
+        + ", left out of costs and savings"
         for policy, counts in comparison.losses.items()
         if counts
     ]

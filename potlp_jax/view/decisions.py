@@ -10,9 +10,11 @@ from typing import Any
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
+from potlp_jax.codec import finite_or_null
 from potlp_jax.task.task import Task
 from potlp_jax.task.words import state_words, transition_words
 from potlp_jax.trials.record import ActionRecord, Decision, Trial
+from potlp_jax.types import status_names
 
 FIGURES: Mapping[str, str] = MappingProxyType(
     {
@@ -128,21 +130,11 @@ def describe_move(trial: Trial, decision: Decision) -> str:
         move = KINDS.get(decision.kind, decision.kind) + target
     else:
         move = action_name(chosen, task_of(trial)).replace(":", f"{target}:", 1)
-    better = decision.kept_from
+    better = decision.overruled
     return move if better is None else f"{move}; kept although {action_name(better, task_of(trial))} is better"
 
 
 def decision_to_dict(decision: Decision) -> dict[str, Any]:
-    """JSON-able values of a decision, actions by expected cost; what is infinite becomes None."""
+    """JSON-able values of a decision, actions by expected cost; what is infinite becomes None, status bits names."""
     ranked = dataclasses.replace(decision, actions=tuple(rank_actions(decision)))
-    return _finite(dataclasses.asdict(ranked))
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {key: _finite(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
-    return value
+    return finite_or_null({**dataclasses.asdict(ranked), "status": list(status_names(decision.status))})

@@ -111,7 +111,7 @@ def draw_labels(axes: Axes, labels: Sequence[AreaLabel], *, size: float = 9.0) -
         )
 
 
-def _areas(letters: Int32[np.ndarray, "rows columns"]) -> list[tuple[int, Int[np.ndarray, "k 2"]]]:
+def _areas(letters: Int32[np.ndarray, "h w"]) -> list[tuple[int, Int[np.ndarray, "k 2"]]]:
     """Connected areas of equal letter as (letter, cells), large ones first."""
     areas = []
     for letter in np.unique(letters[letters > 0]).tolist():
@@ -135,8 +135,8 @@ def _price(
     centre: Float[np.ndarray, "2"],
     half: Float[np.ndarray, "2"],
     placed: Sequence[AreaLabel],
-    steps: Float[np.ndarray, "T 2"],
-    letters: Int32[np.ndarray, "rows columns"],
+    steps: Float[np.ndarray, "N 2"],
+    letters: Int32[np.ndarray, "h w"],
     mark: float,
 ) -> float:
     """What a name would hide: another name (forbidden), the ends of the path, cells of the path and of areas."""

@@ -50,7 +50,7 @@ MAX_CHANGES: int = 30
 
 def cell_image(
     world: World, seen: Bool[np.ndarray, "H W"], propositions: Sequence[str], *, hatch: bool, pixels: int = IMAGE_PIXELS
-) -> UInt8[np.ndarray, "height width 3"]:
+) -> UInt8[np.ndarray, "h w 3"]:
     """The map as a raster: seen cells clear, unseen ones grey (with stripes if ``hatch``), labelled areas coloured.
 
     A cell with several propositions has stripes of their colours.
@@ -238,7 +238,7 @@ def _enlarge(cells: np.ndarray, scale: int) -> np.ndarray:
     return cells.repeat(scale, axis=0).repeat(scale, axis=1)
 
 
-def _keep_right(points: Float[np.ndarray, "T 2"], offset: float) -> Float[np.ndarray, "T 2"]:
+def _keep_right(points: Float[np.ndarray, "N 2"], offset: float) -> Float[np.ndarray, "N 2"]:
     """Points moved to the right of the direction of travel (y downward), the direction averaged over a few steps."""
     if len(points) < 2:
         return points

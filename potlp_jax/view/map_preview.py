@@ -11,9 +11,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.transforms import Affine2D, blended_transform_factory
 
+from potlp_jax.environments.ros.cleaning import CleanMap
 from potlp_jax.environments.ros.map_files import GridFrame, OccupancyMap
 from potlp_jax.environments.ros.places import component_labels
-from potlp_jax.environments.ros.ros_map import CleanMap, RosMap
+from potlp_jax.environments.ros.ros_map import RosMap
 from potlp_jax.environments.ros.survey import SPECK
 from potlp_jax.view.labels import AreaLabel, draw_labels, place_labels
 from potlp_jax.view.layers import area_handles

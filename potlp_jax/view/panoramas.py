@@ -26,7 +26,7 @@ def draw_panoramas(
 
     Args:
         trial: the trial of the decision.
-        decision: one whose policy looked (``decision.looks`` is not empty).
+        decision: one whose policy looked (``decision.observations`` is not empty).
         panoramas: by the number of the decision at which they were taken, in the frame of the map.
     """
     count = len(decision.subgoals)
@@ -36,7 +36,7 @@ def draw_panoramas(
         count, 2, width_ratios=(2.6, 1.0), left=0.01, right=0.995, top=1 - 0.55 / (0.7 + 1.75 * count), bottom=0.02
     )
     chosen = {action.subgoal for action in decision.actions if action.index == decision.choice}
-    for subgoal, look in enumerate(decision.looks):
+    for subgoal, look in enumerate(decision.observations):
         origin = trial.decisions[look].cell
         picture, text = figure.add_subplot(grid[subgoal, 0]), figure.add_subplot(grid[subgoal, 1])
         _draw_rolled(picture, panoramas[look], origin, decision.subgoals[subgoal])

@@ -117,7 +117,7 @@ def _decision(trial: Trial, decision: Decision) -> dict[str, Any]:
         "text": f"Decision {decision.index}: {describe_move(trial, decision)}",
         "value": decision.value if math.isfinite(decision.value) else None,
         "subgoals": [list(cell) for cell in decision.subgoals],
-        "looks": list(decision.looks),
+        "observations": list(decision.observations),
         "path": [list(cell) for cell in decision.path],
         "actions": [
             {

@@ -28,9 +28,12 @@ class CameraConfig:
         far: floor nearer than this is spaced by ratios of distance, floor beyond it by angles.
         fold: rows over which the distance of near floor falls by a factor of e.
         eye_height, wall_height: of the camera, of the walls and the ceiling, above the floor.
-        texture: contrast of the textures, 0 (none) to 1; texture_reach: distance at which half of it is left on walls.
+        texture: contrast of the textures, 0 (none) to 1; texture_reach: distance at which half of it remains on walls.
         ambient: brightness of what has no light at all, 0 (black) to 1.
         ceiling_colour, smoke_colour: RGB in full light.
+        renderer: what draws the picture: empty for ``world.renderer``, otherwise the name of a function of your own,
+            as ``module:attribute`` or an entry point in the group ``potlp_jax.cameras``. It gets the world, the cell
+            and this configuration, runs inside jit, and returns a picture of ``height`` times ``width`` pixels.
     """
 
     height: int = 128
@@ -47,6 +50,8 @@ class CameraConfig:
     ambient: float = 0.12
     ceiling_colour: tuple[int, int, int] = (166, 168, 176)
     smoke_colour: tuple[int, int, int] = (250, 250, 250)
+    # A name instead of the function, so that records, data sets and other processes mean the same camera.
+    renderer: str = ""
 
     def __post_init__(self) -> None:
         lengths = (self.far, self.fold, self.eye_height, self.texture_reach)

@@ -25,6 +25,7 @@ from potlp_jax.world.settings import NO_SETTINGS, Settings
 MAX_LETTER: int = 2**16 - 1
 """Largest letter: sixteen propositions."""
 
+# What environments without colours of their own look like.
 _FLOOR_COLOUR = (150, 150, 150)
 _WALL_COLOUR = (205, 200, 190)
 
@@ -45,6 +46,7 @@ class Appearance:
     smoke: Float32[Array, "*batch H W"]
     light: Float32[Array, "*batch H W"]
 
+    # Made by numpy: ``jnp.full`` would compile a program for every shape of map.
     @classmethod
     def plain(cls, height: int, width: int) -> "Appearance":
         """Grey floor, light walls, no smoke, lights on."""
@@ -57,7 +59,15 @@ class Appearance:
         )
 
     def padded(self, top: int, bottom: int, left: int, right: int) -> "Appearance":
-        """The same with rows and columns added that repeat the outermost colours, without smoke and lit."""
+        """The same with rows and columns added that repeat the outermost colours, without smoke and lit.
+
+        Args:
+            top, bottom: rows to add.
+            left, right: columns to add.
+
+        Returns:
+            The appearance of the larger grid.
+        """
         rows_columns = ((top, bottom), (left, right))
         return Appearance(
             floor_colour=jnp.asarray(np.pad(np.asarray(self.floor_colour), (*rows_columns, (0, 0)), mode="edge")),
@@ -65,6 +75,9 @@ class Appearance:
             smoke=jnp.asarray(np.pad(np.asarray(self.smoke), rows_columns)),
             light=jnp.asarray(np.pad(np.asarray(self.light), rows_columns, constant_values=1.0)),
         )
+
+
+_APPEARANCE_FIELDS: tuple[str, ...] = tuple(field.name for field in dataclasses.fields(Appearance))
 
 
 @struct.dataclass(kw_only=True)
@@ -160,7 +173,17 @@ def make_world(
     """Check the arrays and close the border.
 
     If any cell of the border is free, a ring of obstacles is added around the arrays; ``start`` refers to the arrays as
-    given and is moved with them. Letters on obstacles are dropped. Without ``appearance`` the world looks plain.
+    given and is moved with them. Letters on obstacles are dropped.
+
+    Args:
+        occupied: True on obstacles.
+        letters: bit ``i`` says that proposition ``i`` holds in the cell; any integer type.
+        start: row and column of the robot's first cell.
+        resolution: length of a cell's side in the unit of cost.
+        appearance: what a camera sees; default: plain.
+
+    Returns:
+        A world with a closed border.
 
     Raises:
         WorldError: where the shapes disagree, a letter is out of range, the start is outside or on an obstacle, or the
@@ -170,6 +193,7 @@ def make_world(
     row, column = (int(entry) for entry in start)
     height, width = occupied.shape
     appearance = Appearance.plain(height, width) if appearance is None else appearance
+    # Sensing, rendering and frontiers rely on a closed border: no line leaves the array, no frontier lies on its edge.
     interior = np.zeros(occupied.shape, bool)
     interior[1:-1, 1:-1] = True
     if not np.all(occupied[~interior]):
@@ -190,11 +214,22 @@ def make_world(
 def pad_world(world: World, height: int, width: int) -> World:
     """The world with obstacles added below and to the right until it has ``height`` rows and ``width`` columns.
 
-    Nothing that can be seen, reached or planned changes. Raises WorldError where the world is larger than that.
+    Nothing that can be seen, reached or planned changes.
+
+    Args:
+        world: one world.
+        height, width: rows and columns of the result.
+
+    Returns:
+        The padded world; ``extent`` keeps the size without padding.
+
+    Raises:
+        WorldError: where the world is larger than that.
     """
     rows, columns = world.shape
     if height < rows or width < columns:
         raise WorldError(f"a world of {rows}x{columns} cells cannot be padded to {height}x{width}: give a larger size")
+    # Below and to the right, so that cells keep their coordinates.
     missing = ((0, height - rows), (0, width - columns))
     return dataclasses.replace(
         world,
@@ -210,15 +245,23 @@ def belief_from_numpy(
     resolution: float = 1.0,
     extent: tuple[int, int] | None = None,
 ) -> BeliefMap:
-    """A belief from host arrays, whatever their integer type; entries of ``cells`` as in ``BeliefMap``.
+    """A belief from host arrays.
 
-    ``extent`` is the map's size without padding, by default that of the arrays.
+    Args:
+        cells: ``BeliefMap.UNKNOWN``, ``FREE`` or ``OCCUPIED`` (-1, 0, 1) in any type of number.
+        letters: the letter of each cell in any integer type, 0 where it is not observed.
+        resolution: length of a cell's side in the unit of cost.
+        extent: rows and columns without padding; default: those of the arrays.
+
+    Returns:
+        The belief as the planner takes it.
 
     Raises:
         WorldError: where an entry of ``cells`` is none of the three, or an unobserved cell has a letter.
     """
     if not np.isin(cells, (BeliefMap.UNKNOWN, BeliefMap.FREE, BeliefMap.OCCUPIED)).all():
         raise WorldError(f"a belief's cells must be -1, 0 or 1, found {np.unique(cells).tolist()[:8]}")
+    # Goals of which the robot is told beforehand would be letters of unobserved cells; the model has none.
     if np.any((cells == BeliefMap.UNKNOWN) & (letters != 0)):
         raise WorldError("a belief has letters in cells that were not observed; set them to 0")
     return BeliefMap(
@@ -231,7 +274,7 @@ def belief_from_numpy(
 
 def world_to_dict(world: World) -> dict[str, Any]:
     """JSON-able values of one world; arrays are compressed. Read back bit for bit by ``world_from_dict``."""
-    look = world.appearance
+    appearance = world.appearance
     return {
         "occupied": pack_array(np.asarray(world.occupied)),
         "letters": pack_array(np.asarray(world.letters)),
@@ -240,14 +283,15 @@ def world_to_dict(world: World) -> dict[str, Any]:
         "extent": np.asarray(world.extent).tolist(),
         "propositions": None if world.propositions is None else list(world.propositions),
         "settings": world.settings.to_dict(),
-        "appearance": {name: pack_array(np.asarray(getattr(look, name))) for name in look.__dataclass_fields__},
+        "appearance": {name: pack_array(np.asarray(getattr(appearance, name))) for name in _APPEARANCE_FIELDS},
     }
 
 
 def world_from_dict(data: Mapping[str, Any]) -> World:
     """The world that ``world_to_dict`` wrote. Raises WorldError where the values are damaged."""
     try:
-        look = {name: jnp.asarray(unpack_array(values)) for name, values in data["appearance"].items()}
+        # The same checks as for a new world, so that a damaged file cannot make one that breaks elsewhere.
+        appearance = {name: jnp.asarray(unpack_array(values)) for name, values in data["appearance"].items()}
         row, column = (int(entry) for entry in data["start"])
         rows, columns = (int(size) for size in data["extent"])
         propositions = None if data["propositions"] is None else tuple(data["propositions"])
@@ -257,7 +301,7 @@ def world_from_dict(data: Mapping[str, Any]) -> World:
             unpack_array(data["letters"]),
             (row, column),
             float(data["resolution"]),
-            Appearance(**look),
+            Appearance(**appearance),
         )
     except WorldError:
         raise
@@ -265,12 +309,14 @@ def world_from_dict(data: Mapping[str, Any]) -> World:
         raise WorldError(f"not the values of a world: {error!r}") from error
     if not (0 < rows <= world.shape[0] and 0 < columns <= world.shape[1]):
         raise WorldError(f"the extent {rows}x{columns} does not fit the {world.shape[0]}x{world.shape[1]} grid")
+    # The border was closed when the world was made, so ``make_world`` has added no ring; padding is told by the extent.
     extent = jnp.asarray(np.array([rows, columns], np.int32))
     return dataclasses.replace(world, extent=extent, propositions=propositions, settings=settings)
 
 
 def pack_array(array: Shaped[np.ndarray, "..."]) -> dict[str, Any]:
     """Shape, type and zlib-compressed bytes (base64) of an array, as JSON-able values."""
+    # ``dtype.str`` names the byte order, so that files travel between machines.
     contiguous = np.ascontiguousarray(array)
     data = base64.b64encode(zlib.compress(contiguous.tobytes())).decode()
     return {"shape": list(array.shape), "dtype": contiguous.dtype.str, "zlib": data}
@@ -278,6 +324,7 @@ def pack_array(array: Shaped[np.ndarray, "..."]) -> dict[str, Any]:
 
 def unpack_array(data: Mapping[str, Any]) -> Shaped[np.ndarray, "..."]:
     """The array that ``pack_array`` wrote."""
+    # A copy, because an array over ``bytes`` cannot be written to.
     raw = zlib.decompress(base64.b64decode(data["zlib"]))
     return np.frombuffer(raw, dtype=np.dtype(data["dtype"])).reshape(data["shape"]).copy()
 
@@ -289,6 +336,8 @@ def _check(
     resolution: float,
     appearance: Appearance | None,
 ) -> None:
+    """Raises WorldError for what ``make_world`` must not be given."""
+    # Types first: what follows compares values.
     if occupied.dtype != np.bool_ or not np.issubdtype(letters.dtype, np.integer):
         raise WorldError(f"occupied must be boolean, letters integers; found {occupied.dtype} and {letters.dtype}")
     if letters.shape != occupied.shape or occupied.ndim != 2 or occupied.size == 0:
@@ -308,6 +357,8 @@ def _check(
 
 
 def _check_appearance(appearance: Appearance, shape: tuple[int, ...]) -> None:
+    """Raises WorldError where a field does not fit a grid of this shape."""
+    # The renderer packs fields into bits by their types, so that another type would change colours without an error.
     wanted = {
         "floor_colour": ((*shape, 3), jnp.uint8),
         "wall_colour": ((*shape, 3), jnp.uint8),

@@ -134,7 +134,7 @@ def step_length(before: Int32[Array, "*batch 2"], after: Int32[Array, "*batch 2"
     return jnp.where(jnp.all(before != after, axis=-1), DIAGONAL, 1.0).astype(jnp.float32)
 
 
-def step_lengths(path: Path) -> Float64[np.ndarray, " moves"]:
+def step_lengths(path: Path) -> Float64[np.ndarray, " steps"]:
     """Length of each move of a path; empty for a path of one cell."""
     cells = np.asarray(path)
     return np.where(np.all(cells[1:] != cells[:-1], axis=1), DIAGONAL, 1.0)
@@ -155,3 +155,8 @@ def count_moves(path: Path) -> tuple[int, int]:
 def length_of(straight: int, diagonal: int) -> float:
     """Length of so many moves. From counts, so that it does not depend on the order of the moves."""
     return straight + diagonal * DIAGONAL
+
+
+def as_cell(cell: Int32[Array, "2"] | Int32[np.ndarray, "2"]) -> Cell:
+    """Row and column of an array as Python numbers."""
+    return int(cell[0]), int(cell[1])

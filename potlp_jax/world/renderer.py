@@ -8,7 +8,7 @@ the map it was taken.
 
 One ray a column is followed through the lattice of cells. Because the robot stands in the middle of a cell, the cells
 that a ray crosses, where it crosses them, and the piece of floor that a pixel shows are the same for every cell and
-world, relative to the robot: they are static tables (``_Rays``, ``_Planes``), and what is left for the device are
+world, relative to the robot: they are static tables (``_Rays``, ``_Planes``), and what remains for the device are
 gathers and one running product along the rays. Where a row or column looks is in ``camera``.
 
 References:
@@ -26,6 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Int, Int32, UInt8
 
+from potlp_jax import plugins
+from potlp_jax.errors import PluginError
 from potlp_jax.world.camera import CameraConfig, column_bearings, finer, row_slopes
 from potlp_jax.world.grid import World
 
@@ -53,6 +55,9 @@ _HALF_DIAGONAL = math.sqrt(0.5)
 _TAYLOR = tuple((-1) ** order / math.factorial(order) for order in range(8))
 _TAYLOR_AT_ZERO = sum(term * (-_HALF_DIAGONAL) ** order for order, term in enumerate(_TAYLOR))
 """What the polynomial gives without smoke; divided by it, clear air lets exactly all light through."""
+
+CAMERAS: str = "potlp_jax.cameras"
+"""Entry points of this group are renderers of other packages."""
 
 _Tables = TypeVar("_Tables", "_Rays", "_Planes")
 
@@ -130,8 +135,26 @@ def render(
 
     Returns:
         The picture, RGB.
+
+    Raises:
+        PluginError: ``config.renderer`` names a function that cannot be found, or that returns something else.
     """
+    if config.renderer:
+        return _render_elsewhere(world, cell, config)
     return _batched_renderer(config)(_pack_optics(world, config), _pack_colours(world), cell)
+
+
+def _render_elsewhere(world: World, cell: Int32[Array, "2"], config: CameraConfig) -> UInt8[Array, "rows columns 3"]:
+    """The picture of a renderer that is not ours."""
+    picture = plugins.load(config.renderer, group=CAMERAS, kind="camera")(world, cell, config)
+    found, wanted = (picture.dtype, picture.shape), (jnp.uint8, (config.height, config.width, 3))
+    # Shapes are known while jit traces, so the check costs nothing later.
+    if found != wanted:
+        raise PluginError(
+            f"camera {config.renderer!r}: its picture is {found[0]}{list(found[1])}, must be uint8{list(wanted[1])}: "
+            "the height and width of its CameraConfig, and RGB"
+        )
+    return picture
 
 
 def _batched_renderer(config: CameraConfig) -> Callable[..., UInt8[Array, "*batch rows columns 3"]]:
@@ -246,7 +269,7 @@ def _passed(optics: Int32[Array, "*shape"], length: Float32[Array, "*shape"]) ->
 def _pass_smoke(crossed: Int32[Array, "steps columns"], rays: _Rays) -> Int32[Array, "steps columns"]:
     """Where each ray enters each cell: the light that comes through and the glow of the smoke, see ``_pack_sight``."""
 
-    def cross(state, cell):
+    def cross(state: tuple[Array, Array], cell: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
         transmission, glow = state
         optics, length = cell
         after = transmission * _passed(optics, length)

@@ -6,8 +6,15 @@ does not pass between two obstacles that touch at their corners. The free cells 
 and its eight neighbours always. An obstacle is seen where it touches, also at a corner, a free cell that is seen: lines
 alone would leave slivers in walls that are grazed. Letters do not block sight.
 
-The lines of a side of the square do not cross, so those through a given cell are a contiguous range of them, and the
-cell is seen where any line of the range gets far enough: a range maximum, two look-ups, instead of a scatter.
+Method. Which cells a line passes does not depend on the map, so the lines are static tables, and the first step is to
+find how far each line gets. The second is the inverse: which cells lie on a line that gets that far. The lines of one
+side of the square do not cross, so those through a given cell are a contiguous range of them, and the cell is seen
+where any line of the range gets far enough. A maximum over a range is two look-ups in a table of maxima over blocks of
+``2 ** level`` lines (one block from the range's beginning, one up to its end), instead of a scatter of all cells.
+
+References:
+    Bresenham, Algorithm for computer control of a digital plotter, IBM Systems Journal 1965.
+    Bender and Farach-Colton, The LCA problem revisited, LATIN 2000 (sparse tables of range maxima).
 """
 
 import dataclasses
@@ -23,8 +30,11 @@ from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.moves import dilate
 
 _OCCUPIED_BIT = 1
+"""Bit of a cell's code that says obstacle."""
 _BLOCK = 12
+"""Steps of all lines that are followed between two tests for lines that still go on."""
 _DIAGONALS = ((-1, -1), (-1, 1), (1, -1), (1, 1))
+"""Diagonal moves, in the order of their bits in a cell's code."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +45,8 @@ class SensorConfig:
         range_cells: how far it sees, Euclidean, in cells. Its cost grows with the range times the grid's longer side.
     """
 
+    # Fixed with the fire-fighting building, see docs/results/calibration.md: at 104 cells the alarm, 102 cells from the
+    # mouth of its hallway, is just seen from there.
     range_cells: float = 104.0
 
     def __post_init__(self) -> None:
@@ -66,7 +78,17 @@ class _Lines:
 
 
 def observe(belief: BeliefMap, world: World, cell: Int32[Array, "2"], config: SensorConfig) -> BeliefMap:
-    """The belief with all that is in line of sight from ``cell`` added. ``config`` is static."""
+    """The belief with all that is in line of sight added.
+
+    Args:
+        belief: what has been observed before.
+        world: the truth, of the belief's shape.
+        cell: the robot's row and column.
+        config: the sensor; static.
+
+    Returns:
+        The belief after the observation; what was observed before stays.
+    """
     seen = visible(world.occupied, cell, config)
     truth = jnp.where(world.occupied, jnp.int8(BeliefMap.OCCUPIED), jnp.int8(BeliefMap.FREE))
     return dataclasses.replace(
@@ -75,12 +97,19 @@ def observe(belief: BeliefMap, world: World, cell: Int32[Array, "2"], config: Se
 
 
 def visible(occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], config: SensorConfig) -> Bool[Array, "H W"]:
-    """The cells, free or not, that are seen from ``cell`` (see the definition at the top of the module).
+    """The cells, free or not, that are seen from a cell (see the definition at the top of the module).
 
-    Outside of the array nothing is seen. ``cell`` must lie inside of it. ``config`` is static.
+    Args:
+        occupied: True on obstacles.
+        cell: row and column, inside of the array.
+        config: the sensor; static.
+
+    Returns:
+        True on the cells that are seen. Outside of the array nothing is.
     """
     height, width = occupied.shape
     lines = _lines(config.range_cells, height, width)
+    # Tables over offsets from the robot become tables over cells by cutting out the window that begins here.
     corner = (jnp.int32(height - 1) - cell[0], jnp.int32(width - 1) - cell[1])
     reach = _range_maxima(_reach(occupied, cell, lines), lines.levels)
     farthest = jnp.maximum(
@@ -88,12 +117,14 @@ def visible(occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], config: Senso
     )
     seen = farthest >= _at_offsets(lines.needed, corner, height, width)
     near = (jnp.abs(jnp.arange(height) - cell[0]) <= 1)[:, None] & (jnp.abs(jnp.arange(width) - cell[1]) <= 1)[None, :]
+    # Obstacles are seen from the free cells in front of them, not by lines (see the definition).
     free_seen = (seen | near) & ~occupied
     return near | free_seen | (occupied & dilate(free_seen))
 
 
 def _reach(occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], lines: _Lines) -> Int32[Array, " lines"]:
     """The last step of every line before it is stopped. A few steps at a time, until all lines are."""
+    # The lines are tables of indices into a window of fixed size with the robot in its middle.
     rows, columns = lines.margin
     padded = jnp.pad(_cell_codes(occupied), ((rows, rows), (columns, columns)), constant_values=_OCCUPIED_BIT)
     window = jax.lax.dynamic_slice(padded, (cell[0], cell[1]), (2 * rows + 1, 2 * columns + 1)).ravel()
@@ -106,22 +137,27 @@ def _reach(occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], lines: _Lines)
     blocking = np.pad(lines.blocking, ((0, missing), (0, 0)), constant_values=_OCCUPIED_BIT)
     cells, blocking = jnp.asarray(cells), jnp.asarray(blocking.reshape(blocks, _BLOCK, count))
 
-    def go_on(carry):
+    # Most lines of an indoor map are stopped within some steps: following a block of steps at a time and stopping with
+    # the last line costs what the view is deep, not what the range is.
+    def follow_block(carry: tuple[Array, Array]) -> tuple[Array, Array]:
         block, reach = carry
         step = block * _BLOCK + jnp.arange(_BLOCK, dtype=jnp.int32)[:, None]
         stopped = (codes[cells[block]] & blocking[block]) != 0
         return block + 1, jnp.minimum(reach, jnp.min(jnp.where(stopped, step, jnp.int32(steps)), axis=0))
 
-    def some_go_on(carry):
+    def some_continue(carry: tuple[Array, Array]) -> Array:
         block, reach = carry
+        # A line goes on where nothing has stopped it in the blocks before.
         return (block < blocks) & jnp.any(reach >= jnp.minimum(block * _BLOCK, steps))
 
-    return jax.lax.while_loop(some_go_on, go_on, (jnp.int32(0), jnp.full(count, steps, jnp.int32)))[1]
+    return jax.lax.while_loop(some_continue, follow_block, (jnp.int32(0), jnp.full(count, steps, jnp.int32)))[1]
 
 
 def _cell_codes(occupied: Bool[Array, "H W"]) -> UInt8[Array, "H W"]:
     """Bit 0: an obstacle. Bit ``1 + d``: entering along diagonal ``d`` squeezes between two obstacles."""
     height, width = occupied.shape
+    # Both cells beside a diagonal step are neighbours of the cell that it enters: looked at from there, each of the
+    # four diagonals is two shifted copies of the map, and a line tests one bit instead of reading two more cells.
     around = jnp.pad(occupied, 1, constant_values=True)
     code = occupied.astype(jnp.uint8)
     for bit, (row_step, column_step) in enumerate(_DIAGONALS, start=1):
@@ -135,6 +171,8 @@ def _range_maxima(values: Int32[Array, " lines"], levels: int) -> Int32[Array, "
     """Row ``l`` of the (flattened) table holds the maximum of every block of ``2 ** l`` values from an index on."""
     rows = [values]
     for level in range(levels - 1):
+        # A block of twice the length is two blocks of this level. Blocks that would reach beyond the end are never
+        # read.
         shift = min(2**level, values.shape[0])
         ahead = jnp.concatenate([rows[-1][shift:], rows[-1][values.shape[0] - shift :]])
         rows.append(jnp.maximum(rows[-1], ahead))
@@ -152,8 +190,11 @@ def _at_offsets(
 def _lines(range_cells: float, height: int, width: int) -> _Lines:
     """The tables. The lines depend on the range alone, so that a padded grid shows the same; the grid bounds steps."""
     half = max(1, math.ceil(range_cells))
+    # On a grid smaller than the range no step beyond the grid's longer side can matter.
     margin = (min(half, height - 1), min(half, width - 1))
     steps = max(margin)
+    # Bresenham in closed form: at step k along the main axis the other coordinate is k aim / half, rounded to the
+    # nearest integer, ties away from 0.
     k = np.arange(steps + 1)[:, None]
     aim = np.arange(-half, half + 1)[None, :]
     minor = np.sign(aim) * ((2 * k * np.abs(aim) + half) // (2 * half))
@@ -166,6 +207,7 @@ def _lines(range_cells: float, height: int, width: int) -> _Lines:
     first, last, needed, levels = _covering_ranges(minor, range_cells, height, width)
     return _Lines(
         margin=margin,
+        # Step 0 is the robot's cell, which stops no line.
         cells=np.where(outside, window_size, cells)[1:].astype(np.int32),
         blocking=_blocking_bits(row, column)[1:],
         first=first,
@@ -176,6 +218,7 @@ def _lines(range_cells: float, height: int, width: int) -> _Lines:
 
 
 def _blocking_bits(row: np.ndarray, column: np.ndarray) -> UInt8[np.ndarray, "steps lines"]:
+    """The bits of a cell's code that stop a line at each step: an obstacle, and the squeeze along its own diagonal."""
     bits = np.full(row.shape, _OCCUPIED_BIT, np.uint8)
     row_step = np.diff(row, axis=0, prepend=0)
     column_step = np.diff(column, axis=0, prepend=0)
@@ -191,16 +234,21 @@ def _covering_ranges(
     side = minor.shape[1]
     row = np.arange(1 - height, height)[:, None]
     column = np.arange(1 - width, width)[None, :]
+    # A line of a side passes the cell at the step that is the cell's distance along the side's axis.
     step = np.maximum(np.abs(row), np.abs(column))
     in_range = (row**2 + column**2 <= range_cells**2) & (step < minor.shape[0])
+    # A cell on a diagonal belongs to two sides. A line that passes it has followed the diagonal up to there, whichever
+    # side it belongs to, so the lines of one will do.
     vertical = np.abs(row) >= np.abs(column)
     sides = np.where(vertical, np.where(row < 0, 0, 1), np.where(column < 0, 2, 3))
     across = np.where(vertical, column, row)
     low, high = np.zeros(step.shape, np.int64), np.zeros(step.shape, np.int64)
+    # At step k the lines of a side are in order of where they are, so the range of those in a column is a search.
     for k in range(minor.shape[0]):
         here = (step == k) & in_range
         low[here] = np.searchsorted(minor[k], across[here], side="left")
         high[here] = np.searchsorted(minor[k], across[here], side="right")
+    # The largest power of two that fits into the range: two blocks of it cover the range, and may overlap.
     level = np.where(in_range, np.floor(np.log2(np.maximum(high - low, 1))), 0).astype(np.int64)
     first = level * 4 * side + sides * side + low
     last = level * 4 * side + sides * side + np.maximum(high - 2**level, 0)

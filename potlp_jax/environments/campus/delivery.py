@@ -37,10 +37,15 @@ from potlp_jax.errors import WorldError
 from potlp_jax.world.grid import World
 
 _HALLWAYS = 0
+"""Number of the room that all hallways are."""
 _MIN_SIDE = 5
+"""Least side of a room, in cells: 2.5 m at half a metre a cell."""
 _DEEPEST_SMALL = 13
+"""Deepest office or other small room; a deeper one gets another room behind it."""
 _ATTEMPTS = 20
+"""Buildings that are drawn, at most, until one has the kinds of rooms that the errand needs."""
 _POSITIONS = 8
+"""Positions of a new hallway that are compared."""
 
 _WIDTHS = {Kind.OFFICE: (5, 9), Kind.LAB: (10, 20), Kind.CLASSROOM: (11, 20), Kind.OTHER: (4, 8)}
 """Of rooms along their row: 2.5 to 4.5 m for an office, at half a metre a cell."""
@@ -150,6 +155,7 @@ class Delivery(Generator):
         Raises:
             WorldError: the configuration leaves no space for the rooms that the errand needs.
         """
+        # The building does not change with the people in it.
         floor_key, furnish_key = jax.random.split(key)
         floor = self.draw_floor(floor_key)
         world, placement = furnish(floor, furnish_key, self.errand, self.config.furnishing, self.config.largest)
@@ -225,6 +231,7 @@ class _Builder:
 
     def build(self) -> Floor:
         height, width = self.rooms.shape
+        # The outermost cells of the first block are the outer walls.
         block = _Box(0, height, 0, width)
         self._cut(block, self._choose_turn(block, [False, True]), first=True)
         return self._without(set(range(len(self.kinds))) - self._open_doors())
@@ -236,8 +243,10 @@ class _Builder:
 
     def _divide(self, block: _Box) -> None:
         """Fill a block with rooms, or run a hallway through it and go on with what lies on both sides."""
+        # Everything is written for rows; ``turned`` exchanges rows and columns.
         fits = [turned for turned in (False, True) if self._fits(block, turned)]
         cuts = [turned for turned in (False, True) if any(self._contacts(block, turned))]
+        # Where rooms fit, another hallway is a matter of chance; where they do not, the block must be divided.
         if cuts and (not fits or self._chance(self.config.split)) and self._cut(block, self._choose_turn(block, cuts)):
             return
         if fits:
@@ -247,6 +256,7 @@ class _Builder:
 
     def _contacts(self, block: _Box, turned: bool) -> tuple[bool, bool]:
         """Whether hallways lie along the block's first and last row (first and last column if ``turned``)."""
+        # Transposed arrays are views: what is written through them is written to the building.
         rooms, box = (self.rooms.T, block.turned) if turned else (self.rooms, block)
         before = rooms[box.top - 1, box.left : box.right] if box.top > 0 else np.zeros(0)
         after = rooms[box.bottom, box.left : box.right] if box.bottom < len(rooms) else np.zeros(0)
@@ -263,6 +273,7 @@ class _Builder:
         """Across which side a hallway runs: mostly so that it divides the longer one."""
         if len(turns) == 1:
             return turns[0]
+        # By squares of the sides: a block twice as long as wide is cut across its length with a chance of four in five.
         return self._chance(block.height**2 / (block.height**2 + block.width**2))
 
     def _cut(self, block: _Box, turned: bool, *, first: bool = False) -> bool:
@@ -283,11 +294,13 @@ class _Builder:
 
     def _choose_position(self, box: _Box, width: int, turned: bool, first: bool) -> int | None:
         """Of a few positions the one beside which rows of rooms fit best."""
+        # The margin holds the least room, its two walls and a cell to spare.
         margin, depth = _MIN_SIDE + 3, self.config.row_depth
         if box.width < 2 * margin + width:
             return None
         left = self.rng.integers(box.left + margin, box.right - margin - width + 1, size=_POSITIONS)
         joined = np.array([first or any(self._meets(box.columns(one, one + width), turned)) for one in left.tolist()])
+        # One row of rooms fills a side up to its depth; a deeper side is best near 1.7 depths, which hold two rows.
         sides = np.stack([left - box.left, box.right - left - width])
         wasted = np.where(sides <= depth, 0, np.minimum(abs(sides - 1.7 * depth), depth)).sum(axis=0)
         return int(left[np.argmin(np.where(joined, wasted, np.inf))]) if joined.any() else None
@@ -303,10 +316,13 @@ class _Builder:
         """Open the hallway up to the hallways that it meets; it may stop short, or be closed in its middle."""
         rooms, meets = self.rooms.T if turned else self.rooms, self._meets(hallway, turned)
         top, bottom = hallway.top + (not meets[0]), hallway.bottom - (not meets[1])
+        # Where the hallway meets another, its first or last row is an opening instead of a wall.
         length = bottom - top
         room = int(self.rng.integers(_MIN_SIDE + 1, 13))
         parts, closed = [hallway.rows(top, bottom)], None
+        # A long hallway between two others may be severed by a room, one with a loose end may stop short: dead ends.
         if all(meets) and length >= 40 and self._chance(self.config.severed):
+            # Not near its ends, where a stub would look like a niche.
             middle = top + int(length * self.rng.uniform(0.3, 0.6))
             parts = [hallway.rows(top, middle), hallway.rows(middle + room + 2, bottom)]
             closed = hallway.rows(middle + 1, middle + room + 1)
@@ -329,9 +345,11 @@ class _Builder:
             return
         box = block.turned if turned else block
         inside = box.inside
+        # At half a metre a cell 400 cells are 100 square metres.
         if block.height * block.width <= 400 and self._chance(self.config.lobby):
             self._open_lobby(block)
         elif sum(self._contacts(block, turned)) == 2 and inside.height >= 2 * _MIN_SIDE + 3:
+            # Hallways on both sides and depth for two rows: back to back, with a wall somewhere in the middle half.
             slack = inside.height - 1 - 2 * _MIN_SIDE
             wall = inside.top + _MIN_SIDE + int(slack * self.rng.uniform(0.25, 0.75))
             self._fill_row(inside.rows(inside.top, wall), turned, front_first=True)
@@ -357,21 +375,25 @@ class _Builder:
             for touches, line, beyond in zip(
                 self._contacts(block, turned), (box.top, box.bottom - 1), (box.top - 1, box.bottom), strict=True
             ):
+                # The wall opens only where the hallway really is beyond it.
                 if touches:
                     columns = np.arange(box.left + 1, box.right - 1)
                     rooms[line, columns[rooms[beyond, columns] == _HALLWAYS]] = _HALLWAYS
 
     def _fill_row(self, row: _Box, turned: bool, front_first: bool) -> None:
         """Rooms side by side along the columns of ``row``, which has no walls of its own; turned back if ``turned``."""
+        # 9 and 13 cells bound the three depths for which ``_USES`` gives chances.
         uses = np.array([chances[int(np.searchsorted((9, 13), row.height))] for _, chances in _USES])
         mix = _USES[int(self.rng.choice(len(_USES), p=uses / uses.sum()))][0]
         left = row.left
         while left < row.right:
             kind = list(mix)[int(self.rng.choice(len(mix), p=list(mix.values())))]
+            # A laboratory that would be as narrow as an office is one.
             if kind in (Kind.LAB, Kind.CLASSROOM) and min(row.right - left, row.height + 3) < _WIDTHS[kind][0]:
                 kind = Kind.OFFICE
             low, high = _WIDTHS[kind]
             right = left + int(self.rng.integers(low, high + 1))
+            # What remains would be too narrow for a room: the last one takes it.
             if row.right - right < _MIN_SIDE + 1:
                 right = row.right
             self._add_rooms_in_depth(row.columns(left, right), kind, turned, front_first)
@@ -383,6 +405,7 @@ class _Builder:
         small, possible = kind in (Kind.OFFICE, Kind.OTHER), box.height >= 2 * _MIN_SIDE + 1
         if small and possible and (box.height > _DEEPEST_SMALL or self._chance(self.config.room_behind)):
             wall = box.top + _MIN_SIDE + int(self.rng.integers(0, box.height - 2 * _MIN_SIDE))
+            # The front room is the one beside the hallway.
             front, back = box.rows(box.top, wall), box.rows(wall + 1, box.bottom)
             if not front_first:
                 front, back = back, front
@@ -404,9 +427,11 @@ class _Builder:
         for number, box in enumerate(self.boxes, start=1):
             if self._open_door(walls[number], number, _HALLWAYS):
                 reached.add(number)
+                # Twelve cells are six metres: large rooms have two doors.
                 if max(box.height, box.width) >= 12 and self._chance(self.config.second_door):
                     self._open_door(walls[number], number, _HALLWAYS)
         self._reach_inner_rooms(walls, reached)
+        # Doors between rooms that are reached anyway close loops. Sorted: the order of a set differs between runs.
         for number in sorted(reached - {_HALLWAYS}):
             others = _neighbours(walls[number]) & reached - {_HALLWAYS, number}
             if others and self._chance(self.config.joining_door):
@@ -415,6 +440,7 @@ class _Builder:
 
     def _reach_inner_rooms(self, walls: Mapping[int, list[_Wall]], reached: set[int]) -> None:
         """Join rooms without a hallway to rooms that are reached, as far as that goes."""
+        # A room behind a room behind a room is reached in the third round.
         grown = True
         while grown:
             grown = False
@@ -442,7 +468,9 @@ class _Builder:
         width = self.config.door_width
         places = []
         for wall in walls:
+            # Cells of the wall behind which the target lies, and that are still wall.
             leads = (wall.beyond == target) & (self.rooms[wall.rows, wall.columns] == NO_ROOM)
+            # First cells of stretches as long as the door is wide.
             stretches = leads[: max(len(leads) - width + 1, 0)].copy()
             for step in range(1, width):
                 stretches &= leads[step : step + len(stretches)]
@@ -451,12 +479,14 @@ class _Builder:
             return False
         wall, first = places[int(self.rng.integers(len(places)))]
         cells = wall.rows[first : first + width], wall.columns[first : first + width]
+        # A door belongs to the room that it was opened for, which is the one behind it as seen from the hallway.
         self.rooms[cells] = number
         self.doors[cells] = True
         return True
 
     def _without(self, walled_up: set[int]) -> Floor:
         """The floor with some rooms solid, the others numbered without gaps."""
+        # The appended entry keeps NO_ROOM, -1, what it is.
         kept = np.array([number not in walled_up for number in range(len(self.kinds))])
         new_numbers = np.append(np.where(kept, np.cumsum(kept) - 1, NO_ROOM), NO_ROOM).astype(np.int32)
         kinds = tuple(kind for kind, keep in zip(self.kinds, kept, strict=True) if keep)

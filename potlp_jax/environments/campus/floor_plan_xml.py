@@ -44,6 +44,7 @@ class PlanRoom:
     @property
     def area(self) -> float:
         """Square metres inside of the outline."""
+        # The shoelace formula; the sign tells the direction of the outline, which files do not agree on.
         pairs = zip(self.outline, (*self.outline[1:], *self.outline[:1]), strict=True)
         return abs(sum(x0 * y1 - x1 * y0 for (x0, y0), (x1, y1) in pairs)) / 2
 
@@ -97,16 +98,19 @@ def read_plan(file: Path | str) -> FloorPlan:
         raise MapError(file, "", f"cannot be read ({error.strerror})") from error
     except ElementTree.ParseError as error:
         raise MapError(file, "", f"is not valid XML: {error}") from error
+    # The corpus has legends in the same folder, which are XML, too.
     if building.tag != "building":
         raise MapError(file, building.tag, "the file must hold a building: is it a legend, or another format?")
     floors = building.findall("floor")
     if len(floors) != 1:
         raise MapError(file, "floor", f"there are {len(floors)}; put each floor into a file of its own")
+    # Everything that is read from here on is in metres.
     scale = _read_scale(file, building)
     spaces = floors[0].findall("spaces/space")
     if not spaces:
         raise MapError(file, "spaces", "the floor has no rooms")
     rooms = tuple(_read_room(file, space, scale) for space in spaces)
+    # Portals refer to rooms by id: given twice, it would join the wrong ones.
     ids = [room.id for room in rooms]
     if len(set(ids)) < len(ids):
         twice = next(name for name in ids if ids.count(name) > 1)
@@ -131,6 +135,7 @@ def read_kinds(file: Path | str | None = None) -> Mapping[str, Kind]:
         if not isinstance(labels, list) or not all(isinstance(label, str) for label in labels):
             raise MapError(file, name, "must be a list of labels")
         for label in labels:
+            # Files of a corpus write labels in capitals or not.
             if found.setdefault(label.upper(), kinds[name]) is not kinds[name]:
                 raise MapError(file, name, f"label {label!r} is listed under another kind, too")
     return found
@@ -144,6 +149,7 @@ def _read_scale(file: Path, building: ElementTree.Element) -> float:
         raise MapError(file, "scale: real_distance: um", f"{unit!r} must be one of {', '.join(_METRES)}")
     if not (pixels > 0 and real > 0):
         raise MapError(file, "scale", f"{pixels:g} pixels for {real:g} {unit}: both must be positive")
+    # ``um`` is the corpus's word for the unit of measure.
     return real * _METRES[unit] / pixels
 
 
@@ -165,6 +171,7 @@ def _read_room(file: Path, space: ElementTree.Element, scale: float) -> PlanRoom
 
 def _read_doors(file: Path, spaces: list[ElementTree.Element], ids: set[str], scale: float) -> Iterator[PlanDoor]:
     """Each door once, though both of its rooms list it."""
+    # The drawn lines of each door by its id, with the room that draws them: ids are unique within a room only.
     segments: dict[str, list[tuple[str, ElementTree.Element]]] = {}
     for space in spaces:
         for segment in space.findall("space_representation/linesegment"):
@@ -179,6 +186,7 @@ def _read_doors(file: Path, spaces: list[ElementTree.Element], ids: set[str], sc
                 raise MapError(
                     file, f"space {space.get('id')}: portal {segment_id}", f"must join two rooms, found {rooms}"
                 )
+            # The rooms are sorted, so that the door of one room and that of the other are recognised as the same.
             if (segment_id, *rooms) not in seen:
                 seen.add((segment_id, *rooms))
                 own = [segment for owner, segment in segments.get(segment_id, []) if owner in rooms]
@@ -197,6 +205,7 @@ def _make_door(
         ends = [
             _read_point(file, f"linesegment {segment.get('id')}", point, scale) for point in segment.findall("point")
         ]
+        # Mostly both ends are the same point; where they differ, the middle is meant.
         if ends:
             points.append((sum(x for x, _ in ends) / len(ends), sum(y for _, y in ends) / len(ends)))
     return PlanDoor(
@@ -216,6 +225,7 @@ def _number(file: Path, field: str, text: str | None) -> float:
     try:
         value = float(text or "")
     except ValueError:
+        # Refused below, together with the infinities that ``float`` reads.
         value = math.nan
     if not math.isfinite(value):
         raise MapError(file, field, f"{text!r} is not a finite number")

@@ -57,6 +57,7 @@ DEEPEST_WALL = 1.5
 MOST_CELLS = 1000
 """Rows, and columns, of a floor, at most."""
 
+# Up to two cells, a metre at the default resolution: farther away it would be another door.
 _SHIFTS = (0, 1, -1, 2, -2)
 """Cells by which an opening may be beside its point, in order of preference: doors stand in corners, too."""
 
@@ -194,6 +195,7 @@ class FloorPlans(Generator):
 
     def generate_with_layout(self, key: PRNGKeyArray) -> tuple[World, PlanFloor, Placement]:
         """The world of this key, its building without padding, and who is where."""
+        # The key itself draws the building, so that people need one of their own.
         furnish_key = jax.random.fold_in(key, 0)
         floor = self.building(key)
         world, placement = furnish(floor.floor, furnish_key, PEOPLE, self.config.furnishing, self._shape)
@@ -227,18 +229,29 @@ def parse_spec(spec: str) -> FloorPlanConfig:
 def rasterise(plan: FloorPlan, kinds: Mapping[str, Kind], resolution: float) -> PlanFloor:
     """The floor of a plan, as the module describes.
 
+    Args:
+        plan: in metres.
+        kinds: the kind of room that each label means.
+        resolution: side of a cell in metres.
+
+    Returns:
+        The floor, and what was lost on the way.
+
     Raises:
         MapError: a label is not in ``kinds``, the resolution is not positive or leaves nothing, or the floor would have
             more than a thousand rows or columns.
     """
+    # A label that nobody explained would silently become some kind of room.
     unknown = sorted({room.label for room in plan.rooms} - set(kinds))
     if unknown:
         raise MapError(plan.file, "label", f"no kind is given for {', '.join(unknown)}; list it in a file of kinds=")
     frame = _frame_around(plan, resolution)
+    # Rooms that no door mentions would be solid in the end anyway, and until then be in the way of doors.
     with_door = {name for door in plan.doors for name in door.rooms}
     rooms = [room for room in plan.rooms if room.id in with_door]
     drawing = _Drawing(rooms, [kinds[room.label] for room in rooms], frame)
     without_cells = len(set(range(len(rooms))) - set(np.unique(drawing.cells).tolist()))
+    # All doors are cut into the same building without doors, so that their order does not matter.
     placed = [drawing.cut_door(door) for door in plan.doors if door.points]
     kept = drawing.wall_up()
     report = FloorReport(
@@ -253,6 +266,7 @@ def rasterise(plan: FloorPlan, kinds: Mapping[str, Kind], resolution: float) -> 
     )
     if not kept:
         raise MapError(plan.file, "", f"nothing is left of it with cells of {resolution} m: {report}")
+    # Rooms are numbered anew without gaps; the last entry keeps NO_ROOM, -1, what it is.
     numbers = np.full(len(rooms) + 1, NO_ROOM, np.int32)
     numbers[kept] = np.arange(len(kept))
     floor = Floor(numbers[drawing.cells], drawing.doors, tuple(drawing.kinds[room] for room in kept), resolution)
@@ -293,6 +307,7 @@ def _frame_around(plan: FloorPlan, resolution: float) -> GridFrame:
         raise MapError(plan.file, "resolution", f"{resolution} is not a positive number of metres")
     points = np.array([point for room in plan.rooms for point in room.outline])
     low, high = points.min(axis=0), points.max(axis=0)
+    # Two more: a ring of obstacles on all sides.
     width, height = (int(size) for size in np.ceil((high - low) / resolution) + 2)
     if max(width, height) > MOST_CELLS:
         raise MapError(
@@ -318,6 +333,7 @@ class _Drawing:
         self.numbers = {room.id: number for number, room in enumerate(rooms)}
         self.areas = [room.area for room in rooms]
         self.cells = np.full((frame.height, frame.width), NO_ROOM, np.int32)
+        # Large rooms first: a closet drawn inside of a hall stays visible.
         for number in sorted(range(len(rooms)), key=lambda number: -self.areas[number]):
             self._fill(number, rooms[number])
         self._separate()
@@ -325,6 +341,7 @@ class _Drawing:
         self._without_doors = self.cells.copy()
 
     def _fill(self, number: int, room: PlanRoom) -> None:
+        # Only the window around the outline is tested for being inside of it.
         corners = [self.frame.metres_to_cell(*point) for point in room.outline]
         rows, columns = zip(*corners, strict=True)
         top, left = min(rows), min(columns)
@@ -334,12 +351,15 @@ class _Drawing:
 
     def _separate(self) -> None:
         """Walls between rooms that touch: of two cells, that of the room which can better do without it."""
+        # Hallways rank lowest and keep their cells, since they are narrow; of other rooms the smaller one keeps its.
         order = sorted(
             range(len(self.kinds)), key=lambda number: (self.kinds[number] is not Kind.HALLWAY, self.areas[number])
         )
+        # The inverse of the order; the last entry is the rank of NO_ROOM, -1.
         rank = np.argsort(np.array([*order, len(order)]))
         walls = np.zeros(self.cells.shape, bool)
         for cells, wall in ((self.cells, walls), (self.cells.T, walls.T)):
+            # Transposed arrays are views, so that the second pass writes the same walls along the other axis.
             one, other = cells[:-1], cells[1:]
             touch = (one != other) & (one != NO_ROOM) & (other != NO_ROOM)
             wall[:-1] |= touch & (rank[one] > rank[other])
@@ -350,9 +370,11 @@ class _Drawing:
         """Open a door; returns the share of its width that was possible, 0 where the rooms do not face each other."""
         rooms = self.numbers[door.rooms[0]], self.numbers[door.rooms[1]]
         wanted = max(1, round(DOOR_WIDTH * (2 if door.double else 1) / self.frame.resolution))
+        # Where the outlines of both rooms have the door, the place is in the middle of the wall between them.
         x, y = (sum(values) / len(door.points) for values in zip(*door.points, strict=True))
         up, across = self.frame.to_grid(np.array([[x, y]]))[0][::-1]
         place = self.frame.height - up, across
+        # Files do not say in which wall a door is: the direction in which more of it fits is right.
         best = max((self._passages(place, rooms, wanted, door.implicit, turned) for turned in (False, True)), key=len)
         for rows, columns in best:
             self.cells[rows, columns] = self._behind(rooms)
@@ -362,6 +384,7 @@ class _Drawing:
     def wall_up(self) -> list[int]:
         """Leave the largest connected part alone; returns the rooms of which something is left."""
         labels = component_labels(self.cells != NO_ROOM)
+        # The appended 0 stands for a drawing without any free cell.
         largest = 1 + np.argmax(np.append(np.bincount(labels.ravel())[1:], 0))
         self.cells[labels != largest] = NO_ROOM
         self.doors &= self.cells != NO_ROOM
@@ -389,6 +412,7 @@ class _Drawing:
                 return None
             return steps, np.full_like(steps, line)
 
+        # An opening without a door is as wide as both rooms go; a door has its width, perhaps a little aside.
         if implicit:
             found = _all_cuts(cut, int(across), along)
         else:
@@ -402,6 +426,7 @@ def _gap(line: Int32[np.ndarray, " N"], middle: float, reach: int, rooms: tuple[
     """The cells of no room between two rooms that follow each other in a line of cells, nearest to its middle."""
     low = max(int(middle) - reach, 0)
     window = line[low : int(middle) + reach + 1]
+    # Two rooms face each other where one follows the other with nothing but wall between.
     taken = np.flatnonzero(window != NO_ROOM)
     gaps = [
         np.arange(low + one + 1, low + other)
@@ -418,6 +443,7 @@ def _all_cuts(cut: Callable[[int, float], Cut | None], middle: int, along: float
         return []
     found = []
     for line, step in ((first, 1), (first - 1, -1)):
+        # The wall may be slanted: the next cut is looked for where this one was.
         place = along
         while (one := cut(line, place)) is not None:
             found.append(one)

@@ -121,6 +121,7 @@ class Floor:
     @property
     def kind_of_cell(self) -> Int32[np.ndarray, "H W"]:
         """The ``Kind`` of each free cell's room; ``NO_ROOM`` on obstacles."""
+        # NO_ROOM is -1, which indexes the entry that is appended.
         return np.append(np.array(self.kinds, np.int32), np.int32(NO_ROOM))[self.rooms]
 
     def rooms_of(self, kind: Kind) -> list[int]:
@@ -172,8 +173,10 @@ class Placement:
 
 def missing_kinds(floor: Floor, errand: Errand) -> tuple[tuple[Kind, ...], ...]:
     """Of what the errand needs a room: the kinds of which the floor has none, or too few for all who need one."""
+    # The robot starts in a hallway, so that one is needed, too.
     needed = [(Kind.HALLWAY,), *errand.rooms.values()]
     rooms = {kinds: [number for kind in kinds for number in floor.rooms_of(kind)] for kinds in needed}
+    # As many rooms as there are people with the same choice of kinds, because no two share a room.
     return tuple(kinds for kinds in rooms if len(rooms[kinds]) < needed.count(kinds))
 
 
@@ -182,17 +185,28 @@ def furnish(
 ) -> tuple[World, Placement]:
     """The floor with people, a start, light and colours, all drawn by key; costs are in metres.
 
-    The world's arrays have ``shape``: what is missing is solid and no part of its ``extent``. Two floors of one shape
-    cost one compilation.
+    Args:
+        floor: the building without people.
+        key: of the world; used for nothing else.
+        errand: who has to be placed, and in which kinds of rooms.
+        config: people, light and colours.
+        shape: rows and columns of the world's arrays: what is missing is solid and no part of its ``extent``. Two
+            floors of one shape cost one compilation.
+
+    Returns:
+        The world, and who is where in it.
 
     Raises:
         WorldError: a room that somebody or the robot needs is missing, or the floor is larger than ``shape``.
     """
+    # Before anything is drawn: the message names what a person could change, a failed draw would not.
     missing = missing_kinds(floor, errand)
     if missing:
         raise WorldError(f"the floor has too few rooms of kind {name_kinds(missing)}, which the errand needs")
+    # Padding is solid and belongs to no room; the extent remembers the size of the building.
     extent = floor.rooms.shape
     floor = _padded(floor, shape)
+    # Separate streams, so that another palette moves nobody.
     people_rng, look_rng = host_generators(key, 2)
     placement = _place_people(floor, people_rng, errand, config)
     look = _appearance(floor, placement, look_rng, config)
@@ -215,12 +229,15 @@ def _padded(floor: Floor, shape: tuple[int, int]) -> Floor:
 
 
 def _place_people(floor: Floor, rng: np.random.Generator, errand: Errand, config: FurnishConfig) -> Placement:
+    # A doorway is part of the room behind it, and no place to begin.
     hallway = np.isin(floor.rooms, floor.rooms_of(Kind.HALLWAY)) & ~floor.doors
     start = _draw_cell(rng, hallway)
     chosen: dict[str, int] = {}
     for name, kinds in errand.rooms.items():
+        # One person a room: who is found must not tell where the next one is.
         vacant = [room for kind in kinds for room in floor.rooms_of(kind) if room not in chosen.values()]
         chosen[name] = vacant[int(rng.integers(len(vacant)))]
+    # After all rooms: a person's cell does not depend on where the others stand.
     cells = {name: _draw_cell(rng, (floor.rooms == number) & ~floor.doors) for name, number in chosen.items()}
     low, high = config.hallway_light
     light = low + (high - low) * float(rng.random())
@@ -237,17 +254,21 @@ def _letters(floor: Floor, placement: Placement, config: FurnishConfig) -> Int32
     reach = config.person_radius
     for bit, (name, (row, column)) in enumerate(placement.cells.items()):
         patch = (slice(max(row - reach, 0), row + reach + 1), slice(max(column - reach, 0), column + reach + 1))
+        # A patch that reaches over a wall or through a door would be met from the hallway; it ends at its room's walls.
         letters[patch] |= np.where(floor.rooms[patch] == placement.rooms[name], 1 << bit, 0).astype(np.int32)
     return letters
 
 
 def _appearance(floor: Floor, placement: Placement, rng: np.random.Generator, config: FurnishConfig) -> Appearance:
     tints = rng.integers(-config.tint, config.tint + 1, size=(2, len(Kind), 3))
+    # One value a cell for all three colours: brightness varies, hue does not.
     noise = rng.integers(-config.tint_noise, config.tint_noise + 1, size=(2, *floor.rooms.shape, 1))
     floor_palette = np.array([_FLOOR_COLOURS[kind] for kind in Kind]) + tints[0]
     wall_palette = np.array([_WALL_COLOURS[kind] for kind in Kind]) + tints[1]
+    # Without colours everything looks like a room of no particular kind, hallways included.
     kinds = floor.kind_of_cell if config.coloured else np.full_like(floor.rooms, Kind.OTHER)
     return Appearance(
+        # Obstacles have no floor; the index only has to exist.
         floor_colour=_colours(floor_palette[np.maximum(kinds, 0)] + noise[0]),
         wall_colour=_colours(wall_palette[_kind_of_wall(kinds)] + noise[1]),
         smoke=jnp.asarray(np.zeros(floor.rooms.shape, np.float32)),
@@ -261,11 +282,13 @@ def _colours(values: Int32[np.ndarray, "H W 3"] | np.ndarray) -> jnp.ndarray:
 
 def _kind_of_wall(kinds: Int32[np.ndarray, "H W"]) -> Int32[np.ndarray, "H W"]:
     """The largest kind among a cell and its eight neighbours; ``HALLWAY`` where no room is near."""
+    # Dilation takes unsigned bytes: one is added so that NO_ROOM becomes 0.
     largest = cv2.dilate((kinds + 1).astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.int32) - 1
     return np.maximum(largest, Kind.HALLWAY).astype(np.int32)
 
 
 def _light(floor: Floor, placement: Placement) -> Float32[np.ndarray, "H W"]:
+    # The last entry is that of NO_ROOM, -1: obstacles are dark.
     lit = np.zeros(len(floor.kinds) + 1, np.float32)
     lit[floor.rooms_of(Kind.HALLWAY)] = placement.hallway_light
     lit[list(placement.rooms.values())] = 1.0

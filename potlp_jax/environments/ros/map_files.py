@@ -81,6 +81,7 @@ class GridFrame:
     def to_grid(self, points: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
         """Metres (x, y) to cells from the lower left corner: along the grid's columns and, upwards, its rows."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        # The inverse turn: into the grid's own axes.
         shifted = points - np.array([[self.x, self.y]])
         along = shifted @ np.array([[cos, -sin], [sin, cos]])
         return np.round(along / self.resolution, BOUNDARY_DECIMALS)
@@ -90,6 +91,7 @@ class GridFrame:
 
         A point on an edge belongs to the cell of larger x and larger y (of the grid's own axes).
         """
+        # To the cell of larger y means to the lower row number: rows count from the top.
         across, up = self.to_grid(np.array([[x, y]], dtype=np.float64))[0]
         return self.height - 1 - math.floor(up), math.floor(across)
 
@@ -102,7 +104,16 @@ class GridFrame:
         return 0 <= row < self.height and 0 <= col < self.width
 
     def window(self, top: int, left: int, height: int, width: int) -> "GridFrame":
-        """Frame of the cells from row ``top`` and column ``left`` on; it may reach beyond the grid."""
+        """Frame of a part of the grid; it may reach beyond it.
+
+        Args:
+            top, left: first row and first column.
+            height, width: rows and columns.
+
+        Returns:
+            The same axes and size of cells, with the lower left corner of the part.
+        """
+        # Of the window's lower left corner, as that of every frame is given.
         x, y = self._corner_to_metres(left, self.height - top - height)
         return GridFrame(height, width, self.resolution, x, y, self.yaw)
 
@@ -157,6 +168,7 @@ def load_map(file: Path | str) -> OccupancyMap:
             YAML says, and pixels that mean "unknown" but are free under ``free_thresh``.
     """
     settings = load_settings(file)
+    # The largest value of the format, by which pixels are scaled: 255, 65535 or what a PGM's header says.
     pixels, white = _read_image(settings.image)
     shade = _shade(settings, pixels, white)
     occupancy, free, occupied = (
@@ -192,6 +204,7 @@ def load_settings(file: Path | str) -> MapSettings:
             "occupied_thresh",
             f"{float(settings.occupied_thresh)} must be larger than free_thresh, {float(settings.free_thresh)}",
         )
+    # The two servers disagree, so that whatever is read would be wrong for one of them.
     if settings.mode == "raw" and settings.negate:
         raise MapError(
             file, "negate", "ROS 1 inverts raw pixels and ROS 2 does not: invert the image and set negate: 0"
@@ -203,6 +216,7 @@ class _TextLoader(yaml.BaseLoader):
     """Leaves every scalar as its text, so that numbers stay exact, and refuses a key that is given twice."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        # YAML libraries keep the last of two equal keys, and say nothing.
         seen = set()
         for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
             if key.value in seen:
@@ -232,9 +246,17 @@ def read_yaml(file: Path) -> dict[str, Any]:
 def parse_number(file: Path, field: str, text: Any) -> Fraction:
     """The exact value of a decimal text.
 
+    Args:
+        file, field: where the text is from, for messages.
+        text: what the YAML has there.
+
+    Returns:
+        The number as a fraction, so that comparisons with it are exact.
+
     Raises:
         MapError: it is not a finite decimal number.
     """
+    # An exponent of more than three digits would make a fraction of millions of digits.
     if not isinstance(text, str) or not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", text.strip()):
         raise MapError(file, field, f"{text!r} is not a finite number")
     return Fraction(text.strip())
@@ -242,6 +264,14 @@ def parse_number(file: Path, field: str, text: Any) -> Fraction:
 
 def parse_numbers(file: Path, field: str, value: Any, names: tuple[str, ...]) -> tuple[float, ...]:
     """A list of numbers, one for each name, such as ``[x, y]``.
+
+    Args:
+        file, field: where the list is from, for messages.
+        value: what the YAML has there.
+        names: of the numbers.
+
+    Returns:
+        As many numbers as there are names.
 
     Raises:
         MapError: it is something else.
@@ -266,6 +296,7 @@ def _find_image(file: Path, text: Any) -> Path:
     image = file.parent / text.strip()  # an absolute path stays as it is
     if image.is_file():
         return image
+    # Maps that were copied from another machine often keep the absolute path of their image.
     sibling = file.parent / image.name
     if sibling.is_file():
         _warn(file, "image", f"{image} does not exist; using {sibling}")
@@ -286,6 +317,7 @@ def _parse_choice(file: Path, field: str, text: Any, choices: tuple[str, ...]) -
 
 
 def _parse_threshold(file: Path, fields: Mapping[str, Any], field: str, default: str) -> Fraction:
+    # The two servers have different defaults, so a missing threshold is worth a word.
     if field not in fields:
         _warn(file, field, f"is missing; using {default}")
     value = parse_number(file, field, fields.get(field, default))
@@ -304,6 +336,7 @@ def _read_image(file: Path) -> tuple[Shaped[np.ndarray, "H W C"], int]:
         content = file.read_bytes()
     except OSError as error:
         raise MapError(file, "", f"cannot be read ({error.strerror})") from error
+    # Magic numbers of the two kinds of PGM.
     if content[:2] in (b"P2", b"P5"):
         return _read_pgm(file, content)
     pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None
@@ -316,6 +349,7 @@ def _read_image(file: Path) -> tuple[Shaped[np.ndarray, "H W C"], int]:
 
 def _read_pgm(file: Path, content: bytes) -> tuple[Int64[np.ndarray, "H W 1"], int]:
     """ASCII (P2) and binary (P5) PGM with any maximum, which image libraries scale differently or not at all."""
+    # Comments may stand between any two numbers of the header.
     header = re.match(rb"P[25]((?:\s|#[^\n]*\n)+\d+){3}", content)
     if header is None:
         raise MapError(file, "", "has no valid PGM header (width, height, maximum)")
@@ -324,6 +358,7 @@ def _read_pgm(file: Path, content: bytes) -> tuple[Int64[np.ndarray, "H W 1"], i
         raise MapError(file, "", f"has an invalid PGM header: {width} x {height} pixels, maximum {white}")
     body = content[header.end() :]
     values = _ascii_values(file, body) if content[:2] == b"P2" else _binary_values(body, white)
+    # A file with more is accepted, as by every reader; one with less has lost a part of the building.
     if len(values) < width * height:
         raise MapError(
             file, "", f"is cut short: {len(values)} of {width} x {height} = {width * height} pixels are there"
@@ -365,6 +400,7 @@ class _Shade:
 
 
 def _shade(settings: MapSettings, pixels: Shaped[np.ndarray, "H W C"], white: int) -> _Shade:
+    # Grey or colour, each with or without alpha: an even number of channels means that the last is alpha.
     has_alpha = pixels.shape[-1] in (2, 4)
     counts_alpha = has_alpha and settings.mode == "trinary"
     counted = pixels[..., :-1] if has_alpha and not counts_alpha else pixels
@@ -388,6 +424,7 @@ def _threshold(
     free = shade.opaque & (darkness < math.ceil(full * free_thresh))
     occupancy = np.where(occupied, OCCUPIED, np.where(free, FREE, UNKNOWN)).astype(np.int8)
     if settings.mode == "scale":
+        # The exact fraction is taken once for each value that occurs, of which there are few.
         between = shade.opaque & ~occupied & ~free
         values, places = np.unique(darkness[between], return_inverse=True)
         scale = 99 / (occupied_thresh - free_thresh)
@@ -399,6 +436,7 @@ def _threshold(
 def _raw_occupancy(
     settings: MapSettings, shade: _Shade
 ) -> tuple[Int8[np.ndarray, "H W"], Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
+    # A raw pixel is the occupancy itself; 101 to 255 are unknown.
     greys = shade.greys()
     known = shade.opaque & (greys <= OCCUPIED)
     occupied = known & (greys > math.floor(100 * settings.occupied_thresh))
@@ -447,6 +485,7 @@ def _warn_of_unknown_as_free(settings: MapSettings, shade: _Shade, free: Bool[np
     """Names greys that are free but look like the map's unknown: 205, or a large area darker than the free one."""
     if settings.mode == "raw":
         return  # raw pixels are occupancies already, no picture
+    # A grey that covers much of the image is meant by whoever made it; noise is spread over many.
     counts = np.bincount(shade.greys()[free], minlength=256)
     common = np.flatnonzero(counts >= PLATEAU_FRACTION * free.size)
     lightest = common.min(initial=255) if settings.negate else common.max(initial=0)
@@ -454,6 +493,7 @@ def _warn_of_unknown_as_free(settings: MapSettings, shade: _Shade, free: Bool[np
     if counts[SAVED_UNKNOWN]:
         suspects.add(SAVED_UNKNOWN)
     for grey in sorted(suspects):
+        # Rounded down, so that the number in the message really excludes the grey.
         at_most = math.floor(1000 * _occupancy_of_grey(settings, grey)) / 1000
         _warn(
             settings.file,

@@ -14,9 +14,15 @@ OCCUPIED_GREY = 0
 
 
 def save_map(file: Path, free: Bool[np.ndarray, "H W"], frame: GridFrame) -> Path:
-    """Write a trinary map, ``file`` (.yaml) with its image beside it (.pgm), and return the image's path.
+    """Write a trinary map: a YAML file, and its image beside it.
 
-    What is not free is an obstacle. Numbers are written so that reading them gives the same frame.
+    Args:
+        file: the YAML's name, ending in .yaml; the image's ends in .pgm.
+        free: True on free cells; all others become obstacles.
+        frame: where the grid lies; reading the file gives the same frame.
+
+    Returns:
+        The image's path.
 
     Raises:
         MapError: the name does not end in .yaml.
@@ -24,9 +30,11 @@ def save_map(file: Path, free: Bool[np.ndarray, "H W"], frame: GridFrame) -> Pat
     """
     if file.suffix != ".yaml":
         raise MapError(file, "", "a map's name must end in .yaml")
+    # Binary PGM needs no library and has no compression to get wrong.
     image = file.with_suffix(".pgm")
     pixels = np.where(free, FREE_GREY, OCCUPIED_GREY).astype(np.uint8)
     image.write_bytes(f"P5\n{frame.width} {frame.height}\n255\n".encode() + pixels.tobytes())
+    # ``!r`` is the shortest text that reads back as the same float.
     file.write_text(
         f"image: {image.name}\n"
         "mode: trinary\n"

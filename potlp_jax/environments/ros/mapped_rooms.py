@@ -26,9 +26,10 @@ from potlp_jax.environments.base import Generator
 from potlp_jax.environments.campus.delivery import DeliveryConfig
 from potlp_jax.environments.campus.furnishing import NO_ROOM, PARCELS, Floor, FurnishConfig, Kind, Placement, furnish
 from potlp_jax.environments.options import parse_options
+from potlp_jax.environments.ros.cleaning import CleanMap, clean_map
 from potlp_jax.environments.ros.map_files import load_map
 from potlp_jax.environments.ros.places import Region, load_regions
-from potlp_jax.environments.ros.ros_map import NARROW_DOORS, CleanMap, clean_map
+from potlp_jax.environments.ros.ros_map import NARROW_DOORS
 from potlp_jax.environments.splits import PARCELS_PREFIX
 from potlp_jax.errors import MapError, MapWarning
 from potlp_jax.world.camera import CameraConfig
@@ -100,6 +101,7 @@ class MappedRooms(Generator):
         self.clean: CleanMap = clean_map(load_map(config.file), config.resolution, config.radius)
         self.name = f"{PARCELS_PREFIX}{Path(config.file).stem}"
         self.rooms, self.left_out, self.floor = _floor(regions, self.clean)
+        # The hallway counts as the first; two people need two rooms.
         if len(self.rooms) < 3 or not np.any(self.floor.rooms == _HALLWAY):
             raise MapError(
                 file,
@@ -115,6 +117,7 @@ class MappedRooms(Generator):
                 stacklevel=2,
             )
         self.settings = _settings(config.resolution)
+        # At least the neighbouring cells: on a coarse grid a person is met beside their cell, too.
         reach = max(1, round(PERSON_RADIUS / config.resolution))
         self._furnishing = FurnishConfig(person_radius=reach, coloured=False)
 
@@ -142,6 +145,7 @@ class MappedRooms(Generator):
 
 def _settings(resolution: float) -> Settings:
     """Camera and replanning as in ``parcels``, in metres, space for all frontiers, and none too narrow."""
+    # The camera counts in cells. On other cells its lengths are scaled, so that the picture shows the same metres.
     scale, camera = LEARNED_RESOLUTION / resolution, CameraConfig()
     lengths = {name: getattr(camera, name) * scale for name in ("far", "eye_height", "wall_height", "texture_reach")}
     frontiers = {"max_subgoals": MANY_SLIVERS, **NARROW_DOORS["decision"]["frontiers"]}
@@ -156,12 +160,15 @@ def _floor(
     numbers = np.where(clean.free, _HALLWAY, NO_ROOM).astype(np.int32)
     used, left_out = ["hallway"], []
     for name, parts in regions.items():
+        # What an earlier room has taken is no hallway any more, and stays with it.
         covered = np.any([part.covers(clean.free, clean.frame) for part in parts], axis=0) & (numbers == _HALLWAY)
         if np.count_nonzero(covered) * clean.frame.resolution**2 < LEAST_ROOM:
             left_out.append(name)
         else:
             numbers[covered] = len(used)
             used.append(name)
+    # A map does not say what a room is for; without colours (see the class) it does not matter.
     kinds = (Kind.HALLWAY,) + (Kind.OTHER,) * (len(used) - 1)
+    # Where rooms end is not drawn as a door: the map's own walls and openings are.
     doors = np.zeros(numbers.shape, bool)
     return tuple(used), tuple(left_out), Floor(numbers, doors, kinds, clean.frame.resolution)

@@ -48,14 +48,17 @@ class Disc:
     def covers(self, free: Bool[np.ndarray, "H W"], frame: GridFrame) -> Bool[np.ndarray, "H W"]:
         """Free cells of the disc that are connected within it to its point, or to the free cell nearest to that."""
         distance = _distances(self.centre, frame)
+        # Distances are in cells, and exact where both the point and the resolution are round.
         near = distance <= self.radius / frame.resolution
         own = frame.metres_to_cell(*self.centre)
+        # A small radius may reach no centre of a cell at all; the point's own cell counts whatever the radius is.
         if frame.contains(*own):
             near[own] = True
             distance[own] = 0.0
         near &= free
         if not near.any():
             return near
+        # Of the pieces that walls leave of the disc only that of the point, so that nobody is met through a wall.
         labels = component_labels(near)
         return labels == labels.flat[np.argmin(np.where(near, distance, np.inf))]
 
@@ -118,6 +121,7 @@ def load_places(file: Path | str) -> Places:
     _check_known(file, "", fields, ("propositions", "start", "tasks"))
     start = None
     if "start" in fields:
+        # Whether it is free can be said of a grid only.
         start = _point(file, "start", fields["start"])
     return Places(
         _propositions(file, fields.get("propositions")), start, _tasks(file, fields.get("tasks", {})), str(file)
@@ -138,6 +142,7 @@ def load_regions(file: Path | str, names: Sequence[str]) -> dict[str, dict[str, 
 
 def save_places(places: Places, file: Path) -> None:
     """Write what `load_places` reads back as the same propositions, start and tasks. Raises OSError."""
+    # The order of the propositions is that of the letters' bits, and is kept (``sort_keys``).
     fields: dict[str, Any] = {
         "propositions": {name: [_region_fields(region) for region in regions] for name, regions in places.propositions}
     }
@@ -164,6 +169,11 @@ def check_points(places: Places, reachable: Bool[np.ndarray, "H W"], frame: Grid
     A disc whose point lies in a wall still covers what is near on one side of it (`Disc.covers`), perhaps not the side
     that was meant.
 
+    Args:
+        places: whose discs are checked; polygons have no point.
+        reachable: True on cells that the robot can reach.
+        frame: metres to cells.
+
     Raises:
         MapError: one does not; the nearest cell that can be reached is named.
     """
@@ -185,17 +195,27 @@ def check_points(places: Places, reachable: Bool[np.ndarray, "H W"], frame: Grid
 def place_letters(places: Places, reachable: Bool[np.ndarray, "H W"], frame: GridFrame) -> Int32[np.ndarray, "H W"]:
     """Letter of every cell; bit i is proposition i.
 
+    Args:
+        places: the propositions and their regions, in metres.
+        reachable: True on cells that the robot can reach; only these carry propositions.
+        frame: metres to cells.
+
+    Returns:
+        The letters, 0 where nothing holds.
+
     Raises:
         MapError: a region lies outside of the map, or covers no cell that the robot can reach.
     """
     letters = np.zeros(reachable.shape, dtype=np.int32)
     for bit, (name, regions) in enumerate(places.propositions):
         for region in regions:
+            # A region that covers nothing would make its proposition silently impossible.
             covered = region.covers(reachable, frame)
             if not covered.any():
                 raise MapError(
                     places.source, f"propositions: {name}", f"{region} {_why_nowhere(region, reachable, frame)}"
                 )
+            # Regions of two propositions may overlap: the cell's letter has both bits.
             letters[covered] |= 1 << bit
     return letters
 
@@ -211,7 +231,17 @@ def component_labels(free: Bool[np.ndarray, "H W"]) -> Int32[np.ndarray, "H W"]:
 
 
 def nearest_free(point: Point, free: Bool[np.ndarray, "H W"], frame: GridFrame) -> Point:
-    """Centre of the free cell nearest to a point, in metres."""
+    """The free cell nearest to a point.
+
+    Args:
+        point: metres (x, y).
+        free: True on free cells; at least one is.
+        frame: metres to cells.
+
+    Returns:
+        The cell's centre, metres (x, y). Of cells at the same distance the first in row-major order.
+    """
+    # Everything that is not free is infinitely far away.
     row, col = np.unravel_index(np.argmin(np.where(free, _distances(point, frame), np.inf)), free.shape)
     return frame.cell_to_metres(int(row), int(col))
 
@@ -219,6 +249,7 @@ def nearest_free(point: Point, free: Bool[np.ndarray, "H W"], frame: GridFrame) 
 def _why_nowhere(region: Region, reachable: Bool[np.ndarray, "H W"], frame: GridFrame) -> str:
     points = np.array([region.centre] if isinstance(region, Disc) else region.vertices)
     centre = (float(points[:, 0].mean()), float(points[:, 1].mean()))
+    # On a map without walls: tells a region beyond the map from one inside of a wall.
     everywhere = region.covers(np.ones_like(reachable), frame)
     what = "covers no cell that the robot can reach" if everywhere.any() else "lies outside of the map's reachable part"
     return f"{what}; the nearest cell it can reach is at {_text(nearest_free(centre, reachable, frame))}"
@@ -258,6 +289,7 @@ def _regions(file: Path, field: str, value: Any) -> tuple[Region, ...]:
 
 
 def _region(file: Path, field: str, value: Any) -> Region:
+    # The keys tell what it is; one too many or too few is neither.
     if isinstance(value, dict) and set(value) == {"point", "radius"}:
         radius = float(parse_number(file, f"{field}: radius", value["radius"]))
         if radius < 0:

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32
 from scipy import ndimage
 
+from potlp_jax.environments.ros.cleaning import CleanMap
 from potlp_jax.environments.ros.map_files import GridFrame, OccupancyMap
 from potlp_jax.environments.ros.places import Point, component_labels
-from potlp_jax.environments.ros.ros_map import CleanMap
 
 WIDEST = 1.5
 """Metres from which on a way from one part of a building to another is no passage but open space."""
@@ -67,10 +67,14 @@ class MapSurvey:
 
 
 def survey_map(image_map: OccupancyMap, clean: CleanMap) -> MapSurvey:
-    """Look a map over; ``clean`` says which passages are open."""
+    """Look a map over.
+
+    ``clean`` says which passages a robot gets through on the cells that it plans with.
+    """
     free, frame = image_map.free, image_map.frame
     labels = component_labels(free)
     areas = np.bincount(labels.ravel())[1:] * frame.resolution**2
+    # Passages are looked for in the largest component alone: others are not part of the building that is planned in.
     largest = labels == 1 + np.argmax(areas)
     rows, cols = (slice(int(found.min()), int(found.max()) + 1) for found in np.nonzero(largest))
     window = frame.window(rows.start, cols.start, rows.stop - rows.start, cols.stop - cols.start)
@@ -95,6 +99,7 @@ def _loose_obstacles(image_map: OccupancyMap) -> int:
 
 def _open_edge(part: Bool[np.ndarray, "H W"], occupied: Bool[np.ndarray, "H W"]) -> int:
     """Sides of pixels between the part and what is neither in it nor an obstacle; beyond the image is neither."""
+    # Padded, so that what rolls over the edge of the image is neither.
     inside, unknown = np.pad(part, 1), ~np.pad(part | occupied, 1)
     return sum(int(np.sum(inside & np.roll(unknown, shift, axis))) for axis in (0, 1) for shift in (-1, 1))
 
@@ -102,10 +107,21 @@ def _open_edge(part: Bool[np.ndarray, "H W"], occupied: Bool[np.ndarray, "H W"])
 def find_passages(
     part: Bool[np.ndarray, "H W"], frame: GridFrame, clean: CleanMap, widest: float = WIDEST, area: float = PART_AREA
 ) -> tuple[Passage, ...]:
-    """Where parts of the free space of ``area`` or more are joined by less than ``widest``, narrowest first.
+    """Where large parts of the free space are joined by little.
 
     The space is filled from its widest places on, a pixel of width at a time; where two parts meet is a passage.
+
+    Args:
+        part: True on the free pixels of one connected part.
+        frame: metres to pixels.
+        clean: the grid that a robot plans with; says which passages are open on it.
+        widest: metres from which on a narrowing is no passage.
+        area: square metres that there must be on either side.
+
+    Returns:
+        The passages, narrowest first.
     """
+    # From each pixel's centre to that of the nearest obstacle; beyond the image all are obstacles.
     clearance = np.asarray(ndimage.distance_transform_edt(np.pad(part, 1)))[1:-1, 1:-1]
     kept = _kept_pixels(clean, frame)
     smallest = area / frame.resolution**2
@@ -117,12 +133,14 @@ def find_passages(
         labels = component_labels(wide)
         for meeting in _meetings(parts, labels, smallest, (width + 2) / 2):
             passages += _passages_between(meeting, parts, labels, clearance, kept, frame, width)
+        # Only parts with enough wide space are followed: the rest is clutter, and there are thousands of it.
         parts = np.where((np.bincount(labels.ravel()) >= WIDE_SHARE * smallest)[labels], labels, 0)
     return tuple(sorted(passages, key=lambda passage: (passage.width, -passage.area)))
 
 
 def _kept_pixels(clean: CleanMap, frame: GridFrame) -> Bool[np.ndarray, "H W"]:
     """The pixels at the centres of the cells that the robot can reach."""
+    # The lower left corner of the cleaned grid, in pixels of this one; both have the same axes.
     corner = frame.to_grid(np.array([[clean.frame.x, clean.frame.y]]))[0]
     cells = np.argwhere(clean.free)
     steps = np.stack([cells[:, 1], clean.frame.height - 1 - cells[:, 0]], axis=1) + 0.5
@@ -140,6 +158,7 @@ def _meetings(
 
     Parts count as ``smallest`` pixels or more if they do with all that is nearer than ``reach`` to them.
     """
+    # ``parts`` are those of the level before, ``labels`` the components of this one, which is wider by a pixel.
     sizes = np.bincount(parts.ravel())
     component = np.zeros(len(sizes), np.int32)
     # Any pixel will do: a part lies in one component as a whole, for every level holds the one before.
@@ -159,8 +178,10 @@ def _meetings(
 
 def _grown(parts: Int32[np.ndarray, "H W"], number: int, boxes: list[tuple[slice, slice] | None], reach: float) -> int:
     """Pixels nearer than ``reach`` to a part. All are free where no obstacle is nearer than that to the part."""
+    # Only the surroundings of the part are looked at: a transform of the whole map for each part would take minutes.
     box = boxes[number - 1]
     assert box is not None, "a part has pixels"
+    # Nothing unknown beside it: an obstacle on the edge of what was mapped may be the beginning of a wall.
     around = np.pad(parts[box] == number, math.ceil(reach))
     return int(np.sum(np.asarray(ndimage.distance_transform_edt(~around)) < reach))
 
@@ -175,18 +196,21 @@ def _passages_between(
     width: int,
 ) -> list[Passage]:
     """The passage from each part of a meeting, but for the largest, to the rest."""
+    # Everything happens in the window around the component in which the parts meet.
     component = labels == labels[parts == meeting[0]][0]
     rows, cols = (slice(int(np.min(index)), int(np.max(index)) + 1) for index in np.nonzero(component))
     component, members = component[rows, cols], parts[rows, cols] * np.isin(parts[rows, cols], meeting)
     nearest = np.asarray(ndimage.distance_transform_edt(members == 0, return_distances=False, return_indices=True))
+    # Each pixel goes to the nearest part. Where owners change the parts meet; the widest pixel there is the passage.
     owner = np.where(component, members[tuple(nearest)], 0)
     border = np.flatnonzero(_borders(owner))
-    border_owner, room = owner.flat[border], clearance[rows, cols].flat[border]
+    border_owner, space = owner.flat[border], clearance[rows, cols].flat[border]
+    # A part that has no pixel of the cleaned grid, or all of them, is separated from the rest on it.
     reached, boxes = np.bincount(owner[kept[rows, cols]], minlength=owner.max() + 1), ndimage.find_objects(owner)
     reached[0] = 0
     found = []
     for number in meeting[1:]:
-        narrow = border[border_owner == number][np.argmax(room[border_owner == number])]
+        narrow = border[border_owner == number][np.argmax(space[border_owner == number])]
         row, col = np.unravel_index(narrow, owner.shape)
         found.append(
             Passage(

@@ -13,13 +13,15 @@ from potlp_jax.world.moves import LENGTHS, NEIGHBOURS, sides_free
 class KnownPath:
     """The beginning of a shortest path through known space.
 
-    ``cells[i]`` and ``states[i]`` for ``i <= length`` are the product states after ``i`` moves, the source included;
-    later entries repeat the last one. ``length`` counts the moves held here, at most K; ``cost`` is that of the whole
-    path to its target, ``inf`` (and ``length`` 0) where the target is out of reach.
+    Attributes:
+        cells, states: the product state after ``i`` moves, the source first; entries beyond ``length`` repeat the last
+            one.
+        length: moves held here, at most the horizon.
+        cost: cost of the whole path to its target, ``inf`` (and ``length`` 0) where the target is out of reach.
     """
 
-    cells: Int32[Array, "*batch K1 2"]
-    states: Int32[Array, "*batch K1"]
+    cells: Int32[Array, "*batch horizon1 2"]
+    states: Int32[Array, "*batch horizon1"]
     length: Int32[Array, "*batch"]
     cost: Float32[Array, "*batch"]
 
@@ -37,22 +39,36 @@ def shortest_path(
     resolution: Float32[Array, ""],
     wildcard: Wildcard | None = None,
 ) -> KnownPath:
-    """First ``horizon`` moves of a shortest path, walked back from the target along ``distances`` from the source.
+    """First moves of a shortest path, walked back from the target along known distances.
 
     Ties between predecessors break by the order of ``NEIGHBOURS``, then by the lowest state.
+
+    Args:
+        distances: costs from the source to every product state, as ``product_distances`` gives them.
+        transitions: the product that they were solved in.
+        free: True where there is no obstacle.
+        source_cell, source_state: where the path begins.
+        target_cell, target_state: where it ends.
+        horizon: moves to keep, counted from the source; static.
+        resolution: length of a cell's side in the unit of cost.
+        wildcard: as in ``product_distances``.
+
+    Returns:
+        The path, padded to ``horizon + 1`` product states.
     """
     cost = distances[target_cell[0], target_cell[1], target_state]
     reachable = jnp.isfinite(cost)
     predecessor = _Predecessor(distances, transitions, free, resolution, wildcard)
     ring = horizon + 1
 
-    # The ring keeps the last entries written, which are those nearest the source.
+    # Walking back begins at the far end, and how long the path is shows only at the source. A ring buffer of ``horizon
+    # + 1`` entries keeps those written last, which are those nearest the source, in memory that the horizon bounds.
     def walk(carry):
         count, cell, state, cells, states = carry
         cell, state = predecessor(cell, state)
         count = count + 1
-        slot = count % ring
-        return count, cell, state, cells.at[slot].set(cell), states.at[slot].set(state)
+        entry = count % ring
+        return count, cell, state, cells.at[entry].set(cell), states.at[entry].set(state)
 
     def unfinished(carry):
         _, cell, state, _, _ = carry
@@ -62,13 +78,18 @@ def shortest_path(
     states = jnp.broadcast_to(jnp.where(reachable, target_state, source_state)[None], (ring,))
     start = (jnp.int32(0), target_cell, target_state, cells, states)
     count, _, _, cells, states = jax.lax.while_loop(unfinished, walk, start)
+    # The source was written last, at ``count``; the path's i-th product state i writes before it.
     length = jnp.minimum(count, horizon)
     order = (count - jnp.minimum(jnp.arange(ring, dtype=jnp.int32), length)) % ring
     return KnownPath(cells=cells[order], states=states[order], length=length, cost=cost)
 
 
 class _Predecessor:
-    """Finds the product state from which a shortest path enters a given one."""
+    """Finds the product state from which a shortest path enters a given one.
+
+    It is the cheapest of all that lead there: costs are shortest, so no tolerance for rounding is needed, and the walk
+    ends at the source because every step lowers the cost.
+    """
 
     def __init__(
         self,
@@ -88,6 +109,7 @@ class _Predecessor:
 
     def __call__(self, cell: Int32[Array, "2"], state: Int32[Array, ""]) -> tuple[Int32[Array, "2"], Int32[Array, ""]]:
         states = self.transitions.shape[2]
+        # Entering the cell reads its letter, so the states before are those whose transition there is ``state``.
         leads = self.transitions[cell[0], cell[1]] == state
         if self.wildcard is not None:
             chosen = self.wildcard.successors[:, state] | (jnp.arange(states) == state)
@@ -95,5 +117,6 @@ class _Predecessor:
         neighbours = cell[None, :] + self.offsets + 1
         cost = self.distances[neighbours[:, 0], neighbours[:, 1]] + self.steps[:, None]
         cost = jnp.where(sides_free(self.free, cell)[:, None] & leads[None, :], cost, jnp.inf)
+        # The first of equal minima: neighbours in their order, then states.
         best = jnp.argmin(cost.reshape(-1)).astype(jnp.int32)
         return neighbours[best // states] - 1, best % states

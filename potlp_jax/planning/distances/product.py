@@ -3,11 +3,13 @@
 Product states are ``(cell, z)``. Grid moves are 8-connected, cost 1 and √2 times the resolution and never cut a corner:
 a diagonal move needs both cells beside it free. Entering a cell in state ``z`` leads to ``transitions[cell, z]``.
 
-Distances are solved by frontal ``sweeps``. A table of costs between a few cells needs no sweep per state where few
-cells carry letters that matter: see ``portals``.
+Whole grids of distances are solved by frontal sweeps (``sweeping``). A table of costs between a few cells needs no
+sweep per state where few cells carry letters that matter (``portals``): the table of a fire-fighting decision takes 3
+to 5 ms instead of 20 to 25 (docs/results/planner.md).
 """
 
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +22,8 @@ from potlp_jax.task.relations import transitive_closure
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_STATE
 
-LANES: int = 8
-"""Sources solved at a time: enough to fill vector units, few enough for a layer of costs to stay in cache."""
+SOURCES_AT_ONCE: int = 8
+"""Sources solved side by side: enough to fill vector units, few enough for a layer of costs to stay in cache."""
 
 
 def product_transitions(
@@ -29,8 +31,14 @@ def product_transitions(
 ) -> Int32[Array, "H W Z"]:
     """State of the automaton after entering each cell from each state.
 
-    ``NO_STATE`` where the cell is not ``known_free`` (True = may be entered) or the letter leads to a trap state:
-    such moves do not exist in the product (docs/model.md section 2).
+    Args:
+        task: arrays of one task.
+        letters: the letter of each cell.
+        known_free: True on cells that may be entered.
+
+    Returns:
+        The next state; ``NO_STATE`` where the cell may not be entered or its letter leads to a trap: such moves do not
+        exist in the product (docs/model.md section 2).
     """
     following = jnp.moveaxis(task.transitions[:, letters], 0, -1)
     allowed = known_free[:, :, None] & ~task.trap[following] & task.state_mask[None, None, :]
@@ -40,6 +48,7 @@ def product_transitions(
 def one_letter_successors(task: TaskArrays) -> Bool[Array, "Z Z"]:
     """Which states follow which by some letter, traps excluded; every live state also keeps itself."""
     states = task.transitions.shape[0]
+    # Every letter counts, also one that no cell of this map has: the optimistic policy lets unknown cells hold any.
     reached = jnp.any(task.transitions[:, :, None] == jnp.arange(states)[None, None, :], axis=1)
     live = task.state_mask & ~task.trap
     return (reached | jnp.eye(states, dtype=bool)) & live[None, :] & live[:, None]
@@ -58,10 +67,18 @@ def product_distances(
     resolution: Float32[Array, ""],
     wildcard: Wildcard | None = None,
 ) -> Float32[Array, "Q H W Z"]:
-    """Shortest cost from each source ``(cell, state)`` to every cell in every state, ``inf`` where there is no path.
+    """Shortest cost from each source to every cell in every state.
 
-    The source's own letter counts as read. ``free`` (True = no obstacle) decides about cutting corners only; what may
-    be entered is in ``transitions``. A source whose state is ``NO_STATE`` reaches nothing.
+    Args:
+        transitions: state after entering each cell from each state, as ``product_transitions`` gives it.
+        free: True where there is no obstacle. It decides about cutting corners only.
+        source_cells: rows and columns of the sources.
+        source_states: states at the sources, their cells' letters read; a source in ``NO_STATE`` reaches nothing.
+        resolution: length of a cell's side in the unit of cost.
+        wildcard: cells whose letter may be any (the optimistic policy's unknown cells); default: none.
+
+    Returns:
+        Costs by source, cell and state; ``inf`` where there is no path.
     """
     return _product_distances(transitions, free, source_cells, source_states, jnp.asarray(resolution), wildcard)
 
@@ -69,7 +86,14 @@ def product_distances(
 # Under vmap the maps are solved one after the other: a batched loop goes on until its slowest row is done, and works on
 # arrays that no cache holds.
 @sequential_vmap
-def _product_distances(transitions, free, source_cells, source_states, resolution, wildcard):
+def _product_distances(
+    transitions: Int32[Array, "H W Z"],
+    free: Bool[Array, "H W"],
+    source_cells: Int32[Array, "Q 2"],
+    source_states: Int32[Array, " Q"],
+    resolution: Float32[Array, ""],
+    wildcard: Wildcard | None,
+) -> Float32[Array, "Q H W Z"]:
     sweeper = Sweeper(_layers_first(transitions), free, wildcard)
     solved = _map_sources(sweeper.solve, source_cells, source_states)
     return jnp.transpose(solved, (3, 1, 2, 0)) * resolution
@@ -84,10 +108,23 @@ def distance_table(
     target_cells: Int32[Array, "T 2"],
     resolution: Float32[Array, ""],
 ) -> tuple[Float32[Array, "Q T Z"], Float32[Array, " Q"]]:
-    """Costs from each source to each target cell in each state, and to acceptance anywhere; ``inf`` unreachable.
+    """Costs from each source to each target, and to acceptance anywhere.
 
     The same distances as ``product_distances``, up to rounding, without its grids. Where few cells carry letters that
-    matter, they are found by way of those cells (``portals``), elsewhere by sweeps.
+    matter, they are found through those cells (``portals``), elsewhere by sweeps.
+
+    Args:
+        transitions: state after entering each cell from each state, as ``product_transitions`` gives it.
+        free: True where there is no obstacle. It decides about cutting corners only.
+        accepting: True on states in which the task is satisfied.
+        source_cells: rows and columns of the sources.
+        source_states: states at the sources, their cells' letters read; a source in ``NO_STATE`` reaches nothing.
+        target_cells: rows and columns of the targets.
+        resolution: length of a cell's side in the unit of cost.
+
+    Returns:
+        Costs by source, target and state at the target, and by source the cost of the nearest accepting product state;
+        ``inf`` where there is no path.
     """
     return _distance_table(
         transitions, free, accepting, source_cells, source_states, target_cells, jnp.asarray(resolution)
@@ -95,7 +132,15 @@ def distance_table(
 
 
 @sequential_vmap
-def _distance_table(transitions, free, accepting, source_cells, source_states, target_cells, resolution):
+def _distance_table(
+    transitions: Int32[Array, "H W Z"],
+    free: Bool[Array, "H W"],
+    accepting: Bool[Array, " Z"],
+    source_cells: Int32[Array, "Q 2"],
+    source_states: Int32[Array, " Q"],
+    target_cells: Int32[Array, "T 2"],
+    resolution: Float32[Array, ""],
+) -> tuple[Float32[Array, "Q T Z"], Float32[Array, " Q"]]:
     active = find_active_cells(transitions)
 
     def by_portals():
@@ -105,17 +150,27 @@ def _distance_table(transitions, free, accepting, source_cells, source_states, t
     def by_sweeps():
         return _table_by_sweeps(transitions, free, accepting, source_cells, source_states, target_cells)
 
+    # Decided on the device, because which cells are active depends on what has been observed. Outside of vmap ``cond``
+    # runs one branch only, and ``sequential_vmap`` keeps it so.
     pays = portals_pay(transitions, active, source_cells, source_states)
     travel, finish = jax.lax.cond(pays, by_portals, by_sweeps)
     return travel * resolution, finish * resolution
 
 
-def _table_by_sweeps(transitions, free, accepting, source_cells, source_states, target_cells):
+def _table_by_sweeps(
+    transitions: Int32[Array, "H W Z"],
+    free: Bool[Array, "H W"],
+    accepting: Bool[Array, " Z"],
+    source_cells: Int32[Array, "Q 2"],
+    source_states: Int32[Array, " Q"],
+    target_cells: Int32[Array, "T 2"],
+) -> tuple[Float32[Array, "Q T Z"], Float32[Array, " Q"]]:
     """``distance_table`` in cells, from the grids of all sources."""
     sweeper = Sweeper(_layers_first(transitions), free, None)
     rows, columns = target_cells[:, 0], target_cells[:, 1]
 
-    def solve(cells, states):
+    # Each group of sources is reduced to its entries of the table at once: the grids of all would not fit the cache.
+    def solve(cells: Int32[Array, "Q 2"], states: Int32[Array, " Q"]) -> Float32[Array, "N Q"]:
         cost = sweeper.solve(cells, states)
         finish = jnp.min(jnp.where(accepting[:, None, None, None], cost, jnp.inf), axis=(0, 1, 2))
         return jnp.concatenate([cost[:, rows, columns].reshape(-1, cells.shape[0]), finish[None]])
@@ -128,46 +183,74 @@ def _table_by_sweeps(transitions, free, accepting, source_cells, source_states, 
 def _neutral_arrivals(
     neutral: Bool[Array, "H W"],
     free: Bool[Array, "H W"],
-    keys: Int32[Array, "K 2"],
+    keys: Int32[Array, "keys 2"],
     count: Int32[Array, ""],
-    ends: Int32[Array, "N 2"],
-) -> Float32[Array, "K N"]:
-    """Cost in cells of entering each end from each of the first ``count`` keys over ``neutral`` cells, else ``inf``."""
+    ends: Int32[Array, "ends 2"],
+) -> Float32[Array, "keys ends"]:
+    """Cost in cells of entering each end from each of the first ``count`` keys over neutral cells; others ``inf``."""
+    # Neutral cells keep every state, so one automaton state stands for all.
     sweeper = Sweeper(jnp.where(neutral, 0, NO_STATE)[None, :, :, None], free, None)
-    lanes = min(LANES, keys.shape[0])
-    padded = jnp.pad(keys, ((0, -keys.shape[0] % lanes), (0, 0)))
+    size = min(SOURCES_AT_ONCE, keys.shape[0])
+    padded = jnp.pad(keys, ((0, -keys.shape[0] % size), (0, 0)))
     states = jnp.where(jnp.arange(padded.shape[0]) < count, 0, NO_STATE).astype(jnp.int32)
 
-    def solve(chunk, arrivals):
-        first = chunk * lanes
-        cells = jax.lax.dynamic_slice_in_dim(padded, first, lanes)
-        grid = sweeper.solve(cells, jax.lax.dynamic_slice_in_dim(states, first, lanes))[0]
+    def solve_chunk(chunk: Array, arrivals: Array) -> Array:
+        first = chunk * size
+        cells = jax.lax.dynamic_slice_in_dim(padded, first, size)
+        grid = sweeper.solve(cells, jax.lax.dynamic_slice_in_dim(states, first, size))[0]
+        # An end need not be neutral itself: what is wanted is the cost of standing beside it and moving in.
         return jax.lax.dynamic_update_slice(arrivals, sweeper.links.arrival_at(grid, ends).T, (first, 0))
 
     start = jnp.full((padded.shape[0], ends.shape[0]), jnp.inf, jnp.float32)
-    return jax.lax.fori_loop(0, -(-count // lanes), solve, start)[: keys.shape[0]]
+    return jax.lax.fori_loop(0, -(-count // size), solve_chunk, start)[: keys.shape[0]]
 
 
-def distances_by_lane(
+def distances_per_source(
     transitions: Int32[Array, "Z H W Q"],
     free: Bool[Array, "H W"],
     source_cells: Int32[Array, "Q 2"],
     source_states: Int32[Array, " Q"],
     resolution: Float32[Array, ""],
 ) -> Float32[Array, "Z H W Q"]:
-    """As ``product_distances``, with transitions of its own for every source and the sources in the minor axis."""
-    return _distances_by_lane(transitions, free, source_cells, source_states, jnp.asarray(resolution))
+    """As ``product_distances``, with transitions of its own for every source and the sources in the minor axis.
+
+    Args:
+        transitions: by state, cell and source, the state after entering the cell.
+        free: True where there is no obstacle. It decides about cutting corners only.
+        source_cells: rows and columns of the sources.
+        source_states: states at the sources; a source in ``NO_STATE`` reaches nothing.
+        resolution: length of a cell's side in the unit of cost.
+
+    Returns:
+        Costs by state, cell and source; ``inf`` where there is no path.
+    """
+    return _distances_per_source(transitions, free, source_cells, source_states, jnp.asarray(resolution))
 
 
 @sequential_vmap
-def _distances_by_lane(transitions, free, source_cells, source_states, resolution):
+def _distances_per_source(
+    transitions: Int32[Array, "Z H W Q"],
+    free: Bool[Array, "H W"],
+    source_cells: Int32[Array, "Q 2"],
+    source_states: Int32[Array, " Q"],
+    resolution: Float32[Array, ""],
+) -> Float32[Array, "Z H W Q"]:
     return Sweeper(transitions, free, None).solve(source_cells, source_states) * resolution
 
 
-def arrivals_by_lane(
+def arrivals_per_source(
     costs: Float32[Array, "Z H W Q"], free: Bool[Array, "H W"], resolution: Float32[Array, ""]
 ) -> Float32[Array, "Z H W Q"]:
-    """Cost of arriving in each cell by one move from the best neighbour, per state there, letters ignored."""
+    """Cost of arriving in each cell by one move from the best neighbour, per state there, letters ignored.
+
+    Args:
+        costs: costs by state, cell and source, as ``distances_per_source`` gives them.
+        free: True where there is no obstacle.
+        resolution: length of a cell's side in the unit of cost.
+
+    Returns:
+        Costs of the same shape; ``inf`` where no neighbour has been reached.
+    """
     links = Links(free)
     return jax.vmap(lambda layer: links.cheapest_arrival(layer / resolution) * resolution)(costs)
 
@@ -175,7 +258,17 @@ def arrivals_by_lane(
 def grid_distances(
     free: Bool[Array, "H W"], cell: Int32[Array, "2"], resolution: Float32[Array, ""]
 ) -> Float32[Array, "H W"]:
-    """Shortest cost from ``cell`` to every free cell, letters ignored; ``inf`` where unreachable."""
+    """Shortest cost from a cell to every free cell, letters ignored.
+
+    Args:
+        free: True on cells that may be entered.
+        cell: row and column of the source.
+        resolution: length of a cell's side in the unit of cost.
+
+    Returns:
+        Costs; ``inf`` where unreachable.
+    """
+    # A product with one state that every free cell keeps.
     transitions = jnp.where(free, 0, NO_STATE)[:, :, None]
     source = jnp.zeros((1,), jnp.int32)
     return product_distances(transitions, free, cell[None, :], source, resolution)[0, :, :, 0]
@@ -184,9 +277,17 @@ def grid_distances(
 def reachable_cells(
     free: Bool[Array, "H W"], cell: Int32[Array, "2"], within: Bool[Array, "H W"]
 ) -> Bool[Array, "H W"]:
-    """Free cells that can be reached from ``cell``, letters ignored; ``within`` are cells known to be among them.
+    """Free cells that can be reached from a cell, letters ignored.
 
-    Where no move leads out of ``within``, as where no letter forbids a way, nothing is solved.
+    Where no move leads out of ``within``, as where no letter forbids entering a cell, nothing is solved.
+
+    Args:
+        free: True on cells that may be entered.
+        cell: row and column of the source.
+        within: True on cells that are known to be reachable, such as those with a finite product distance.
+
+    Returns:
+        True on the cells that can be reached, the source among them.
     """
     within = within.at[cell[0], cell[1]].set(True)
     costs = jnp.where(within, 0.0, jnp.inf).astype(jnp.float32)[:, :, None]
@@ -197,32 +298,39 @@ def reachable_cells(
 
 
 def _layers_first(transitions: Int32[Array, "H W Z"]) -> Int32[Array, "Z H W 1"]:
+    """The layout of the sweeps: one layer per state, shared by all sources."""
     return jnp.moveaxis(transitions, -1, 0)[..., None]
 
 
-def _map_sources(solve, cells: Int32[Array, "Q 2"], states: Int32[Array, " Q"]) -> Array:
-    """Apply ``solve`` to ``LANES`` sources at a time; results carry the sources in the last axis.
+def _map_sources(
+    solve: Callable[[Int32[Array, "Q 2"], Int32[Array, " Q"]], Array],
+    cells: Int32[Array, "Q 2"],
+    states: Int32[Array, " Q"],
+) -> Array:
+    """Apply ``solve`` to ``SOURCES_AT_ONCE`` sources at a time; results carry the sources in the last axis.
 
     Real sources are gathered in front, so that empty ones cost nothing: they reach nothing, ``inf``.
     """
     count = cells.shape[0]
-    lanes = min(LANES, count)
-    if count == lanes:
+    size = min(SOURCES_AT_ONCE, count)
+    if count == size:
         return solve(cells, states)
-    missing = -count % lanes
+    missing = -count % size
+    # Stable, and undone at the end by its inverse: results are in the order of the sources.
     order = jnp.argsort(states == NO_STATE, stable=True)
     back = jnp.argsort(order)
     cells = jnp.pad(cells[order], ((0, missing), (0, 0)))
     states = jnp.pad(states[order], (0, missing), constant_values=NO_STATE)
     real = jnp.sum(states != NO_STATE, dtype=jnp.int32)
 
-    def solve_chunk(chunk, solved):
-        first = chunk * lanes
+    def solve_chunk(chunk: Array, solved: Array) -> Array:
+        first = chunk * size
         part = solve(
-            jax.lax.dynamic_slice_in_dim(cells, first, lanes), jax.lax.dynamic_slice_in_dim(states, first, lanes)
+            jax.lax.dynamic_slice_in_dim(cells, first, size), jax.lax.dynamic_slice_in_dim(states, first, size)
         )
         return jax.lax.dynamic_update_slice_in_dim(solved, part, first, axis=solved.ndim - 1)
 
-    one = jax.eval_shape(solve, cells[:lanes], states[:lanes])
+    # Chunks without a real source are not solved; their part of the result stays as it was filled.
+    one = jax.eval_shape(solve, cells[:size], states[:size])
     unreached = jnp.full((*one.shape[:-1], count + missing), jnp.inf, jnp.float32)
-    return jax.lax.fori_loop(0, -(-real // lanes), solve_chunk, unreached)[..., back]
+    return jax.lax.fori_loop(0, -(-real // size), solve_chunk, unreached)[..., back]

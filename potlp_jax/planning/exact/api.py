@@ -5,8 +5,8 @@ a time: open nodes have a lower bound from a relaxation; those that the policy w
 meet are expanded first. Where that policy meets no open node from any of the root's actions, the bounds are the
 optimum.
 
-The parts: ``rollouts`` (the rules), ``exact_knowledge`` (what can be known of one subgoal), ``exact_relaxation``
-(bounds of open nodes), ``exact_graph`` (nodes), ``exact_bounds`` (backing up), ``exact_search`` (what to expand next).
+The parts: ``rollouts`` (the rules), ``knowledge`` (what can be known of one subgoal), ``relaxation`` (bounds of open
+nodes), ``graph`` (nodes), ``bounds`` (backing up), ``exploration`` (what to expand next).
 
 References:
   Bradley et al., Learning and Planning for Temporally Extended Tasks in Unknown Environments, ICRA 2021, Eq. 3.
@@ -21,10 +21,10 @@ from jaxtyping import Float64
 
 from potlp_jax.errors import ProblemTooLargeError
 from potlp_jax.planning.exact.bounds import GraphBounds
+from potlp_jax.planning.exact.exploration import Exploration
 from potlp_jax.planning.exact.graph import Graph
 from potlp_jax.planning.exact.knowledge import Knowledge
 from potlp_jax.planning.exact.rollouts import Rollouts
-from potlp_jax.planning.exact.search import Search
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.types import NO_ACTION, Status
 
@@ -39,7 +39,7 @@ class ExactSolution:
       value: expected cost of the best action; 0 where the task is satisfied, the dead-end cost at a dead end.
       q_values: expected cost of each action, inf where it is not available.
       action: index of the best action (ties: lowest index), or ``NO_ACTION``.
-      states: nodes of the graph that were looked at.
+      states: nodes of the graph that were explored.
       status: ``ACCEPTING_ROOT``, ``DEAD_END`` or ``OK``.
       dead_end_part: what the cost of dead ends contributes to ``value`` under the best policy found.
     """
@@ -60,11 +60,11 @@ class Bounds:
       lower, upper: bounds on the value; equal up to rounding where ``exact``.
       q_lower, q_upper: bounds on the expected cost of each action, inf where it is not available.
       action: the action of least upper bound (ties: lowest index), or ``NO_ACTION``.
-      states: nodes of the graph that were looked at.
+      states: nodes of the graph that were explored.
       status: ``ACCEPTING_ROOT``, ``DEAD_END`` or ``OK``.
       exact: whether ``lower`` and ``upper`` are the optimum; bounds of other actions may still be loose.
       dead_end_part: what the cost of dead ends contributes under the policy that is best by the lower bounds, as far as
-        it was followed: exact where ``exact``, else from below.
+        it was followed: exact where ``exact``, otherwise from below.
     """
 
     lower: float
@@ -90,6 +90,9 @@ def solve_exact(problem: PlanningProblem, *, max_states: int = 3_000_000, second
       problem: the problem; ``problem.check()`` is called.
       max_states: nodes after which to give up (about 0.5 kB each).
       seconds: processor time after which to give up.
+
+    Returns:
+      The optimum.
 
     Raises:
       ProblemError: the problem is not valid.
@@ -117,6 +120,9 @@ def bound_exact(
       seconds: processor time after which to stop.
       tolerance: stop where ``gap`` is no larger; 0 asks for the optimum.
 
+    Returns:
+      The interval in which the optimum lies, and whether it is a point.
+
     Raises:
       ProblemError: the problem is not valid.
       ProblemTooLargeError: too many things can be known of one subgoal to begin with.
@@ -126,6 +132,7 @@ def bound_exact(
 
 def _explore(problem: PlanningProblem, max_states: int, seconds: float, tolerance: float | None) -> Bounds:
     """Bounds by search; without a tolerance until every action's bounds meet."""
+    # Processor time, not wall time: what is found must not depend on what else the machine does.
     problem.check()
     deadline = time.process_time() + seconds
     rollouts = Rollouts(problem)
@@ -139,30 +146,37 @@ def _tighten(graph: Graph, max_states: int, deadline: float, tolerance: float | 
     """Expand until the bounds meet the tolerance (None: until they are the optimum), or a limit."""
     start = time.process_time()
     bounds = GraphBounds(graph)
-    search = Search(graph, bounds)
-    search.begin(max_states)
+    exploration = Exploration(graph, bounds)
+    exploration.begin(max_states)
     while True:
+        # Bounds are backed up in full before a decision is made on them: ``grow`` updates only what is new.
         bounds.back_up(np.arange(graph.expansions.count))
         lower, upper = bounds.of_actions()
-        flow = search.follow(np.where(np.isfinite(lower), 1.0, 0.0) if tolerance is None else _least(lower))
+        # Without a tolerance the Q of every action is wanted, so the policy is followed from all of them; otherwise
+        # only from the action that looks best.
+        flow = exploration.follow(np.where(np.isfinite(lower), 1.0, 0.0) if tolerance is None else _least(lower))
+        # A policy that meets no open node has a known cost, and it is the best by lower bounds: the optimum.
         exact = not flow.open.any()
         if not exact and tolerance is not None and lower.min() >= (1.0 - tolerance) * upper.min():
-            return _result(graph, search, lower, upper, False)
+            return _result(graph, exploration, lower, upper, False)
         if exact or graph.nodes.count > max_states or time.process_time() > deadline:
-            return _result(graph, search, lower, upper, exact)
+            return _result(graph, exploration, lower, upper, exact)
+        # In the last fifth of the budget nodes beside the policy are left alone: closing the policy tightens the bound.
         closing = graph.nodes.count > 0.8 * max_states or time.process_time() > start + 0.8 * (deadline - start)
-        search.grow(flow, max_states, deadline, closing)
+        exploration.grow(flow, max_states, deadline, closing)
 
 
-def _result(graph: Graph, search: Search, lower: np.ndarray, upper: np.ndarray, exact: bool) -> Bounds:
+def _result(graph: Graph, exploration: Exploration, lower: np.ndarray, upper: np.ndarray, exact: bool) -> Bounds:
     """What to report, from bounds on the Q of every action."""
     dead_end_cost, states = graph.tables.rollouts.dead_end_cost, graph.nodes.count
+    # No action is within reach, and finish is out of reach.
     if np.isinf(lower).all():
         return Bounds(
             dead_end_cost, dead_end_cost, lower, lower, NO_ACTION, states, Status.DEAD_END, True, dead_end_cost
         )
     best = _least(lower)
-    dead = search.follow(best).dead
+    dead = exploration.follow(best).dead
+    # The value of the best action is its lower bound. Those of others may still have a gap, which the caller is told.
     if exact:
         upper = np.where(best > 0, lower, upper)
     return Bounds(

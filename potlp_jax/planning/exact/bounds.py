@@ -27,6 +27,8 @@ class GraphBounds:
 
     def back_up(self, expansions: np.ndarray) -> None:
         """Bounds of expanded nodes from those of their children, last nodes first."""
+        # Children have larger ranks, except those that paths lead to, which may share a rank. Hence first the attempts
+        # of the whole group, which look at children of larger rank only, then its paths, which use those attempts.
         for group in self._graph.groups(expansions)[::-1]:
             for start in range(0, len(group), CHUNK):
                 self._back_up_attempts(group[start : start + CHUNK])
@@ -35,40 +37,44 @@ class GraphBounds:
 
     def of_actions(self) -> tuple[np.ndarray, np.ndarray]:
         """Bounds on the Q of every action."""
-        t, z = self._tables, int(self._nodes["state"][0])
-        lower = np.full(t.rollouts.finish_action + 1, np.inf)
-        lower[-1] = t.finish[-1, z]
+        tables, z = self._tables, int(self._nodes["state"][0])
+        # The last row of ``finish`` and ``travel`` is the robot's own cell; finish is the last action.
+        lower = np.full(tables.rollouts.finish_action + 1, np.inf)
+        lower[-1] = tables.finish[-1, z]
         upper = lower.copy()
         for action, s, k, expansion, path_cost in self._graph.root_actions():
-            below, above = self.attempts(np.array([expansion]))
+            below, above = self.attempt_bounds(np.array([expansion]))
             lower[action], upper[action] = path_cost + below[0, s, k], path_cost + above[0, s, k]
         return lower, upper
 
-    def attempts(self, expansions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def attempt_bounds(self, expansions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Bounds on the cost of every attempt from its subgoal on, ``[N, S, K]``; inf where it is not available."""
-        t, nodes = self._tables, self._expansions["node"][expansions]
-        q, state = self._nodes["q"][nodes], self._nodes["state"][nodes]
-        here = np.arange(q.shape[1])[None]
-        chance, success_cost = t.probability[here, q], t.success_cost[here, q]
-        failure_cost = t.failure_cost[here, state[:, None]]
+        tables, nodes = self._tables, self._expansions["node"][expansions]
+        rows, state = self._nodes["rows"][nodes], self._nodes["state"][nodes]
+        here = np.arange(rows.shape[1])[None]
+        chance, success_cost = tables.probability[here, rows], tables.success_cost[here, rows]
+        failure_cost = tables.failure_cost[here, state[:, None]]
         success, failure = self._expansions["success"][expansions], self._expansions["failure"][expansions]
+        # Eq. 3 from the subgoal on: the path to it is not part of a node.
         possible = success != NOWHERE
         bounds = []
         for after_success, after_failure in zip(
-            self._arrive(success, success_cost),
-            self._arrive(failure, np.broadcast_to(failure_cost, success.shape)),
+            self._arrival_bounds(success, success_cost),
+            self._arrival_bounds(failure, np.broadcast_to(failure_cost, success.shape)),
             strict=True,
         ):
             cost = chance * (success_cost + after_success) + (1.0 - chance) * (failure_cost + after_failure)
             bounds.append(np.where(possible, cost, np.inf))
         return bounds[0], bounds[1]
 
-    def _arrive(self, children: np.ndarray, pending_cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _arrival_bounds(self, children: np.ndarray, pending_cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Bounds on the value of histories ``[N, S, K]`` that end at node ``children`` beyond subgoal s."""
+        # ``ACCEPTED`` and ``NOWHERE`` are negative; they read node 0 and are replaced at the end.
         n, s = np.maximum(children, 0), np.arange(children.shape[1])[None, :, None]
         lower = np.minimum(pending_cost + self._nodes["leave_lower"][n, s], self._nodes["attempt_lower"][n, s])
         upper = np.minimum(pending_cost + self._nodes["leave_upper"][n, s], self._nodes["attempt_upper"][n, s])
         upper = np.minimum(upper, self._nodes["ceiling"][n])
+        # Nothing to do: a dead end. Where the relaxation cannot exclude one, the bound is no larger than its cost.
         nothing = np.isinf(lower)
         lower = np.where(nothing | (self._nodes["may_be_dead"][n] & (lower > self._dead_end)), self._dead_end, lower)
         upper = np.where(nothing, self._dead_end, upper)
@@ -76,25 +82,29 @@ class GraphBounds:
         return np.where(real, lower, 0.0), np.where(real, upper, 0.0)
 
     def _back_up_attempts(self, expansions: np.ndarray) -> None:
+        """Value of trying on beyond each subgoal, where nothing is paid before: the best edge there."""
         nodes = self._expansions["node"][expansions]
-        lower, upper = self.attempts(expansions)
+        lower, upper = self.attempt_bounds(expansions)
         self._expansions["best_edge"][expansions] = lower.argmin(axis=2)
         self._nodes["attempt_lower"][nodes] = lower.min(axis=2)
         self._nodes["attempt_upper"][nodes] = upper.min(axis=2)
 
     def _back_up_paths(self, expansions: np.ndarray) -> None:
+        """Value of leaving from beyond each subgoal, less the pending cost."""
         states = self._nodes["state"][self._expansions["node"][expansions]]
         for z in np.unique(states):
             self._back_up_paths_from(int(z), expansions[states == z])
 
     def _back_up_paths_from(self, z: int, expansions: np.ndarray) -> None:
-        t, nodes = self._tables, self._expansions["node"][expansions]
-        subgoals = len(t.subgoals)
-        lower = np.broadcast_to(t.finish[:subgoals, z], (len(nodes), subgoals)).copy()
+        """``_back_up_paths`` of expansions in state z: finish, or the cheapest path to another attempt."""
+        tables, nodes = self._tables, self._expansions["node"][expansions]
+        subgoals = len(tables.subgoals)
+        lower = np.broadcast_to(tables.finish[:subgoals, z], (len(nodes), subgoals)).copy()
         upper = lower.copy()
         best = np.full((len(nodes), subgoals, 2), FINISH)
-        for other in t.travels_to[z] if subgoals else ():
-            path_cost = t.travel[:subgoals, z, :, other]
+        for other in tables.travels_to[z] if subgoals else ():
+            path_cost = tables.travel[:subgoals, z, :, other]
+            # The same subgoal in the same state is not left and entered again: that is trying on.
             if other == z:
                 path_cost = np.where(np.eye(subgoals, dtype=bool), np.inf, path_cost)
             link = self._expansions["link"][expansions, other]

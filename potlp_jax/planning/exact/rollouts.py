@@ -5,6 +5,8 @@ at one history at a time or tabulate what can be known beforehand.
 
 References:
   Bradley et al., Learning and Planning for Temporally Extended Tasks in Unknown Environments, ICRA 2021, section III.
+  Dowling and Gallier, Linear-time algorithms for testing the satisfiability of propositional Horn formulae, Journal of
+  Logic Programming 1984 (why unit propagation finds all that follows).
 """
 
 import math
@@ -61,6 +63,7 @@ class Rollouts:
         self.finish_action = problem.action_count - 1
         self.dead_end_cost = float(problem.dead_end_cost)
         self.accepting = (np.asarray(task.accepting) & np.asarray(task.state_mask)).tolist()
+        # Python floats in lists: looked up one at a time, numpy's scalars would be slower.
         self.travel = np.asarray(problem.travel, np.float64).tolist()
         self.finish = np.asarray(problem.finish, np.float64).tolist()
         self._estimates = [
@@ -80,6 +83,7 @@ class Rollouts:
 
     def root(self) -> Position:
         """At the robot, nothing known."""
+        # Location S is the robot's own cell, from which no attempt is made.
         knowledge = (SubgoalKnowledge(0, 0),) * self.subgoals
         visited = 1 << (self.subgoals * self.states + self._initial_state)
         return Position(self.subgoals, self._initial_state, knowledge, visited)
@@ -94,6 +98,7 @@ class Rollouts:
             return Terms(1.0, 0.0, 0.0, False)
         subgoal, _, _, condition = self.split(action)
         known = position.knowledge[subgoal]
+        # Few combinations occur, and each occurs in very many histories.
         key = (subgoal, condition, known)
         if key not in self._terms:
             self._terms[key] = self.combined(subgoal, condition, known)
@@ -125,6 +130,8 @@ class Rollouts:
                 if math.isinf(self.distance(position, action)):
                     continue
                 terms = self.terms(position, action)
+                # A certain success teaches nothing; where it leads to a product state that this stretch without news
+                # has visited, taking it would allow to go in circles (docs/model.md section 4).
                 leads_back = terms.certain and position.visited >> (subgoal * self.states + target) & 1
                 if terms.probability > 0 and not leads_back:
                     yield action
@@ -132,10 +139,20 @@ class Rollouts:
             yield self.finish_action
 
     def step(self, position: Position, action: int, success: bool) -> Position:
-        """The history after an available action other than finish."""
+        """The history after an available action other than finish.
+
+        Args:
+          position: the history before.
+          action: its index.
+          success: the outcome of the attempt.
+
+        Returns:
+          The history after it, beyond the action's subgoal.
+        """
         subgoal, source, target, condition = self.split(action)
         known = position.knowledge[subgoal]
         state = target if success else source
+        # Whatever is learnt starts a new stretch, in which everything may be visited again.
         here = 1 << (subgoal * self.states + state)
         if known.holds >> condition & 1:
             return position._replace(location=subgoal, state=state, visited=position.visited | here)
@@ -144,10 +161,20 @@ class Rollouts:
         return Position(subgoal, state, knowledge, here)
 
     def combined(self, subgoal: int, condition: int, known: SubgoalKnowledge) -> Terms:
-        """P_S, R_S, R_F of a condition from its cubes, tried in order of R_S (docs/model.md section 3)."""
+        """P_S, R_S, R_F of a condition from its cubes, tried in order of R_S (docs/model.md section 3).
+
+        Args:
+          subgoal: index of the subgoal.
+          condition: index of the condition.
+          known: what is known of the subgoal.
+
+        Returns:
+          What an attempt at the condition promises.
+        """
         probabilities, success_costs, failure_costs = (values[subgoal] for values in self._estimates)
         classes = self._classes[condition]
         certain = bool(known.holds >> condition & 1)
+        # The cheapest cube first: ``none_yet`` is the chance that no cube before has held.
         none_yet, weighted, possible = 1.0, 0.0, []
         for c in sorted(classes, key=lambda c: (success_costs[c], c)):
             failed, held = known.fails >> c & 1, known.holds >> c & 1
@@ -155,6 +182,7 @@ class Rollouts:
             weighted += none_yet * chance * success_costs[c]
             none_yet *= 1.0 - chance
             possible += [] if failed else [success_costs[c]]
+        # A success cost is wanted where the chance is 0 as well: knowledge may contradict the estimates.
         total = 1.0 - none_yet
         success_cost = weighted / total if total > 0 else min(possible, default=0.0)
         probability = 1.0 if certain else 0.0 if known.fails >> condition & 1 else total
@@ -162,16 +190,28 @@ class Rollouts:
 
 
 class Closure:
-    """Transitions of what is known about one subgoal, looked up once they have occurred."""
+    """What follows from the outcome of an attempt for what is known about its subgoal (docs/model.md section 4).
+
+    The rules are clauses with at most one negative literal each: that a condition holds or fails is passed on along
+    ``implies``, and a condition of several cubes holds only if one of its cubes does. Unit propagation over such
+    clauses finds all that follows. Results are kept, since few outcomes differ and each occurs often.
+    """
 
     def __init__(self, implies: np.ndarray, classes: np.ndarray, class_count: int) -> None:
+        """Masks of the rules.
+
+        Args:
+          implies: ``[M, M]``, True where the row's condition implies the column's.
+          classes: ``[M, K]``, cubes of each condition, then ``NO_CLASS``.
+          class_count: C; conditions from here on have several cubes.
+        """
         count = len(implies)
         self._forward = [_mask(implies[a]) for a in range(count)]
         self._backward = [_mask(implies[:, b]) for b in range(count)]
         self._compounds = [
             (m, sum(1 << int(c) for c in classes[m] if c != NO_CLASS))
             for m in range(class_count, count)
-            if implies[m, m]
+            if implies[m, m]  # padded conditions imply nothing, not even themselves
         ]
         self._known: dict[tuple[SubgoalKnowledge, int, bool], SubgoalKnowledge] = {}
 
@@ -181,13 +221,24 @@ class Closure:
         return bool(self._compounds)
 
     def add_outcome(self, known: SubgoalKnowledge, condition: int, success: bool) -> SubgoalKnowledge:
-        """What is known once the condition has held or failed."""
+        """What is known once the condition has held or failed.
+
+        Args:
+          known: what was known before; it leaves the condition open.
+          condition: of the attempt.
+          success: its outcome.
+
+        Returns:
+          What is known then, with all that follows.
+        """
         key = (known, condition, success)
         if key not in self._known:
             holds = known.holds | (self._forward[condition] if success else 0)
             fails = known.fails | (0 if success else self._backward[condition])
             if self._compounds:
                 fails = self._propagate(fails)
+                # Proof by refutation: x holds if its failing would make something fail that holds. Passing on what
+                # holds along ``implies`` alone would miss a condition of which a single cube remains.
                 refuting = (x for x, backward in enumerate(self._backward) if self._propagate(fails | backward) & holds)
                 holds = sum(1 << x for x in refuting)
             self._known[key] = SubgoalKnowledge(holds, fails)
@@ -205,4 +256,5 @@ class Closure:
 
 
 def _mask(flags: np.ndarray) -> int:
+    """Flags as the bits of one integer."""
     return sum(1 << int(i) for i in np.flatnonzero(flags))

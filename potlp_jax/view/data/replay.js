@@ -189,7 +189,7 @@ function mountReplay(root, data) {
     views.replaceChildren();
     if (!decision) return;
     const chosen = decision.actions.find((action) => action.chosen);
-    decision.looks.forEach((look, number) => {
+    decision.observations.forEach((look, number) => {
       const source = data.panoramas[look];
       if (!source) return;
       const figure = document.createElement("figure"), image = document.createElement("img"), text = document.createElement("figcaption");

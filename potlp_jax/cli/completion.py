@@ -1,0 +1,67 @@
+"""What the shell proposes for a word of a command line. Nothing here imports jax: TAB answers at once.
+
+Tasks, policies and splits repeat what `environments`, `planning.policies` and `environments.splits` define, because
+those import jax; ``tests/test_cli.py`` compares them.
+"""
+
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from potlp_jax.environments.families import GROUP, NAMED, PREFIXED
+from potlp_jax.plugins import entry_points
+
+TASKS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "toy": ("1", "2"),
+        "firefighting": ("1", "2", "3", "4"),
+        "delivery": ("1",),
+        "parcels": ("1", "2"),
+        "rooms": ("1", "2"),
+    }
+)
+"""Numbers of the tasks of the environments that need no file."""
+
+POLICIES = ("known-map", "baseline", "optimistic", "oracle", "potlp")
+SPLITS = ("calibration", "training", "validation", "test")
+
+
+def complete_environment(incomplete: str) -> list[str]:
+    """Names of environments, those that other installed packages declare among them."""
+    return _starting([*NAMED, *PREFIXED, *entry_points(GROUP)], incomplete)
+
+
+def complete_task(ctx: Any, incomplete: str) -> list[str]:
+    """Numbers of the tasks of the environment that stands before; of all environments where none does."""
+    # Typer hands over its context by the name `ctx`; what it passes is no `typer.Context`.
+    environment = ctx.params.get("environment")
+    known = TASKS.get(environment, ()) if environment else {task for tasks in TASKS.values() for task in tasks}
+    return _starting(sorted(known), incomplete)
+
+
+def complete_policy(incomplete: str) -> list[str]:
+    """Names of policies."""
+    return _starting(POLICIES, incomplete)
+
+
+def complete_policies(incomplete: str) -> list[str]:
+    """Names of policies after those that are there already, joined by commas."""
+    *before, last = incomplete.split(",")
+    return [",".join([*before, name]) for name in _starting(POLICIES, last) if name not in before]
+
+
+def complete_recipe(incomplete: str) -> list[str]:
+    """Shipped recipes."""
+    folder = Path(str(resources.files("potlp_jax.recipes"))) / "data"
+    return _starting([path.stem for path in sorted(folder.glob("*.yaml"))], incomplete)
+
+
+def complete_split(incomplete: str) -> list[str]:
+    """Names of splits."""
+    return _starting(SPLITS, incomplete)
+
+
+def _starting(words: Sequence[str], incomplete: str) -> list[str]:
+    return [word for word in words if word.startswith(incomplete)]

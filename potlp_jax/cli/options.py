@@ -1,0 +1,110 @@
+"""Options and arguments that several commands share, each written once."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from potlp_jax.cli.completion import (
+    complete_environment,
+    complete_policy,
+    complete_recipe,
+    complete_split,
+    complete_task,
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Write JSON, and nothing else, to stdout.")]
+OpenPage = Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")]
+
+# What runs.
+Environment = Annotated[
+    str,
+    typer.Argument(
+        metavar="ENV",
+        help="[cyan]toy[/cyan], [cyan]firefighting[/cyan], [cyan]delivery[/cyan], [cyan]rooms[/cyan], "
+        "[cyan]map:FILE.yaml[/cyan] (ROS map), [cyan]floorplan:FILE.xml[/cyan] (real floor plan, or a folder), or "
+        "[cyan]module:attribute[/cyan] of an environment of your own.",
+        autocompletion=complete_environment,
+    ),
+]
+TaskName = Annotated[
+    str,
+    typer.Option(
+        "--task",
+        "-t",
+        help="Number of one of the environment's tasks, a formula, or a .hoa file.",
+        autocompletion=complete_task,
+    ),
+]
+PolicyName = Annotated[
+    str | None,
+    typer.Option(
+        "--policy",
+        "-p",
+        help="potlp (the default where an estimator is shipped), known-map, baseline, optimistic, oracle, or "
+        "module:attribute of a policy of your own.",
+        show_default=False,
+        autocompletion=complete_policy,
+    ),
+]
+SplitName = Annotated[
+    str | None,
+    typer.Option(
+        "--split",
+        help="Which worlds to draw from: calibration, training, validation (the default) or test (all that floor plans "
+        "are for).",
+        show_default=False,
+        autocompletion=complete_split,
+    ),
+]
+WorldNumber = Annotated[int, typer.Option("--world", "-w", min=0, help="Number of the world in the split.")]
+Simulations = Annotated[
+    int | None, typer.Option("--simulations", min=1, help="Simulations per decision of policies that search.")
+]
+EstimatorName = Annotated[
+    str | None,
+    typer.Option(
+        "--estimator",
+        metavar="FILE|NAME",
+        help="What the policy potlp asks: a trained estimator's file, or module:attribute; default: the shipped one.",
+        show_default=False,
+    ),
+]
+CameraName = Annotated[
+    str | None,
+    typer.Option("--camera", metavar="NAME", help="module:attribute of a camera of your own.", show_default=False),
+]
+
+# Tasks without an environment.
+Formula = Annotated[
+    str,
+    typer.Argument(
+        metavar="FORMULA", help="A co-safe formula in Spot's syntax, the name of a shipped task, or a .hoa file."
+    ),
+]
+Propositions = Annotated[
+    str | None, typer.Option("--propositions", "-p", help="All propositions, in the order of a letter's bits: a,b.")
+]
+
+# What `potlp run` and `potlp sweep` wrote.
+TrialFile = Annotated[Path, typer.Argument(metavar="TRIAL", help="Folder or file that `potlp run --out` wrote.")]
+SweepFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a sweep, as --out named it.")]
+
+# What makes estimators.
+RecipeName = Annotated[
+    str | None,
+    typer.Option(
+        "--recipe",
+        "-r",
+        help="What makes an estimator: the name of a shipped recipe ([cyan]firefighting[/cyan], [cyan]delivery[/cyan], "
+        "[cyan]parcels[/cyan]) or a file of your own.",
+        autocompletion=complete_recipe,
+    ),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="NAME=VALUE", help="Change a setting, such as training.patience=10; may be repeated."
+    ),
+]
+Processes = Annotated[int, typer.Option("--processes", min=1, help="Collect in so many processes, each on a core.")]

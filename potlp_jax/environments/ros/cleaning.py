@@ -1,0 +1,242 @@
+"""From a raw ROS map to a grid on which a robot can move.
+
+A raw map does not describe a closed building: pixels are free that no robot reached, and free space touches unknown
+space without a wall between. `clean_map` therefore
+
+1. takes what is unknown, and all beyond the image, for an obstacle;
+2. inflates obstacles by the robot's radius (between centres of pixels);
+3. resamples to the working resolution: a cell is an obstacle if it shares area with any obstacle pixel, so that no wall
+   is lost, however thin; a passage of width w keeps at least ``floor((w - 2 radius) / resolution) - 1`` free cells;
+4. keeps what is connected with the start (8-connected without corner cutting, which is the same as 4-connected), or the
+   largest such component;
+5. crops to it, with a ring of obstacles around.
+
+Steps 2 and 3 can close a doorway. What a robot of this radius can reach on the map's own pixels but not on the grid is
+named: in ``CleanMap.cut_off``, and by a warning where a world is made of the map.
+"""
+
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Int, Shaped
+from scipy import ndimage
+
+from potlp_jax.environments.ros.map_files import GridFrame, OccupancyMap
+from potlp_jax.environments.ros.places import Point, component_labels, nearest_free
+from potlp_jax.errors import MapError
+
+CUT_OFF_AREA = 2.0
+"""Square metres of free cells from which on a part that is cut off counts as a room, not as a niche."""
+
+
+@dataclass(frozen=True)
+class FreeArea:
+    """Free space in square metres: on the map, and what each step of cleaning leaves of it.
+
+    Attributes:
+        mapped: what the thresholds call free.
+        inflated: where a robot's centre can be.
+        resampled: cells without any obstacle.
+        reachable: cells connected with the start, or the largest component.
+    """
+
+    mapped: float
+    inflated: float
+    resampled: float
+    reachable: float
+
+
+@dataclass(frozen=True)
+class CutOff:
+    """A part of the building that the robot fits into, behind a passage that the working grid closes.
+
+    Attributes:
+        at: metres (x, y) of one of its free cells, near its middle.
+        area: of its free cells, in square metres.
+    """
+
+    at: Point
+    area: float
+
+
+@dataclass(frozen=True, eq=False)
+class CleanMap:
+    """Cells that the robot can reach, all others being obstacles, and where they lie.
+
+    Attributes:
+        free: the cells that can be reached.
+        frame: metres to cells.
+        area: what cleaning left of the map's free space.
+        cut_off: parts of `CUT_OFF_AREA` or more that resampling has closed off, the largest first.
+    """
+
+    free: Bool[np.ndarray, "H W"]
+    frame: GridFrame
+    area: FreeArea
+    cut_off: tuple[CutOff, ...]
+
+
+def clean_map(
+    image_map: OccupancyMap,
+    resolution: float = 0.2,
+    radius: float = 0.1,
+    start: Point | None = None,
+    source: str = "start",
+) -> CleanMap:
+    """The grid on which a robot of this radius can move, as the module describes.
+
+    Args:
+        image_map: the map as published.
+        resolution: size of a working cell in metres.
+        radius: the robot's radius in metres.
+        start: metres (x, y) whose component is kept; None: the largest.
+        source: the file that gives the start, for messages.
+
+    Returns:
+        The cells that can be reached, where they lie, and what was lost on the way.
+
+    Raises:
+        MapError: the resolution is finer than the map's, nothing is left free, or the start lies outside or is blocked.
+    """
+    # Exact fractions: a cell of 0.2 m must be 4 pixels of 0.05 m, not 4.000000000000001.
+    file, pixel = image_map.settings.file, image_map.settings.resolution
+    ratio = _exact(file, "resolution", resolution) / pixel
+    # Finer cells would invent detail that the map does not have.
+    if ratio < 1:
+        raise MapError(file, "resolution", f"{resolution} m a cell is finer than the map's {float(pixel)} m a pixel")
+    inflated = ~inflate(~image_map.free, _exact(file, "radius", radius) / pixel)
+    free = ~resample(~inflated, ratio)
+    height, width = free.shape
+    frame = GridFrame(height, width, float(ratio * pixel), *image_map.settings.origin)
+    if not free.any():
+        raise MapError(
+            file, "", f"nothing is left free with cells of {resolution} m and a radius of {radius} m; make them smaller"
+        )
+    kept = _largest_component(free) if start is None else _component_of(start, free, frame, source)
+    # The first two are counted in pixels, the others in cells.
+    area = FreeArea(
+        *(float(pixels.sum()) * float(pixel) ** 2 for pixels in (image_map.free, inflated)),
+        *(float(cells.sum()) * frame.resolution**2 for cells in (free, kept)),
+    )
+    return _crop(kept, frame, area, _cut_off(inflated, image_map.frame, free & ~kept, kept, frame))
+
+
+def _exact(file: Path, field: str, number: float) -> Fraction:
+    if not np.isfinite(number) or number < 0:
+        raise MapError(file, field, f"{number} is not a finite number of metres, 0 or more")
+    # By its shortest text: 0.1 means one tenth, not the nearest binary fraction.
+    return Fraction(str(number))
+
+
+def inflate(blocked: Bool[np.ndarray, "H W"], pixels: Fraction) -> Bool[np.ndarray, "H W"]:
+    """Obstacles and all whose centre is within a radius, in pixels, of an obstacle's centre."""
+    # Padded, because what is beyond the image counts as an obstacle, too.
+    distance = np.asarray(ndimage.distance_transform_edt(~np.pad(blocked, 1, constant_values=True)))[1:-1, 1:-1]
+    # Squared distances between centres are integers, so that the comparison can be exact.
+    return np.rint(distance**2) <= int(pixels * pixels)
+
+
+def resample(
+    pixels: Shaped[np.ndarray, "H W"], ratio: Fraction, reduce: np.ufunc = np.logical_or, beyond: bool | int = True
+) -> Shaped[np.ndarray, "h w"]:
+    """Cells of several pixels, from the lower left corner on.
+
+    Args:
+        pixels: row 0 at the top.
+        ratio: pixels per cell, along each side.
+        reduce: makes a cell of all pixels that share area with it.
+        beyond: what every pixel beyond the image is.
+
+    Returns:
+        The cells, row 0 at the top. By default a cell is True (blocked) if one of its pixels is, or is missing.
+    """
+    # Row 0 is the top of the map, and cells are counted from the bottom.
+    upwards = _reduce_each(pixels[::-1], ratio, reduce, beyond)[::-1]
+    return _reduce_each(upwards.T, ratio, reduce, beyond).T
+
+
+def _reduce_each(
+    pixels: Shaped[np.ndarray, "H W"], ratio: Fraction, reduce: np.ufunc, beyond: bool | int
+) -> Shaped[np.ndarray, "h W"]:
+    # Rounded up: a last cell that is only partly in the image counts.
+    count = -(-len(pixels) // ratio)
+    spans = [(int(cell * ratio), int(-(-(cell + 1) * ratio // 1))) for cell in range(count)]
+    # A last cell may reach over the image's edge.
+    padded = np.pad(pixels, ((0, spans[-1][1] + 1 - len(pixels)), (0, 0)), constant_values=beyond)
+    # `reduceat` reduces between consecutive indices; every other result spans one cell.
+    return reduce.reduceat(padded, np.array(spans).ravel(), axis=0)[::2]
+
+
+def _largest_component(free: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    # Entry 0 counts what is not free.
+    labels = component_labels(free)
+    return labels == 1 + np.argmax(np.bincount(labels.ravel())[1:])
+
+
+def _component_of(
+    start: Point, free: Bool[np.ndarray, "H W"], frame: GridFrame, source: str
+) -> Bool[np.ndarray, "H W"]:
+    # A start in a wall is a mistake in the file: the nearest free cell is named, not taken.
+    cell = frame.metres_to_cell(*start)
+    inside = frame.contains(*cell)
+    if not inside or not free[cell]:
+        x, y = nearest_free(start, free, frame)
+        why = (
+            "is blocked: it lies in or too near an obstacle, or in unknown space" if inside else "is outside of the map"
+        )
+        raise MapError(
+            source, "start", f"[{start[0]:g}, {start[1]:g}] {why}; the nearest free cell is at [{x:.2f}, {y:.2f}]"
+        )
+    labels = component_labels(free)
+    return labels == labels[cell]
+
+
+def _cut_off(
+    inflated: Bool[np.ndarray, "H W"],
+    pixels: GridFrame,
+    lost: Bool[np.ndarray, "h w"],
+    kept: Bool[np.ndarray, "h w"],
+    frame: GridFrame,
+) -> tuple[CutOff, ...]:
+    """Components of ``lost`` cells whose pixels are connected with those of the cells that are kept."""
+    # On the map's own pixels the robot gets there; only the size of the cells keeps it out.
+    components = component_labels(inflated)
+    numbers = components[_pixels_of(frame, pixels)]
+    labels = component_labels(lost & (numbers == numbers[tuple(np.argwhere(kept)[0])]))
+    sizes = np.bincount(labels.ravel())[1:] * frame.resolution**2
+    found = [
+        CutOff(_middle(labels == 1 + index, frame), float(sizes[index]))
+        for index in np.flatnonzero(sizes >= CUT_OFF_AREA).tolist()
+    ]
+    return tuple(sorted(found, key=lambda part: -part.area))
+
+
+def _pixels_of(frame: GridFrame, pixels: GridFrame) -> tuple[Int[np.ndarray, "h 1"], Int[np.ndarray, "1 w"]]:
+    """Row and column of the pixel at every cell's centre, or of the nearest one where the cell lies beyond the image.
+
+    Both grids have the same lower left corner.
+    """
+    # Rows count from the top in both grids, so heights are compared from the bottom, where both begin.
+    ratio = frame.resolution / pixels.resolution
+    up = ((frame.height - np.arange(frame.height) - 0.5) * ratio).astype(int)
+    across = ((np.arange(frame.width) + 0.5) * ratio).astype(int)
+    rows = pixels.height - 1 - np.minimum(up, pixels.height - 1)
+    return rows[:, None], np.minimum(across, pixels.width - 1)[None, :]
+
+
+def _middle(part: Bool[np.ndarray, "h w"], frame: GridFrame) -> Point:
+    """Centre of the part's cell that is nearest to its centroid, in metres."""
+    # The centroid of a part that is bent around a corner may lie outside of it.
+    cells = np.argwhere(part)
+    row, col = cells[np.argmin(np.linalg.norm(cells - cells.mean(axis=0, keepdims=True), axis=1))].tolist()
+    return frame.cell_to_metres(row, col)
+
+
+def _crop(kept: Bool[np.ndarray, "H W"], frame: GridFrame, area: FreeArea, cut_off: tuple[CutOff, ...]) -> CleanMap:
+    rows, cols = np.flatnonzero(kept.any(axis=1)), np.flatnonzero(kept.any(axis=0))
+    # All kept cells, and one ring of obstacles: sensors and sweeps rely on a closed border.
+    content = kept[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
+    free = np.pad(content, 1)
+    return CleanMap(free, frame.window(int(rows[0]) - 1, int(cols[0]) - 1, *free.shape), area, cut_off)

@@ -1,0 +1,261 @@
+"""Collects a dataset for the estimator from simulated buildings.
+
+A heuristic robot (``recipes.exploration``) wanders through each world. Now and then the panorama is recorded, and for
+every subgoal in line of sight and some outcome classes, drawn from a distribution of tasks, the true P_S, R_S, R_F and
+the weights of the loss. ``docs/dataset.md`` describes the files. A collection that was interrupted continues where it
+stopped: what is recorded depends on the seed, the split and the index of the world alone.
+"""
+
+import dataclasses
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from multiprocessing.connection import wait
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int32, PRNGKeyArray, UInt8
+
+from potlp_jax.cache import enable_compilation_cache
+from potlp_jax.codec import json_copy
+from potlp_jax.environments.base import Generator
+from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.errors import DatasetError
+from potlp_jax.learning.dataset import (
+    DatasetMetadata,
+    Samples,
+    finished_shards,
+    read_metadata,
+    remove_unfinished_files,
+    write_shard,
+)
+from potlp_jax.learning.questions import HELD_OUT, TaskDistribution
+from potlp_jax.learning.recording import (
+    Pose,
+    Recorder,
+    RecordingConfig,
+    draws_of_world,
+    record_views,
+    recording_metadata,
+)
+from potlp_jax.learning.sample_weights import WeightBounds
+from potlp_jax.recipes.exploration import Explorer, ExplorerConfig
+from potlp_jax.trials.config import trial_config_for
+from potlp_jax.trials.loop import versions
+from potlp_jax.world.camera import Disturbance, disturb
+from potlp_jax.world.grid import World
+from potlp_jax.world.renderer import render
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CollectConfig(RecordingConfig):
+    """What is recorded, and how the robot comes there.
+
+    Attributes:
+        worlds_per_shard: what is lost, at most, where a process is killed.
+        disturbance: of the images.
+        explorer: how the robot wanders; it pursues the tasks that the outcome classes are from.
+    """
+
+    worlds_per_shard: int = 4
+    disturbance: Disturbance = Disturbance()
+    explorer: ExplorerConfig = ExplorerConfig()
+
+
+@dataclasses.dataclass(frozen=True)
+class Collected:
+    """Where a collection stands: worlds done of all, and views recorded since it was started."""
+
+    worlds: int
+    of: int
+    views: int
+
+
+@dataclasses.dataclass(frozen=True)
+class _Job:
+    """One shard to collect; goes to another process."""
+
+    folder: Path
+    shard: int
+    generator: Generator
+    split: Split
+    config: CollectConfig
+    metadata: DatasetMetadata
+
+
+def collection_of(generator: Generator) -> CollectConfig:
+    """What to record in worlds of a family: subgoals as its trials have them, and never the formulas it holds out."""
+    frontiers = trial_config_for(generator).decision.frontiers
+    return CollectConfig(
+        frontiers=frontiers,
+        explorer=ExplorerConfig(frontiers=frontiers),
+        held_out=HELD_OUT.get(generator.name, ()),
+    )
+
+
+def collect(
+    generator: Generator,
+    environment: str,
+    split: Split,
+    worlds: int,
+    folder: Path,
+    config: CollectConfig,
+    processes: int = 1,
+    tell: Callable[[Collected], None] = lambda collected: None,
+) -> None:
+    """Collect what is missing of the first ``worlds`` worlds of a split.
+
+    Args:
+        generator: where worlds come from.
+        environment: the name that the dataset keeps of it.
+        split: from which worlds; training and validation never share one.
+        worlds: a multiple of ``config.worlds_per_shard``.
+        folder: the dataset; may hold a part of it already.
+        config: what is recorded.
+        processes: work at the same time, each on a core of its own.
+        tell: called at the start and after every shard.
+
+    Raises:
+        DatasetError: the folder holds a dataset with other metadata, or ``worlds`` does not fill whole shards.
+    """
+    size = config.worlds_per_shard
+    shards = _whole_shards(worlds, size)
+    if processes < 1:
+        raise DatasetError(f"{processes} processes are too few: ask for at least 1")
+    metadata = dataset_metadata(generator, environment, split, config)
+    finished = finished_shards(folder)
+    differences = read_metadata(folder).differences(metadata) if finished else []
+    if differences:
+        raise DatasetError(
+            f"{folder} holds a dataset that was collected otherwise ({'; '.join(differences)}): continue with the same "
+            "settings, or choose an empty folder"
+        )
+    remove_unfinished_files(folder)
+    missing = [shard for shard in range(shards) if shard not in finished]
+    jobs = [_Job(folder, shard, generator, split, config, metadata) for shard in missing]
+    views, done = 0, worlds - len(jobs) * size
+    tell(Collected(done, worlds, views))
+    for count in _run(jobs, processes):
+        views, done = views + count, done + size
+        tell(Collected(done, worlds, views))
+
+
+def _whole_shards(worlds: int, size: int) -> int:
+    shards, rest = divmod(worlds, size)
+    if rest or shards < 1:
+        raise DatasetError(
+            f"{worlds} worlds are no whole shards of {size} worlds: ask for {max(shards, 1) * size} worlds, or for "
+            "other shards (worlds_per_shard)"
+        )
+    return shards
+
+
+def dataset_metadata(generator: Generator, environment: str, split: Split, config: CollectConfig) -> DatasetMetadata:
+    """What the shards of a collection share.
+
+    Args:
+        generator: where worlds come from; its first world tells the size and the unit.
+        environment: the name that the dataset keeps of it.
+        split: from which worlds.
+        config: what is recorded.
+
+    Returns:
+        Metadata in which everything that decides what is recorded has a place, so that equal ones may be continued.
+    """
+    world = generator.generate(world_key(split, 0, generator.name))
+    resolution = float(world.resolution)
+    return recording_metadata(
+        config,
+        WeightBounds.of_map(*world.shape, resolution),
+        versions(),
+        propositions=generator.propositions,
+        environment=environment,
+        generator=json_copy(dataclasses.asdict(generator.config)),
+        split=split.value,
+        unit="cells" if resolution == 1.0 else "metres",
+        resolution=resolution,
+    )
+
+
+def _collect_shard(job: _Job) -> int:
+    """Collect and write one shard; returns the number of its views."""
+    tasks = TaskDistribution(job.generator.propositions, job.config.held_out)
+    recorder = Recorder(job.shard, job.config, WeightBounds(**job.metadata.weights))
+    first = job.shard * job.config.worlds_per_shard
+    for index in range(first, first + job.config.worlds_per_shard):
+        world = job.generator.generate(world_key(job.split, index, job.generator.name))
+        _collect_world(recorder, world, index, tasks, job)
+    write_shard(job.folder, job.shard, recorder.views, recorder.samples, job.metadata)
+    return len(recorder.views["view"])
+
+
+def _collect_world(recorder: Recorder, world: World, index: int, tasks: TaskDistribution, job: _Job) -> None:
+    """Wander through one world and record views in which a subgoal can be seen."""
+    config = job.config
+    rng, pool = draws_of_world(config, job.split, index, tasks)
+
+    def photograph(pose: Pose) -> UInt8[np.ndarray, "rows columns 3"]:
+        # By world and step, so that a picture does not depend on how many were taken before it.
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), index), pose.step)
+        return np.asarray(_image(world, jnp.asarray(pose.cell, jnp.int32), key, config))
+
+    record_views(recorder, world, index, Explorer(world, pool, rng, config.explorer).poses(), pool, rng, photograph)
+
+
+@partial(jax.jit, static_argnames="config")
+def _image(
+    world: World, cell: Int32[Array, "2"], key: PRNGKeyArray, config: CollectConfig
+) -> UInt8[Array, "rows columns 3"]:
+    return disturb(render(world, cell, config.camera), key, config.disturbance)
+
+
+def _run(jobs: Sequence[_Job], processes: int) -> Iterator[int]:
+    """Views of each shard as it is done."""
+    if processes == 1:
+        yield from map(_collect_shard, jobs)
+        return
+    # XLA's threads do not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    cores = context.SimpleQueue()
+    allowed = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
+    for index in range(processes):
+        cores.put(allowed[index % len(allowed)])
+    with context.Pool(processes, _start_worker, (cores,)) as pool:
+        yield from pool.imap_unordered(_collect_shard, jobs)
+
+
+def _start_worker(cores) -> None:
+    """A process keeps to one core where the system lets it choose, and ends with its parent however that ends."""
+    core = cores.get()
+    if core is not None:
+        # Before XLA starts, which then uses one thread.
+        os.sched_setaffinity(0, {core})
+    enable_compilation_cache()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+
+def summary(samples: Samples) -> str:
+    """Size and balance of a dataset, in words."""
+    holds = samples.success > 0
+    views = len(samples.images)
+    if not len(holds):
+        return f"{views} views, no samples"
+    lines = [
+        f"{views} views, {len(holds)} samples ({len(holds) / views:.1f} a view), {holds.mean():.1%} successes",
+        f"images: {np.mean([len(image) for image in samples.images]) / 1024:.1f} KiB each",
+    ]
+    for index, name in enumerate(samples.metadata.propositions):
+        asked = samples.phi_go[:, index] > 0
+        lines.append(f"{name}: asked for in {asked.mean():.1%} of samples, {holds[asked].mean():.1%} of them successes")
+    return "\n".join(lines)

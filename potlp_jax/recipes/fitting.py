@@ -1,0 +1,199 @@
+"""Fits an estimator to a dataset.
+
+The folder of a fit then holds ``estimator.npz`` (the best parameters by validation loss: what is shipped), ``log.csv``
+(one row an epoch), ``curves.png``, ``tensorboard/``, ``plan.json`` and ``checkpoints/``. A fit that was interrupted,
+also by SIGKILL, resumes and ends with the same parameters, bit for bit, as without the interruption.
+
+With a time to keep, the speed is measured first, and as many steps are planned as fit, at most ``epochs``; the learning
+rate's schedule ends with the plan. The plan is written once, so that a resumed training follows it.
+"""
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from potlp_jax.codec import differences
+from potlp_jax.errors import TrainingError
+from potlp_jax.learning.dataset import Samples, decode
+from potlp_jax.learning.loss import DataScale, network_config
+from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, operation_counts, parameter_count
+from potlp_jax.learning.serialization import save_estimator
+from potlp_jax.learning.training import (
+    Trained,
+    TrainingConfig,
+    TrainingOptions,
+    seconds_per_step,
+    steps_per_epoch,
+    train,
+)
+from potlp_jax.recipes.journal import Display, Journal
+
+ESTIMATOR: str = "estimator.npz"
+"""Name of the result in a fit's folder."""
+
+# Of the time asked for: what validation, checkpoints and a busy machine may take.
+_RESERVE = 0.1
+# Times the time asked for, after which a training that is slower than measured is cut short.
+_OVERRUN = 1.2
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FitConfig:
+    """What is fitted, and how.
+
+    Attributes:
+        epochs: passes over the panoramas, at most.
+        minutes: plan as many steps as fit into this time; None for all epochs.
+        exclusive_within: cells within which subgoals exclude each other, as ``eval.exclusion`` measures; 0: nowhere.
+        fovea: columns of pixels on each side of a subgoal that the network sees at full resolution; 0 for none.
+        second_widths: channels of the eight convolutions after phi is joined.
+        training: of the optimiser and the data.
+    """
+
+    epochs: int = 10
+    minutes: float | None = None
+    exclusive_within: float = NetworkConfig.exclusive_within
+    fovea: int = NetworkConfig.fovea
+    second_widths: tuple[int, ...] = NetworkConfig.second_widths
+    training: TrainingOptions = TrainingOptions()
+
+    def __post_init__(self) -> None:
+        if self.epochs < 1:
+            raise TrainingError(f"epochs is {self.epochs}; give at least 1")
+        if self.minutes is not None and not self.minutes > 0:
+            raise TrainingError(f"minutes is {self.minutes}; give a positive number, or null for no limit")
+
+
+def fit(training: Samples, validation: Samples, out: Path, config: FitConfig, display: Display = Display()) -> Trained:
+    """Fit an estimator, or resume.
+
+    Args:
+        training: what is learned from.
+        validation: of other worlds; decides which parameters are the best.
+        out: the fit's folder.
+        config: what is fitted, and how.
+        display: shows how it goes.
+
+    Returns:
+        The best parameters, which ``out`` / ``ESTIMATOR`` holds as well.
+
+    Raises:
+        TrainingError: the data do not fit, ``out`` has a plan for something else, or the loss is not finite.
+        CheckpointError: ``out`` holds a damaged checkpoint, or one of another training.
+    """
+    network = EstimatorNetwork(_network_config(training, config))
+    out.mkdir(parents=True, exist_ok=True)
+    began = time.perf_counter()
+    plan = _plan(network, training, out, config)
+    _say_what_is_fitted(network, training, plan, config, display)
+    journal = Journal(out, plan.steps, display)
+    budget = float("inf")
+    if config.minutes is not None:
+        budget = config.minutes * 60 * _OVERRUN - (time.perf_counter() - began)
+    try:
+        trained = train(
+            network,
+            training,
+            validation,
+            plan,
+            folder=out / "checkpoints",
+            budget_seconds=budget,
+            on_start=journal.start,
+            on_step=journal.step,
+            on_evaluation=journal.evaluation,
+        )
+    finally:
+        journal.close()
+    metadata = _metadata(training, validation, plan, trained, journal)
+    save_estimator(out / ESTIMATOR, trained.params, network.config, metadata)
+    return trained
+
+
+def _network_config(training: Samples, config: FitConfig) -> NetworkConfig:
+    if not training.images:
+        raise TrainingError("the dataset has no panoramas: collect more worlds")
+    rows, columns, _ = decode(training.images[0]).shape
+    return network_config(
+        training,
+        (rows, columns),
+        exclusive_within=config.exclusive_within,
+        fovea=config.fovea,
+        second_widths=config.second_widths,
+    )
+
+
+def _plan(network: EstimatorNetwork, training: Samples, out: Path, config: FitConfig) -> TrainingConfig:
+    """How to train, and for how many steps."""
+    options = dataclasses.asdict(config.training)
+    one = TrainingConfig(steps=1, **options)
+    steps = planned_steps(out, steps_per_epoch(training, one), config, lambda: seconds_per_step(network, training, one))
+    return TrainingConfig(steps=steps, **options)
+
+
+def planned_steps(folder: Path, epoch: int, config: FitConfig, measure: Callable[[], float]) -> int:
+    """Steps to plan; where there is a plan already, what it says.
+
+    Args:
+        folder: where ``plan.json`` is.
+        epoch: steps in an epoch.
+        config: how many epochs and how much time.
+        measure: gives the seconds that a step takes; called where a plan must be made for a time.
+
+    Returns:
+        The number of steps. A resumed training must not measure again: another number would be another schedule.
+
+    Raises:
+        TrainingError: there is a plan for other options.
+    """
+    asked = {"epochs": config.epochs, "minutes": config.minutes, "seed": config.training.seed}
+    path = folder / "plan.json"
+    if path.exists():
+        plan = json.loads(path.read_text())
+        found = differences(plan["asked"], asked)
+        if found:
+            raise TrainingError(f"{path} was made for another training ({'; '.join(found)}): choose another folder")
+        return int(plan["steps"])
+    plan = {"asked": asked, "steps": config.epochs * epoch}
+    if config.minutes is not None:
+        plan["seconds_per_step"] = measure()
+        fitting = int(config.minutes * 60 * (1 - _RESERVE) / plan["seconds_per_step"])
+        plan["steps"] = max(1, min(plan["steps"], fitting))
+    temporary = path.with_suffix(".json.tmp")
+    temporary.write_text(json.dumps(plan))
+    temporary.replace(path)
+    return int(plan["steps"])
+
+
+def _say_what_is_fitted(
+    network: EstimatorNetwork, training: Samples, plan: TrainingConfig, config: FitConfig, display: Display
+) -> None:
+    first, second = operation_counts(network.config)
+    display.say(
+        f"{len(training.images)} panoramas, {len(training.success)} samples; {plan.steps} steps in at most "
+        f"{config.epochs} epochs; {first / 1e6:.1f} MFLOP per panorama and {second / 1e6:.1f} per sample, forward"
+    )
+
+
+def _metadata(
+    training: Samples, validation: Samples, plan: TrainingConfig, trained: Trained, journal: Journal
+) -> dict[str, Any]:
+    """What an estimator's file says of how it was made."""
+    return {
+        "training": dataclasses.asdict(plan),
+        "data": dataclasses.asdict(training.metadata),
+        "validation_split": validation.metadata.split,
+        "panoramas": len(training.images),
+        "samples": len(training.success),
+        "prior": DataScale.of(training).prior,
+        "parameters": parameter_count(trained.params),
+        "steps": trained.steps,
+        "best_step": trained.best_step,
+        "ended_by": trained.reason,
+        "seconds": trained.seconds,
+        "figures": journal.row_of_step(trained.best_step),
+        "versions": {name: version(name) for name in ("potlp-jax", "jax", "flax", "optax")},
+    }

@@ -1,0 +1,1 @@
+"""Trials as environments for reinforcement learning: ``episodes`` in pure JAX, ``gym`` for gymnasium."""

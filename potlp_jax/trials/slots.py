@@ -1,0 +1,335 @@
+"""One decision of a simulated trial, and the leg to the next, as pure functions over the arrays of one slot or of many.
+
+The decisions are those of ``loop.run_trial`` (Bradley et al. 2021, Algorithm 1) under the same ``rules``; ``batch``
+keeps the slots filled.
+
+On a CPU the phases before and after the search work through the slots one by one: their loops end at different times,
+and in lockstep all would wait for the slowest. Elsewhere they run in lockstep. The search always does.
+"""
+
+import dataclasses
+import math
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Int16, Int32, Key, PRNGKeyArray
+
+from potlp_jax.learning.estimator import NetworkEstimator
+from potlp_jax.learning.labels import TrueMapEstimator
+from potlp_jax.learning.memory import Views, remember
+from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
+from potlp_jax.planning.estimates import Estimates, Estimator, ask
+from potlp_jax.planning.policies import (
+    Move,
+    MoveKind,
+    Policy,
+    PolicyFunction,
+    Situation,
+    assess,
+    planned_move,
+    planning_problem,
+    policy_function,
+)
+from potlp_jax.planning.search.api import plan_actions
+from potlp_jax.task.task import TaskArrays
+from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.robot import first_seen_at_start, follow, initial_belief, photograph
+from potlp_jax.trials.rules import (
+    Stop,
+    Tally,
+    arrive,
+    count_decision,
+    decision_key,
+    first_tally,
+    planning_key,
+    sensing_key,
+    stop_of,
+)
+from potlp_jax.world.frontiers import Subgoals
+from potlp_jax.world.grid import BeliefMap, World
+from potlp_jax.world.moves import step_length
+from potlp_jax.world.sensing import observe
+
+EMPTY: int = -2
+"""``Tally.outcome`` of a slot without a trial; neither running nor ended."""
+
+Asked = Params | Estimator | None
+"""What all slots share of what the policy asks: parameters of the network, a whole estimator, or nothing."""
+
+
+@struct.dataclass(kw_only=True)
+class Scene:
+    """What stays as it is during a trial.
+
+    Attributes:
+        world: the true map.
+        task: arrays of the task.
+        planning, sensing: keys of the planner and of the sensors.
+    """
+
+    world: World
+    task: TaskArrays
+    planning: Key[Array, "*batch"]
+    sensing: Key[Array, "*batch"]
+
+
+@struct.dataclass(kw_only=True)
+class Progress:
+    """What changes during a trial.
+
+    Attributes:
+        belief: what is known of the map.
+        views: panoramas seen so far; None for a policy that takes none.
+        first_seen: step at which each cell was first observed.
+        cell: where the robot is.
+        path: cells so far, ``tally.steps + 1`` of them; what stands behind them means nothing.
+        tally: what the rules count.
+    """
+
+    belief: BeliefMap
+    views: Views | None
+    first_seen: Int32[Array, "*batch H W"]
+    cell: Int32[Array, "*batch 2"]
+    path: Int16[Array, "*batch L 2"]
+    tally: Tally
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """What all trials of a batch share, static under jit; ``network`` is None for policies that take no panoramas."""
+
+    policy: Policy | PolicyFunction
+    config: TrialConfig
+    network: NetworkConfig | None
+
+    @property
+    def searches(self) -> bool:
+        """Whether the policy is one of those whose searches run together over all slots."""
+        return isinstance(self.policy, Policy) and self.policy.searches
+
+
+@partial(jax.jit, static_argnames="setup")
+def begin(
+    world: World, arrays: TaskArrays, key: PRNGKeyArray, views: Views | None, *, setup: Setup
+) -> tuple[Scene, Progress]:
+    """A trial before its first decision; what is visible from the start is known.
+
+    Args:
+        world: the true map, padded to the batch's shape.
+        arrays: of the task, padded to the batch's sizes.
+        key: of the trial.
+        views: an empty memory of panoramas, or None.
+        setup: of the batch; static.
+
+    Returns:
+        What stays and what changes. The trial may have ended already, where its first letter decides the task.
+    """
+    config = setup.config
+    belief = observe(initial_belief(world, config), world, world.start, config.sensor)
+    height, width = world.shape
+    # The budget is checked between legs only, and a leg is no longer than the horizon; diagonal moves are fewer.
+    length = math.ceil(config.budget_factor * (height + width)) + 2 + config.decision.horizon(height, width)
+    progress = Progress(
+        belief=belief,
+        views=views,
+        first_seen=first_seen_at_start(belief),
+        cell=world.start,
+        path=jnp.zeros((length, 2), jnp.int16).at[0].set(world.start.astype(jnp.int16)),
+        tally=first_tally(belief, world.start, arrays),
+    )
+    scene = Scene(world=world, task=arrays, planning=planning_key(key), sensing=sensing_key(key))
+    return scene, _arrive(scene, progress, jnp.bool_(False), config)
+
+
+def _arrive(scene: Scene, progress: Progress, gave_up: Bool[Array, ""], config: TrialConfig) -> Progress:
+    tally = arrive(progress.tally, progress.belief, progress.cell, scene.task, gave_up, config)
+    return dataclasses.replace(progress, tally=tally)
+
+
+def step(scene: Scene, asked: Asked, setup: Setup, progress: Progress) -> Progress:
+    """One decision, and the leg to the next, in every slot whose trial is running.
+
+    Args:
+        scene: of all slots.
+        asked: what the slots share of what the policy asks.
+        setup: of the batch; static.
+        progress: of all slots.
+
+    Returns:
+        The progress; that of slots which are not running is unchanged.
+    """
+    if setup.searches:
+        return _search_together(scene, asked, setup, progress)
+    return _each(partial(_decide_alone, setup, asked), progress, scene)
+
+
+def _search_together(scene: Scene, asked: Asked, setup: Setup, progress: Progress) -> Progress:
+    """As ``policies.search_move``, with the searches of all slots in one kernel."""
+    decision = setup.config.decision
+
+    def prepare(progress: Progress, scene: Scene) -> tuple[Any, ...]:
+        views, situation, estimates, key = _consider(setup, asked, progress, scene)
+        running = progress.tally.running
+        problem = _phase(running, partial(planning_problem, config=decision), situation, estimates)
+        return views, situation, problem, key
+
+    views, situation, problem, keys = _each(prepare, progress, scene)
+    plans = jax.vmap(lambda problem, key: plan_actions(problem, key, decision.search))(problem, keys)
+
+    def act(progress: Progress, scene: Scene, *considered: Any) -> Progress:
+        tally = progress.tally
+        move = _phase(tally.running, partial(planned_move, config=decision), *considered, tally.intention)
+        return advance(setup, progress, scene, move)
+
+    return _each(act, dataclasses.replace(progress, views=views), scene, situation, problem, plans)
+
+
+def _decide_alone(setup: Setup, asked: Asked, progress: Progress, scene: Scene) -> Progress:
+    """Decide in one slot, with whatever function the policy is, and go."""
+    views, situation, estimates, key = _consider(setup, asked, progress, scene)
+    tally, config = progress.tally, setup.config.decision
+
+    def decide(situation: Situation, estimates: Estimates | None, key: PRNGKeyArray, intention: Any) -> Move:
+        return policy_function(setup.policy)(situation, estimates, key, config, intention)
+
+    move = _phase(tally.running, decide, situation, estimates, key, tally.intention)
+    return advance(setup, dataclasses.replace(progress, views=views), scene, move)
+
+
+def _each(function: Any, *batches: Any) -> Any:
+    """Apply to every slot: one by one on a CPU, otherwise in lockstep."""
+    if jax.default_backend() == "cpu":
+        return jax.lax.map(lambda row: function(*row), batches)
+    return jax.vmap(function)(*batches)
+
+
+def _phase(running: Bool[Array, ""], function: Any, *arguments: Any) -> Any:
+    """The result of a phase of a decision, zeros where the trial is not running: idle slots cost nothing on a CPU.
+
+    The branch also keeps phases apart. XLA's CPU compiler otherwise merges one into the loops of the next, and computes
+    it there many times: a whole decision took three times as long as its phases.
+    """
+
+    structure: Any = None
+
+    def leaves_of(*arguments: Any) -> list[Array]:
+        nonlocal structure
+        leaves, structure = jax.tree.flatten(function(*arguments))
+        return leaves
+
+    # Compiled together, so that it is traced once for its shapes and the branch.
+    phase = jax.jit(leaves_of)
+    blank = jax.eval_shape(phase, *arguments)
+    leaves = jax.lax.cond(running, phase, lambda *_: [_zeros(leaf) for leaf in blank], *arguments)
+    return jax.tree.unflatten(structure, leaves)
+
+
+def _zeros(leaf: Any) -> Array:
+    # A key has no zero; any key will do for a result that nobody reads.
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        return jnp.broadcast_to(jax.random.key(0), leaf.shape)
+    return jnp.zeros(leaf.shape, leaf.dtype)
+
+
+def _consider(
+    setup: Setup, asked: Asked, progress: Progress, scene: Scene
+) -> tuple[Views | None, Situation, Estimates | None, PRNGKeyArray]:
+    """What every policy is given: the situation, and estimates where it asks for them."""
+    running = progress.tally.running
+    views = None if setup.network is None else _take_panorama(setup, setup.network, asked, progress, scene)
+    situation = _phase(
+        running,
+        partial(assess, config=setup.config.decision.frontiers),
+        progress.belief,
+        progress.cell,
+        progress.tally.state,
+        scene.task,
+    )
+    estimates = None
+    if _estimator(setup, asked, views, scene) is not None:
+
+        def estimate(progress: Progress, subgoals: Subgoals, scene: Scene) -> Estimates:
+            estimator = _estimator(setup, asked, progress.views, scene)
+            assert estimator is not None
+            return ask(estimator, progress.belief, subgoals, scene.task, progress.tally.state)
+
+        estimates = _phase(running, estimate, dataclasses.replace(progress, views=views), situation.subgoals, scene)
+    return views, situation, estimates, decision_key(scene.planning, progress.tally.decisions)
+
+
+def _take_panorama(setup: Setup, network: NetworkConfig, asked: Asked, progress: Progress, scene: Scene) -> Views:
+    """What is remembered after a panorama from here."""
+    config, running = setup.config, progress.tally.running
+    key = jax.random.fold_in(scene.sensing, progress.tally.steps)
+    camera = partial(photograph, camera=config.camera, disturbance=config.disturbance)
+    panorama = _phase(running, camera, scene.world, progress.cell, key)
+    features = _phase(running, EstimatorNetwork(network).encode, asked, panorama)
+    views = progress.views
+    assert views is not None
+    # Not a phase of its own: a branch would copy the memory.
+    return remember(views, features, progress.belief, progress.cell)
+
+
+def _estimator(setup: Setup, asked: Asked, views: Views | None, scene: Scene) -> Estimator | None:
+    """What the policy asks in one slot."""
+    if setup.policy is Policy.ORACLE:
+        return TrueMapEstimator(world=scene.world)
+    if setup.network is not None and views is not None:
+        return NetworkEstimator(params=asked, views=views, config=setup.network)
+    return asked
+
+
+def advance(setup: Setup, progress: Progress, scene: Scene, move: Move) -> Progress:
+    """Follow a move's path until the next decision is due, and see whether the trial ends there.
+
+    Args:
+        setup: of the batch; static.
+        progress: of one slot.
+        scene: of the slot.
+        move: what was decided.
+
+    Returns:
+        The progress; unchanged where the trial is not running.
+    """
+    config = setup.config
+    stop = stop_of(move, progress.tally, progress.belief, config)
+
+    def go(progress: Progress, scene: Scene, move: Move, stop: Stop) -> Progress:
+        belief, first_seen, moved = follow(
+            scene.world, progress.belief, progress.first_seen, move.path, progress.tally.steps, stop, config.sensor
+        )
+        went = _went(progress, move, belief, first_seen, moved)
+        return _arrive(scene, went, (move.kind == MoveKind.NONE) & (moved == 0), config)
+
+    # The views are not touched; in the branch they would be copied.
+    views, without = progress.views, dataclasses.replace(progress, views=None)
+    went = jax.lax.cond(progress.tally.running, go, lambda progress, *_: progress, without, scene, move, stop)
+    return dataclasses.replace(went, views=views)
+
+
+def _went(
+    progress: Progress, move: Move, belief: BeliefMap, first_seen: Int32[Array, "H W"], moved: Int32[Array, ""]
+) -> Progress:
+    """After ``moved`` moves along the move's path."""
+    cells, tally = move.path.cells, progress.tally
+    diagonal = (step_length(cells[:-1], cells[1:]) > 1.0) & (jnp.arange(cells.shape[0] - 1) < moved)
+    diagonals = jnp.sum(diagonal, dtype=jnp.int32)
+    # What is written beyond the moves made is overwritten by the next ones.
+    path = jax.lax.dynamic_update_slice(progress.path, cells[1:].astype(jnp.int16), (tally.steps + 1, 0))
+    counted = count_decision(tally, move)
+    return dataclasses.replace(
+        progress,
+        belief=belief,
+        first_seen=first_seen,
+        cell=cells[moved],
+        path=path,
+        tally=dataclasses.replace(
+            counted,
+            state=move.path.states[moved],
+            straight=tally.straight + moved - diagonals,
+            diagonal=tally.diagonal + diagonals,
+        ),
+    )

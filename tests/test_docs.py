@@ -1,0 +1,276 @@
+"""What the documentation says is true: examples run, commands parse, paths and links exist, figures are the data's.
+
+Examples are the fenced blocks of README and docs. A comment before a block says how it is tested, invisible to readers:
+
+    <!-- test: parse -->    Python that needs data or minutes: its syntax is checked, and its imports are made
+    <!-- test: skip -->     a shell block with placeholders
+
+All other Python blocks of a page run in one namespace, in order. Every ``potlp ...`` line has to parse.
+"""
+
+import ast
+import copy
+import functools
+import importlib
+import importlib.util
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import typer.core
+import yaml
+from typer.testing import CliRunner
+
+from potlp_jax.cli import app
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+BLOCK = re.compile(
+    r"^(?:<!-- test: (?P<how>\w+) -->\n+)?(?P<indent> *)```(?P<language>\w*)\n(?P<code>.*?)^(?P=indent)```$",
+    re.M | re.S,
+)
+KNOWN_PROGRAMS = {
+    "pip",
+    "conda",
+    "make",
+    "taskset",
+    "mkdocs",
+    "pre-commit",
+    "git",
+    "ruff",
+    "pyright",
+    "pytest",
+    "python",
+    ".",
+}
+GENERATED = ("api/", "notebooks/", "contributing.md", "changes.md")
+"""Pages that docs/site_hooks.py makes; `mkdocs build --strict` checks links to them."""
+
+
+def _name(path):
+    return str(path.relative_to(ROOT))
+
+
+def _blocks(page, *languages):
+    return [match for match in BLOCK.finditer(page.read_text()) if match["language"] in languages]
+
+
+def _prose(page):
+    """A page without its fenced blocks."""
+    return BLOCK.sub("", page.read_text())
+
+
+@functools.cache
+def _python_pages():
+    return [page for page in PAGES if _blocks(page, "python")]
+
+
+@pytest.mark.parametrize("page", _python_pages(), ids=_name)
+def test_python_examples_run(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    namespace = {"__name__": "example"}
+    for block in _blocks(page, "python"):
+        tree = compile(block["code"], _name(page), "exec", ast.PyCF_ONLY_AST)
+        if block["how"] == "parse":
+            imports = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
+            tree = ast.Module(imports, [])
+        else:
+            assert block["how"] is None, f"unknown test: {block['how']}"
+        exec(compile(tree, _name(page), "exec"), namespace)
+
+
+def _commands(page):
+    """Shell commands of a page's blocks and of its inline code that begins with ``potlp``, as lists of words."""
+    lines = []
+    for block in _blocks(page, "sh", "bash", "console", ""):
+        if block["how"] == "skip":
+            continue
+        code = block["code"].replace("\\\n", " ")
+        if block["language"] in ("console", "") and "$ " in code:
+            # A transcript: lines with a prompt are commands, the others what they print.
+            lines += [line[2:] for line in code.splitlines() if line.startswith("$ ")]
+        elif block["language"] in ("sh", "bash"):
+            lines += code.splitlines()
+    inline = re.findall(r"(?<!`)`(potlp (?!\.\.\.)[^`]+)`(?!`)", re.sub(r"\n *", " ", _prose(page)))
+    lines += [line for line in inline if "..." not in line]
+    for line in lines:
+        tokens = shlex.shlex(line, posix=True, punctuation_chars="&|;")
+        tokens.whitespace_split, tokens.commenters = True, "#"
+        command = []
+        for token in [*tokens, "&"]:
+            if set(token) <= set("&|;"):
+                if command:
+                    yield line, command
+                command = []
+            else:
+                command.append(token)
+
+
+@pytest.fixture
+def parse(monkeypatch):
+    """Parses a ``potlp`` command line without running it; returns the exit code (2: refused) and what was printed."""
+    monkeypatch.setattr(typer.core.TyperCommand, "invoke", lambda self, ctx: None)
+
+    def run(words):
+        result = CliRunner().invoke(app, words)
+        return result.exit_code, result.output
+
+    return run
+
+
+PAGES_WITH_COMMANDS = [page for page in PAGES if any(_commands(page))]
+
+
+@pytest.mark.parametrize("page", PAGES_WITH_COMMANDS, ids=_name)
+def test_command_lines_parse(page, parse):
+    for line, words in _commands(page):
+        program = Path(words[0]).name
+        if program == "potlp":
+            if words[1:] and words[1].isupper():
+                continue  # `potlp COMMAND --help`
+            code, told = parse(words[1:])
+            assert code == 0, f"{line}: {told}"
+        elif program == "python" and words[1:2] == ["-m"]:
+            assert importlib.util.find_spec(words[2]) is not None, f"{line}: no module {words[2]}"
+        elif program == "make":
+            targets = re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.M)
+            assert set(words[1:]) <= set(targets), f"{line}: the Makefile has {targets}"
+        else:
+            assert program in KNOWN_PROGRAMS or words[0].startswith(".") or "=" in words[0], f"{line}: {program}?"
+
+
+@pytest.mark.parametrize("line", ["run firefighting --no-such-option", "no-such-command", "run", "run toy --world x"])
+def test_a_wrong_command_line_is_refused(line, parse):
+    assert parse(line.split())[0] == 2
+
+
+FOLDERS = ("docs", "eval", "tests", "notebooks", "examples", "potlp_jax")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_paths_in_code_exist(page):
+    rooms = {path.name for path in (ROOT / "potlp_jax").iterdir() if path.is_dir()}
+    for word in re.findall(r"(?<!`)`([\w./*-]+/[\w./*-]+)`(?!`)", _prose(page)):
+        first = word.split("/")[0]
+        if first in FOLDERS:
+            assert list(ROOT.glob(word)), f"{word} does not exist"
+        elif first in rooms and word.endswith((".py", "/")):
+            assert list((ROOT / "potlp_jax").glob(word)), f"{word} does not exist in potlp_jax"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_dotted_names_exist(page):
+    for name in set(re.findall(r"`(potlp_jax(?:\.\w+)+)`", _prose(page))):
+        parts = name.split(".")
+        for count in range(len(parts), 0, -1):
+            module = ".".join(parts[:count])
+            try:
+                found = importlib.import_module(module)
+            except ModuleNotFoundError as error:
+                if error.name is None or not module.startswith(error.name):
+                    raise
+                continue
+            for part in parts[count:]:
+                found = getattr(found, part)
+            break
+
+
+def _anchors(page):
+    """What mkdocs makes of headings."""
+    anchors = set()
+    for heading in re.findall(r"^#+ (.+)$", _prose(page), re.M):
+        text = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading)
+        anchors.add(re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", text.replace("`", "")).strip().lower()))
+    return anchors
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_links_resolve(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", _prose(page)):
+        if re.match(r"https?:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        if path.startswith(GENERATED):
+            continue
+        file = (page.parent / path).resolve() if path else page
+        assert file.exists(), f"{target} does not exist"
+        if anchor:
+            assert anchor in _anchors(file), f"{target}: {_name(file)} has {sorted(_anchors(file))}"
+
+
+def test_the_navigation_has_every_page():
+    listed = set(re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text())) - {"contributing.md", "changes.md"}
+    assert listed == {str(page.relative_to(ROOT / "docs")) for page in PAGES if page.is_relative_to(ROOT / "docs")}
+
+
+def test_the_picture_of_the_house_has_every_room():
+    picture = (ROOT / "docs" / "architecture.md").read_text().split("```text\n", 1)[1].split("```", 1)[0]
+    drawn = set(re.findall(r"^  (\w+)(?:/|\.py)", picture, re.M))
+    rooms = {
+        path.stem for path in (ROOT / "potlp_jax").iterdir() if (path / "__init__.py").exists() or path.suffix == ".py"
+    }
+    assert drawn == rooms
+
+
+QUOTED = yaml.safe_load((ROOT / "docs" / "quoted.yaml").read_text())
+
+
+def _value(data, path):
+    head, _, rest = path.partition(".")
+    for step in f"{QUOTED['names'].get(head, head)}{'.' if rest else ''}{rest}".split("."):
+        if step.startswith("["):
+            key, _, wanted = step[1:-1].partition("=")
+            (data,) = [entry for entry in data if str(entry[key]) == wanted]
+        else:
+            data = data[int(step)] if isinstance(data, list) else data[step]
+    return data
+
+
+def _render(text, data):
+    """A quoted text with its placeholders filled from data."""
+
+    def value(match):
+        number = _value(data, match[1])
+        return f"{100 * number if match[2] else number:.{match[3]}f}"
+
+    return re.sub(r"\{([^:}]+):(%?)(\d)\}", value, text)
+
+
+def _flat(page):
+    return re.sub(r"\s+", " ", (ROOT / page).read_text())
+
+
+def _quotes():
+    return [
+        (entry["source"], page, text)
+        for entry in QUOTED["quotes"]
+        for page in entry["pages"]
+        for text in entry["texts"]
+    ]
+
+
+@pytest.mark.parametrize(("source", "page", "text"), _quotes())
+def test_quoted_figures_are_those_of_the_data(source, page, text):
+    rendered = _render(text, json.loads((ROOT / source).read_text()))
+    assert rendered in _flat(page), f"{page} does not say what {source} has: {rendered}"
+
+
+def test_another_figure_in_the_data_is_noticed():
+    source, page, text = _quotes()[0]
+    data = json.loads((ROOT / source).read_text())
+    other = copy.deepcopy(data)
+    _value(other, "t3")["attainable_low"] += 0.02
+    assert _render(text, data) in _flat(page)
+    assert _render(text, other) not in _flat(page)
+
+
+@pytest.mark.parametrize("page", list(QUOTED["complete"]))
+def test_no_percentage_of_a_front_page_is_without_a_source(page):
+    text = _flat(page)
+    for source, quoted, template in _quotes():
+        if quoted == page:
+            text = text.replace(_render(template, json.loads((ROOT / source).read_text())), "")
+    found = set(re.findall(r"[\d.,]*\d %", text))
+    assert found == set(QUOTED["complete"][page])

@@ -1,0 +1,159 @@
+"""Recipes: the shipped ones are what made the shipped estimators, and a small one makes an estimator."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from potlp_jax.cli import app
+from potlp_jax.codec import json_copy, shipped_settings
+from potlp_jax.environments.registry import make
+from potlp_jax.environments.splits import Split
+from potlp_jax.errors import ConfigurationError
+from potlp_jax.learning.dataset import read_metadata
+from potlp_jax.learning.estimator import shipped_estimator
+from potlp_jax.learning.serialization import load_estimator
+from potlp_jax.recipes.fitting import ESTIMATOR
+from potlp_jax.recipes.journal import Display
+from potlp_jax.recipes.recipe import PACKAGE, follow, read_recipe
+
+SHIPPED = ("delivery", "firefighting", "parcels")
+
+# One pass over a few small pictures of two-room worlds: the code of a whole training in seconds.
+SMALL = {
+    "environment": "toy",
+    "training_worlds": 4,
+    "validation_worlds": 2,
+    "collect": {
+        "worlds_per_shard": 2,
+        "views_per_world": 3,
+        "tasks_per_world": 3,
+        "classes": 3,
+        "staying_sets": 2,
+        "camera": {"height": 64, "width": 64},
+    },
+    "fit": {
+        "epochs": 1,
+        "second_widths": [3, 4, 5, 6, 7, 8, 9, 9],
+        "training": {"views_per_batch": 2, "samples_per_view": 4, "seed": 3},
+    },
+}
+
+
+def test_every_shipped_estimator_has_its_recipe():
+    assert tuple(shipped_settings(PACKAGE)) == SHIPPED
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_recipe_is_what_made_the_shipped_file(name):
+    recipe = read_recipe(name)
+    estimator = shipped_estimator(make(recipe.environment).propositions)
+    assert estimator is not None
+    made, data = estimator.metadata["training"], estimator.metadata["data"]
+    options = json_copy(dataclasses.asdict(recipe.fit.training))
+    assert options == {key: value for key, value in made.items() if key != "steps"}
+    per_epoch = estimator.metadata["panoramas"] // recipe.fit.training.views_per_batch
+    assert abs(made["steps"] - recipe.fit.epochs * per_epoch) <= recipe.fit.epochs
+    for field in ("exclusive_within", "fovea", "second_widths"):
+        assert getattr(recipe.fit, field) == getattr(estimator.config, field)
+    collected = json_copy(dataclasses.asdict(recipe.collect))
+    assert data["environment"] == recipe.environment
+    assert data["disturbance"] == collected["disturbance"]
+    assert data["encoding"] == {"format": collected["image_format"], "quality": collected["quality"]}
+    assert data["camera"].items() <= collected["camera"].items()
+    for field in ("seed", "held_out", "views_per_world", "tasks_per_world", "classes", "staying_sets", "spacing"):
+        assert data["collection"][field] == collected[field]
+    # No world gives more views than this; most give as many.
+    most = recipe.training_worlds * recipe.collect.views_per_world
+    assert 0.9 * most < estimator.metadata["panoramas"] <= most
+
+
+def test_a_small_recipe_makes_an_estimator_and_continues(tmp_path):
+    (tmp_path / "small.yaml").write_text(json.dumps(SMALL))
+    recipe = read_recipe(tmp_path / "small.yaml")
+    lines, told = [], []
+    trained = follow(
+        recipe,
+        tmp_path / "out",
+        tell=lambda split, collected: told.append((split, collected.worlds)),
+        display=Display(say=lines.append),
+    )
+    assert told == [(Split.TRAINING, 0), (Split.TRAINING, 2), (Split.TRAINING, 4), ("validation", 0), ("validation", 2)]
+    assert any(line.startswith("epoch   1.0") for line in lines)
+    params, config, metadata = load_estimator(tmp_path / "out" / ESTIMATOR)
+    for found, expected in zip(jax.tree.leaves(params), jax.tree.leaves(trained.params), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    assert config.propositions == make("toy").propositions
+    assert config.second_widths == recipe.fit.second_widths
+    assert metadata["training"]["seed"] == 3
+    assert read_metadata(tmp_path / "out" / "validation").split == "validation"
+    again = follow(recipe, tmp_path / "out", display=Display(say=lines.append))
+    assert lines[-1].startswith("resumed at step")
+    assert again.best_step == trained.best_step
+
+
+def _potlp(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def test_the_commands_collect_and_fit_by_a_recipe(tmp_path):
+    (tmp_path / "small.yaml").write_text(json.dumps(SMALL))
+    told = _potlp("collect", "--recipe", tmp_path / "small.yaml", "--split", "validation", "--out", tmp_path / "data")
+    assert told.exit_code == 0, told.stderr
+    assert "views" in told.stdout
+    assert read_metadata(tmp_path / "data").split == "validation"
+    told = _potlp("fit", "--recipe", tmp_path / "small.yaml", "--out", tmp_path / "out", "--fovea", 2)
+    assert told.exit_code == 0, told.stderr
+    assert "ended by planned" in told.stdout
+    _, config, metadata = load_estimator(tmp_path / "out" / ESTIMATOR)
+    assert config.fovea == 2
+    assert metadata["training"]["seed"] == SMALL["fit"]["training"]["seed"]
+    assert (tmp_path / "out" / "curves.png").stat().st_size > 1000
+    # The same worlds with the same settings: the dataset of the other command serves as well.
+    again = _potlp("collect", "--recipe", tmp_path / "small.yaml", "--out", tmp_path / "out" / "training")
+    assert again.exit_code == 0, again.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("collect",), "name an environment, or a recipe"),
+        (("collect", "toy", "--recipe", "firefighting"), "one of the two"),
+        (("collect", "toy"), "how many worlds"),
+        (("collect", "toy", "--worlds", 4, "--set", "views=3"), "--set: unknown field 'views'"),
+        (("collect", "mars", "--worlds", 4), "mars"),
+        (("fit",), "give a DATASET and --validation, or a recipe"),
+        (("fit", "data"), "another of other worlds"),
+        (("fit", "--recipe", "soup"), "neither a file nor one of those that are shipped"),
+    ],
+)
+def test_what_is_wrong_with_a_command_is_named(tmp_path, arguments, message):
+    told = _potlp(*arguments, "--out", tmp_path)
+    assert told.exit_code == 2
+    assert message in " ".join(told.stderr.split())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"worlds": 3}, "unknown field 'worlds'; known: environment, training_worlds"),
+        ({"fit": {"epochs": 0}}, r"small\.yaml\.fit: epochs is 0; give at least 1"),
+        ({"fit": {"training": {"steps": 5}}}, "fit.training: unknown field 'steps'"),
+        ({"collect": {"camera": {"height": "tall"}}}, "collect.camera.height: give a whole number"),
+    ],
+)
+def test_what_is_wrong_with_a_recipe_is_named(tmp_path, changes, message):
+    (tmp_path / "small.yaml").write_text(json.dumps({**SMALL, **changes}))
+    with pytest.raises(ConfigurationError, match=message):
+        read_recipe(tmp_path / "small.yaml")
+
+
+def test_a_recipe_that_is_not_there_is_named_beside_those_that_are(tmp_path):
+    with pytest.raises(ConfigurationError, match=r"soup: neither a file nor .*delivery, firefighting, parcels"):
+        read_recipe("soup")
+    (tmp_path / "empty.yaml").write_text("environment: toy")
+    with pytest.raises(ConfigurationError, match="training_worlds, validation_worlds is missing"):
+        read_recipe(tmp_path / "empty.yaml")
