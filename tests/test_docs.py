@@ -10,7 +10,9 @@ All other Python blocks of a page run in one namespace, in order. Every ``potlp 
 
 import ast
 import copy
+import csv
 import functools
+import gzip
 import importlib
 import importlib.util
 import json
@@ -94,7 +96,8 @@ def _commands(page):
         elif block["language"] in ("sh", "bash"):
             lines += code.splitlines()
     inline = re.findall(r"(?<!`)`(potlp (?!\.\.\.)[^`]+)`(?!`)", re.sub(r"\n *", " ", _prose(page)))
-    lines += [line for line in inline if "..." not in line]
+    # A command that is only mentioned has no arguments: it has to exist.
+    lines += [f"{line} --help" if re.fullmatch(r"[a-z -]+", line) else line for line in inline if "..." not in line]
     for line in lines:
         tokens = shlex.shlex(line, posix=True, punctuation_chars="&|;")
         tokens.whitespace_split, tokens.commenters = True, "#"
@@ -264,6 +267,20 @@ def test_another_figure_in_the_data_is_noticed():
     _value(other, "t3")["attainable_low"] += 0.02
     assert _render(text, data) in _flat(page)
     assert _render(text, other) not in _flat(page)
+
+
+def test_wins_and_ties_are_those_of_the_rows():
+    costs = {}
+    with gzip.open(ROOT / "docs/results/table1/rows.csv.gz", "rt", newline="") as file:
+        for row in csv.DictReader(file):
+            costs.setdefault((row["task"], row["world"]), {})[row["policy"]] = float(row["cost"])
+    page = (ROOT / "docs/results/table1.md").read_text()
+    tasks = json.loads((ROOT / "docs/results/table1/test.json").read_text())["tables"]
+    for number, table in tasks.items():
+        # Costs in the file are rounded to three decimals, and equal paths have equal costs.
+        gains = [world["baseline"] - world["potlp"] for (task, _), world in costs.items() if task == table["task"]]
+        shares = [100 * sum(map(test, gains)) / len(gains) for test in ((0).__lt__, (0).__eq__, (0).__gt__)]
+        assert f"| {number} | {' | '.join(f'{share:.1f} %' for share in shares)} |" in page
 
 
 @pytest.mark.parametrize("page", list(QUOTED["complete"]))
