@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from potlp_jax.planning.problem import enumerate_actions as enumerate_actions
     from potlp_jax.planning.search.api import Plan as Plan
     from potlp_jax.planning.search.api import plan_actions as plan_actions
-    from potlp_jax.planning.search.graph import SearchConfig as SearchConfig
+    from potlp_jax.planning.search.config import SearchConfig as SearchConfig
+    from potlp_jax.planning.search.config import UctConfig as UctConfig
     from potlp_jax.rl.episodes import TaskEnv as TaskEnv
     from potlp_jax.task.task import Task as Task
     from potlp_jax.task.task import TaskArrays as TaskArrays
@@ -105,6 +106,7 @@ __all__ = [  # noqa: RUF022 - by use, not by the alphabet
     "PlanningProblem",
     "enumerate_actions",
     "SearchConfig",
+    "UctConfig",
     "Plan",
     "plan_actions",
     "Bounds",
@@ -150,7 +152,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "planning.policies": ("DecisionConfig", "Policy", "PolicyFunction", "decide", "move_to"),
     "planning.problem": ("PlanningProblem", "enumerate_actions"),
     "planning.search.api": ("Plan", "plan_actions"),
-    "planning.search.graph": ("SearchConfig",),
+    "planning.search.config": ("SearchConfig", "UctConfig"),
     "rl.episodes": ("TaskEnv",),
     "task.task": ("Task", "TaskArrays", "TaskSizes", "stack_tasks"),
     "trials.batch": ("Finished", "Start", "run_batch"),

@@ -102,6 +102,32 @@ def read_settings(file: Path) -> Mapping[str, Any]:
     return data
 
 
+def settings_from_words(words: Sequence[str]) -> dict[str, Any]:
+    """Nested settings from words such as ``camera.height=64``; values are written as in YAML.
+
+    Raises:
+        ConfigurationError: a word has no ``=``, or its value is no YAML.
+    """
+    settings: dict[str, Any] = {}
+    for word in words:
+        path, equals, text = word.partition("=")
+        if not (path and equals):
+            raise ConfigurationError(
+                f"setting {word!r}: write name=value, with dots for names inside: camera.height=64"
+            )
+        *outer, name = path.split(".")
+        inner = settings
+        for part in outer:
+            inner = inner.setdefault(part, {})
+            if not isinstance(inner, dict):
+                raise ConfigurationError(f"setting {word!r}: {part} has got a value already, so it holds no {name}")
+        try:
+            inner[name] = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigurationError(f"setting {word!r}: {text!r} is no value as in YAML") from error
+    return settings
+
+
 def shipped_settings(package: str) -> dict[str, Path]:
     """The YAML files that come with a package as its data, by name without the ending."""
     folder = Path(str(resources.files(package))) / "data"

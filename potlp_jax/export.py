@@ -34,7 +34,7 @@ from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.policies import DecisionConfig, Move, MoveKind
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig, UctConfig
 from potlp_jax.task.task import Task
 from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL, Status
 from potlp_jax.world.grid import BeliefMap
@@ -182,7 +182,7 @@ def _programs(task: Task, config: ExportConfig) -> list[_Program]:
     return [search, _subgoals_program(task, config.grid, config), _decide_program(task, config.grid, config)]
 
 
-def _plan_program(task: Task, subgoals: int, search: SearchConfig) -> _Program:
+def _plan_program(task: Task, subgoals: int, search: SearchConfig | UctConfig) -> _Program:
     arrays, states, classes = task.arrays, task.sizes.states, task.sizes.classes
     # Concrete here, constants of the program there.
     names = ("travel", "finish", "success_probability", "success_cost", "failure_cost")

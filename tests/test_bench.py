@@ -26,7 +26,7 @@ from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.policies import DecisionConfig
 from potlp_jax.planning.search.api import search_tree
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig
 from potlp_jax.task.task import Task
 from potlp_jax.world.frontiers import FrontierConfig
 
@@ -230,7 +230,7 @@ from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.bench.problems import family_problem
 from potlp_jax.planning.search.api import plan_actions
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig
 problem = family_problem("find", 2, "tuning", 0)
 plan = jax.jit(plan_actions, static_argnums=2)(problem, jax.random.key(0), SearchConfig(simulations=12))
 print(json.dumps({"folder": str(folder), "hits": sum(hits), "q": repr(plan.q_values.tolist())}))

@@ -8,7 +8,15 @@ from typing import Literal
 
 import pytest
 
-from potlp_jax.codec import config_from_dict, differences, finite_or_null, finite_or_text, json_copy, with_settings
+from potlp_jax.codec import (
+    config_from_dict,
+    differences,
+    finite_or_null,
+    finite_or_text,
+    json_copy,
+    settings_from_words,
+    with_settings,
+)
 from potlp_jax.errors import ConfigurationError
 from potlp_jax.trials.config import TrialConfig
 
@@ -119,3 +127,29 @@ def test_numbers_that_are_not_finite_have_a_form_in_json():
     assert float(text["cost"]) == math.inf
     assert [float(value) for value in text["list"][:2]] == [1.0, -math.inf]
     assert finite_or_null(values) == {"cost": None, "list": [1.0, None, None], "text": "inf", "count": 3}
+
+
+def test_settings_are_read_from_words():
+    words = ["width=3", "shape.kind=polygon", "shape.corners=[[1, 2]]", "colour=green"]
+    assert settings_from_words(words) == {
+        "width": 3,
+        "shape": {"kind": "polygon", "corners": [[1, 2]]},
+        "colour": "green",
+    }
+    assert with_settings(Drawing(), settings_from_words(words)) == Drawing(
+        shape=Polygon(((1, 2),)), colour=Colour.GREEN, width=3
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["width"], "'width': write name=value"),
+        (["=3"], "'=3': write name=value"),
+        (["width=["], "no value as in YAML"),
+        (["shape=3", "shape.radius=2"], "shape has got a value already"),
+    ],
+)
+def test_words_that_are_no_settings_are_named(words, message):
+    with pytest.raises(ConfigurationError, match=message):
+        settings_from_words(words)

@@ -18,7 +18,7 @@ from potlp_jax.planning.decision import frontier_subgoals
 from potlp_jax.planning.policies import DecisionConfig, MoveKind, Policy, decide_jit
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import Plan, plan_actions
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig
 from potlp_jax.task.task import Task
 from potlp_jax.types import Status
 from potlp_jax.world.frontiers import FrontierConfig

@@ -6,9 +6,11 @@ import json
 import jax
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from potlp_jax.cli import app
 from potlp_jax.codec import json_copy, shipped_settings
-from potlp_jax.environments import make
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
 from potlp_jax.errors import ConfigurationError
 from potlp_jax.learning.dataset import read_metadata
@@ -91,6 +93,47 @@ def test_a_small_recipe_makes_an_estimator_and_continues(tmp_path):
     again = follow(recipe, tmp_path / "out", display=Display(say=lines.append))
     assert lines[-1].startswith("resumed at step")
     assert again.best_step == trained.best_step
+
+
+def _potlp(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def test_the_commands_collect_and_fit_by_a_recipe(tmp_path):
+    (tmp_path / "small.yaml").write_text(json.dumps(SMALL))
+    told = _potlp("collect", "--recipe", tmp_path / "small.yaml", "--split", "validation", "--out", tmp_path / "data")
+    assert told.exit_code == 0, told.stderr
+    assert "views" in told.stdout
+    assert read_metadata(tmp_path / "data").split == "validation"
+    told = _potlp("fit", "--recipe", tmp_path / "small.yaml", "--out", tmp_path / "out", "--fovea", 2)
+    assert told.exit_code == 0, told.stderr
+    assert "ended by planned" in told.stdout
+    _, config, metadata = load_estimator(tmp_path / "out" / ESTIMATOR)
+    assert config.fovea == 2
+    assert metadata["training"]["seed"] == SMALL["fit"]["training"]["seed"]
+    assert (tmp_path / "out" / "curves.png").stat().st_size > 1000
+    # The same worlds with the same settings: the dataset of the other command serves as well.
+    again = _potlp("collect", "--recipe", tmp_path / "small.yaml", "--out", tmp_path / "out" / "training")
+    assert again.exit_code == 0, again.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("collect",), "name an environment, or a recipe"),
+        (("collect", "toy", "--recipe", "firefighting"), "one of the two"),
+        (("collect", "toy"), "how many worlds"),
+        (("collect", "toy", "--worlds", 4, "--set", "views=3"), "--set: unknown field 'views'"),
+        (("collect", "mars", "--worlds", 4), "mars"),
+        (("fit",), "give a DATASET and --validation, or a recipe"),
+        (("fit", "data"), "another of other worlds"),
+        (("fit", "--recipe", "soup"), "neither a file nor one of those that are shipped"),
+    ],
+)
+def test_what_is_wrong_with_a_command_is_named(tmp_path, arguments, message):
+    told = _potlp(*arguments, "--out", tmp_path)
+    assert told.exit_code == 2
+    assert message in " ".join(told.stderr.split())
 
 
 @pytest.mark.parametrize(

@@ -380,7 +380,7 @@ def test_resuming_with_other_options_or_data_names_the_difference(tmp_path):
     samples = synthetic(4, 4, 9)
     network = _network(samples, TINY)
     train(network, samples, samples, _config(2), folder=tmp_path)
-    with pytest.raises(CheckpointError, match=r"training\.learning_rate is 0\.002 in the file and 0\.1 here"):
+    with pytest.raises(CheckpointError, match=r"training\.learning_rate was 0\.002, is 0\.1"):
         train(network, samples, samples, _config(2, learning_rate=0.1), folder=tmp_path)
     renamed = dataclasses.replace(network.config, propositions=("red", "blue"))
     with pytest.raises(CheckpointError, match=r"network\.propositions .*green.*blue"):
@@ -402,15 +402,17 @@ def test_the_command_writes_an_estimator_and_resumes(tmp_path):
         columns |= {"success_probability": samples.success.tolist()}
         camera = {"horizon": 24.0, "far": 50.0, "fold": 8.0}
         write_shard(tmp_path / name, 0, views, columns, dataclasses.replace(METADATA, camera=camera))
-    command = [sys.executable, "-m", "train.fit", str(tmp_path / "training"), "--validation", tmp_path / "validation"]
-    command += ["--out", str(tmp_path / "out"), "--epochs", "2", "--views-per-batch", "2", "--samples-per-view", "2"]
-    command += ["--fovea", "3", "--second-widths", *"34567899"]
-    for expected in ("epoch   2.0", "ended by planned"):
+    command = [sys.executable, "-c", "from potlp_jax.cli import main; main()", "fit", str(tmp_path / "training")]
+    command += ["--validation", str(tmp_path / "validation"), "--out", str(tmp_path / "out"), "--epochs", "2"]
+    command += ["--set", "training.views_per_batch=2", "--set", "training.samples_per_view=2"]
+    command += ["--fovea", "3", "--set", "second_widths=[3, 4, 5, 6, 7, 8, 9, 9]"]
+    for expected in ("epoch   2.0", "resumed at step"):
         done = subprocess.run(
             command, capture_output=True, text=True, cwd=ROOT, timeout=400, env=_environment(tmp_path)
         )
         assert done.returncode == 0, done.stderr
-        assert expected in done.stdout
+        assert expected in done.stderr
+        assert "ended by planned" in done.stdout
     params, config, metadata = load_estimator(tmp_path / "out" / "estimator.npz")
     assert config.propositions == ("red", "green")
     assert (config.fovea, config.horizon, config.second_widths) == (3, 24.0, (3, 4, 5, 6, 7, 8, 9, 9))
@@ -420,5 +422,5 @@ def test_the_command_writes_an_estimator_and_resumes(tmp_path):
     assert (tmp_path / "out" / "curves.png").stat().st_size > 1000
     assert list((tmp_path / "out" / "tensorboard").iterdir())
     refused = subprocess.run([*command, "--seed", "1"], capture_output=True, text=True, cwd=ROOT)
-    assert refused.returncode == 1
-    assert "'seed': 0" in refused.stderr
+    assert refused.returncode == 2
+    assert "seed was 0, is 1" in refused.stderr

@@ -35,8 +35,10 @@ from potlp_jax.bench.problems import FAMILIES, SUBGOAL_COUNTS, Split, family_pro
 from potlp_jax.planning.exact.api import ProblemTooLargeError, bound_exact, solve_exact
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions
-from potlp_jax.planning.search.best_first import choose, is_open, simulate
-from potlp_jax.planning.search.graph import Context, SearchConfig, SearchMode, Tree, new_search
+from potlp_jax.planning.search.best_first import BEST_FIRST
+from potlp_jax.planning.search.config import SearchConfig, UctConfig
+from potlp_jax.planning.search.lockstep import Search
+from potlp_jax.planning.search.uct import UCT
 from potlp_jax.types import NO_ACTION
 
 mpl.use("Agg")
@@ -137,31 +139,37 @@ def _long_search(problem: PlanningProblem, key: Any) -> Any:
     return plan_actions(problem, key, config).q_values
 
 
-def ours(name: str, **settings: Any) -> Callable[..., Iterator[Answer]]:
-    """Our search on all instances in one batch; every budget goes on from the one before."""
+def ours(
+    name: str, search: Search = BEST_FIRST, kind: type[SearchConfig | UctConfig] = SearchConfig, **settings: Any
+) -> Callable[..., Iterator[Answer]]:
+    """One of our searches on all instances in one batch; every budget goes on from the one before."""
 
     def run(problems: Sequence[PlanningProblem], budgets: Sequence[int]) -> Iterator[Answer]:
-        config = SearchConfig(simulations=max(budgets), **settings)
-        leaves, structure = jax.tree.flatten(_stack(problems))
+        config = kind(simulations=max(budgets), **settings)
+        stacked = _stack(problems)
         seeds = jax.vmap(lambda key: jax.random.bits(key, (2,), jnp.uint32))(
             jax.random.split(jax.random.key(0), len(problems))
         )
-        begin = jax.jit(lambda leaves, seeds: new_search(structure, leaves, seeds, config))
-
-        def unfinished(context: Context, carry: tuple[Any, Tree]) -> Any:
-            return (carry[0] > 0) & jnp.any(is_open(context, carry[1], config))
 
         @jax.jit
-        def advance(context: Context, tree: Tree, count: Any) -> tuple[Tree, Any]:
-            def step(carry: tuple[Any, Tree]) -> tuple[Any, Tree]:
-                return carry[0] - 1, simulate(context, carry[1], config)
+        def begin(problems: PlanningProblem, seeds: Any) -> tuple[Any, Any]:
+            context = search.prepare(problems, seeds, config)
+            return context, search.plant(context, config)
+
+        def unfinished(context: Any, carry: tuple[Any, Any]) -> Any:
+            return (carry[0] > 0) & jnp.any(search.is_open(context, carry[1]))
+
+        @jax.jit
+        def advance(context: Any, tree: Any, count: Any) -> tuple[Any, Any]:
+            def step(carry: tuple[Any, Any]) -> tuple[Any, Any]:
+                return carry[0] - 1, search.simulate(context, carry[1], config)
 
             tree = jax.lax.while_loop(functools.partial(unfinished, context), step, (count, tree))[1]
-            return tree, choose(context, tree, config).action
+            return tree, search.choose(context, tree).action
 
-        jax.block_until_ready(advance(*begin(leaves, seeds), jnp.int32(1)))
+        jax.block_until_ready(advance(*begin(stacked, seeds), jnp.int32(1)))
         start = time.process_time()
-        context, tree = jax.block_until_ready(begin(leaves, seeds))
+        context, tree = jax.block_until_ready(begin(stacked, seeds))
         spent, before = time.process_time() - start, 0
         for budget in budgets:
             start = time.process_time()
@@ -225,14 +233,14 @@ def _in_batches(
 
 PLANNERS: dict[str, Callable[..., Iterator[Answer]]] = {
     "ours": ours("ours"),
-    "authors_code": ours("ours, authors_code", mode=SearchMode.AUTHORS_CODE, exploration=50.0),
+    "uct": ours("ours, uct", UCT, UctConfig),
     "numba": numba_pouct,
     "pomdp-py": pomdp_py,
     "mctx": mctx,
 }
 FEW = {"pomdp-py": 6}
 """Instances of a planner too slow for all."""
-LARGEST = {"ours": 1000, "authors_code": 1000, "pomdp-py": 1000, "mctx": 1000}
+LARGEST = {"ours": 1000, "uct": 1000, "pomdp-py": 1000, "mctx": 1000}
 """Budgets beyond which a planner is not asked: it gains no more, or takes too long."""
 
 

@@ -33,7 +33,7 @@ import numpy as np
 from eval.bench.opponents import installed
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions, search
-from potlp_jax.planning.search.graph import SearchConfig, SearchMode
+from potlp_jax.planning.search.config import SearchConfig, UctConfig
 from potlp_jax.task.task import Task
 
 mpl.use("Agg")
@@ -125,9 +125,11 @@ def problem_batch(goals: int, subgoals: int, batch: int) -> PlanningProblem:
     )
 
 
-def kernel(problems: PlanningProblem, simulations: int, **settings: Any) -> Prepared:
-    """The batched kernel."""
-    config = SearchConfig(simulations=simulations, **settings)
+def kernel(
+    problems: PlanningProblem, simulations: int, kind: type[SearchConfig | UctConfig] = SearchConfig
+) -> Prepared:
+    """The batched search of one kind, with its other settings by default."""
+    config = kind(simulations=simulations)
 
     def run(problems, keys):
         plan, tree = search(problems, keys, config)
@@ -231,7 +233,7 @@ def _pomdp_py(problems: PlanningProblem, simulations: int) -> Prepared:
 PROGRAMS: dict[str, Callable[[PlanningProblem, int], Prepared]] = {
     "search": kernel,
     "vmap(plan_actions)": under_vmap,
-    "search, authors_code": functools.partial(kernel, mode=SearchMode.AUTHORS_CODE, exploration=50.0),
+    "search, uct": functools.partial(kernel, kind=UctConfig),
     "mctx": mctx,
     "pomdp-py": _pomdp_py,
     "numba": _numba,

@@ -23,7 +23,7 @@ from potlp_jax.planning.estimates import Estimator, ask
 from potlp_jax.planning.policies import DecisionConfig, Move, Policy, Situation, assess, decide, planning_problem
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions, search
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.types import NO_STATE
 from potlp_jax.world.grid import BeliefMap, World

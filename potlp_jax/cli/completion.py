@@ -5,6 +5,8 @@ those import jax; ``tests/test_cli.py`` compares them.
 """
 
 from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -48,6 +50,12 @@ def complete_policies(incomplete: str) -> list[str]:
     """Names of policies after those that are there already, joined by commas."""
     *before, last = incomplete.split(",")
     return [",".join([*before, name]) for name in _starting(POLICIES, last) if name not in before]
+
+
+def complete_recipe(incomplete: str) -> list[str]:
+    """Shipped recipes."""
+    folder = Path(str(resources.files("potlp_jax.recipes"))) / "data"
+    return _starting([path.stem for path in sorted(folder.glob("*.yaml"))], incomplete)
 
 
 def complete_split(incomplete: str) -> list[str]:

@@ -19,6 +19,8 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
         "view": "potlp_jax.cli.view",
         "sweep": "potlp_jax.cli.sweep",
         "report": "potlp_jax.cli.report",
+        "collect": "potlp_jax.cli.collect",
+        "fit": "potlp_jax.cli.fit",
         "estimator": "potlp_jax.cli.estimator",
         "map": "potlp_jax.cli.maps",
         "log": "potlp_jax.cli.log",

@@ -5,7 +5,13 @@ from typing import Annotated
 
 import typer
 
-from potlp_jax.cli.completion import complete_environment, complete_policy, complete_split, complete_task
+from potlp_jax.cli.completion import (
+    complete_environment,
+    complete_policy,
+    complete_recipe,
+    complete_split,
+    complete_task,
+)
 
 Json = Annotated[bool, typer.Option("--json", help="Write JSON, and nothing else, to stdout.")]
 OpenPage = Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")]
@@ -83,3 +89,22 @@ Propositions = Annotated[
 # What `potlp run` and `potlp sweep` wrote.
 TrialFile = Annotated[Path, typer.Argument(metavar="TRIAL", help="Folder or file that `potlp run --out` wrote.")]
 SweepFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a sweep, as --out named it.")]
+
+# What makes estimators.
+RecipeName = Annotated[
+    str | None,
+    typer.Option(
+        "--recipe",
+        "-r",
+        help="What makes an estimator: the name of a shipped recipe ([cyan]firefighting[/cyan], [cyan]delivery[/cyan], "
+        "[cyan]parcels[/cyan]) or a file of your own.",
+        autocompletion=complete_recipe,
+    ),
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="NAME=VALUE", help="Change a setting, such as training.patience=10; may be repeated."
+    ),
+]
+Processes = Annotated[int, typer.Option("--processes", min=1, help="Collect in so many processes, each on a core.")]

@@ -37,7 +37,7 @@ from potlp_jax.planning.estimates import Estimates, Estimator, ask
 from potlp_jax.planning.history import ActionTerms, action_terms, initial_history
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import Plan, plan_actions
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig, UctConfig
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_ACTION, NO_STATE, Status, status_array, status_if
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
@@ -81,7 +81,7 @@ class DecisionConfig:
     its way turns to it; 0: at once, as published."""
 
     frontiers: FrontierConfig = FrontierConfig()
-    search: SearchConfig = SearchConfig()
+    search: SearchConfig | UctConfig = SearchConfig()
     dead_end_factor: float = 4.0
     commitment: float = 0.15
     path_horizon: int | None = None

@@ -60,15 +60,13 @@ def read_recipe(given: str | Path) -> Recipe:
     missing = [name for name in ("environment", "training_worlds", "validation_worlds") if name not in data]
     if missing:
         raise ConfigurationError(f"{path}: {', '.join(missing)} is missing")
-    environment = str(data["environment"])
-    # What is not said is as the family of worlds wants it.
-    defaults = Recipe(
-        environment=environment,
-        training_worlds=0,
-        validation_worlds=0,
-        collect=collection_of(make(environment)),
-    )
-    return with_settings(defaults, data, str(path))
+    return with_settings(recipe_for(str(data["environment"])), data, str(path))
+
+
+def recipe_for(environment: str) -> Recipe:
+    """What is recorded and fitted where nothing else is said, for a family of worlds by name; of no worlds yet."""
+    collect = collection_of(make(environment))
+    return Recipe(environment=environment, training_worlds=0, validation_worlds=0, collect=collect)
 
 
 def follow(

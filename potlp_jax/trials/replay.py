@@ -16,6 +16,7 @@ from potlp_jax.planning.policies import DecisionConfig, Policy, assess, planning
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import Plan, search_tree
 from potlp_jax.planning.search.graph import Tree
+from potlp_jax.planning.search.uct import UctTree
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import LOG_PREFIX, Decision, Trial
@@ -26,7 +27,7 @@ from potlp_jax.world.grid import BeliefMap
 
 def replay_decision(
     trial: Trial, index: int, estimator: TrainedEstimator | None = None
-) -> tuple[PlanningProblem, Plan, Tree]:
+) -> tuple[PlanningProblem, Plan, Tree | UctTree]:
     """Search again as in one decision of a recorded trial.
 
     Args:

@@ -216,6 +216,7 @@ def dictionary_pouct(problem, simulations, exploration, seed=0):
             outcome = rng.random() < p
             values[(*key, (action, outcome))] = simulate([*history, (action, outcome)])
             success_value, failure_value = values.get((*key, (action, True))), values.get((*key, (action, False)))
+            # An outcome that was not sampled yet is worth what the other is.
             success_value, failure_value = (
                 (failure_value if success_value is None else success_value),
                 (success_value if failure_value is None else failure_value),
@@ -229,7 +230,7 @@ def dictionary_pouct(problem, simulations, exploration, seed=0):
     return q_values[()], visits[()]
 
 
-def authors_pouct(problem, simulations, exploration, uniform):
+def literal_pouct(problem, simulations, exploration, uniform):
     """PO-UCT as in the authors' code: visits and mean cost of each action at the root.
 
     Every new history ends a simulation and is worth nothing beyond the cost so far. ``uniform(simulation, level)`` are

@@ -59,6 +59,17 @@ def least_of_each(values: Shaped[Array, "B A"], worst: int | float) -> Shaped[Ar
     return jnp.min(_combine(jnp.minimum, values, worst), axis=1)
 
 
+def first_of_least(score: Float32[Array, "B A"]) -> tuple[Int32[Array, "B"], Float32[Array, "B"]]:
+    """The action of least score and that score; ties go to the lowest index.
+
+    The minimum first, then the first index that attains it: faster on CPU than ``argmin``.
+    """
+    last = score.shape[1] - 1
+    index = jnp.arange(last + 1, dtype=jnp.int32)[None, :]
+    least = least_of_each(score, jnp.inf)
+    return least_of_each(jnp.where(score <= least[:, None], index, last), last), least
+
+
 def _combine(
     operation: Callable[[Array, Array], Array], values: Shaped[Array, "B A"], neutral: int | float
 ) -> Shaped[Array, "B w"]:
@@ -67,8 +78,3 @@ def _combine(
     count = -(-values.shape[1] // width)
     padded = jnp.pad(values, ((0, 0), (0, count * width - values.shape[1])), constant_values=neutral)
     return functools.reduce(operation, [padded[:, i * width : (i + 1) * width] for i in range(count)])
-
-
-def align(flags: Bool[Array, "B"], like: Array) -> Bool[Array, "B ..."]:
-    """Give flags the rank of ``like``."""
-    return flags.reshape(flags.shape + (1,) * (like.ndim - 1))

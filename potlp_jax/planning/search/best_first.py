@@ -1,13 +1,23 @@
-"""The search of ``potlp_jax.planning.search.api``: many planning problems in lockstep, in fixed memory.
+"""Best-first search on bounds over a graph of histories: the default search, of the family of AO*.
 
-Every row of a batch owns a graph of histories of fixed capacity. One simulation of all rows is
+Values are those of Eq. 3 itself: expectations over both outcomes, minima over actions. Outcomes that have no node yet
+have a guessed value (``search.guess``). Every node also has a **bound**: its value if every guess were too high by the
+fraction ``optimism``. One simulation of all rows of a batch is
 
-1. a descent that only reads, carries the history along, and records per level what its value depends on,
-2. one expansion,
-3. a backward pass over the recorded levels that writes.
+1. **descend**: from the root, take the action of least bound, and of its two outcomes the one that contributes more to
+   the gap between value and bound, until an outcome without a node is reached. Only reads.
+2. **expand**: give that outcome a node, or find the one that another order of the same events led to.
+3. **back up** values and bounds along the descent. Only writes.
 
-All reads come before all writes, so that the compiler updates the arrays in place and the cost of a simulation does
-not depend on their size.
+Once no gap is left at the root the search ends: what could be best under the optimistic guesses has been examined. All
+reads of a simulation come before its writes, so that XLA updates the arrays in place and the cost of a simulation does
+not depend on their size. Nothing is sampled.
+
+References:
+  Nilsson, Principles of Artificial Intelligence, 1980 (AO*).
+  Martelli and Montanari, Additive AND/OR graphs, IJCAI 1973.
+  Hansen and Zilberstein, LAO*: a heuristic search algorithm that finds solutions with loops, AIJ 2001.
+  McMahan, Likhachev and Gordon, Bounded real-time dynamic programming, ICML 2005: outcomes chosen by their gap.
 """
 
 import dataclasses
@@ -17,32 +27,123 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
-from potlp_jax.planning.history import step_row
-from potlp_jax.planning.search.arrays import least_of_each, status_of_rows, uniform, unpack_rows
-from potlp_jax.planning.search.graph import (
-    Context,
-    SearchConfig,
-    SearchMode,
-    Tree,
-    arrival,
-    find,
-    least_values,
-    new_node,
-)
-from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL, Status
+from potlp_jax.planning.history import ActionTables, History, terms_of_all
+from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.search.arrays import first_of_least, least_of_each, status_of_rows
+from potlp_jax.planning.search.config import SearchConfig
+from potlp_jax.planning.search.graph import NewNode, NodeValues, Tree, add_node, find, plant_tree
+from potlp_jax.planning.search.guess import Rule, guess_outcomes, make_rule
+from potlp_jax.planning.search.lockstep import Search
+from potlp_jax.planning.search.model import FAILURE, SUCCESS, Model, make_model
+from potlp_jax.planning.search.plan import Plan, plan_of_least_score
+from potlp_jax.task.relations import transitive_closure
+from potlp_jax.types import Status
+
+OPTIMISM: float = 0.3
+"""Optimism of problems of more than ``FEW_ACTIONS`` where the configuration names none. Tuned on the split ``tuning``
+of the families of problems (docs/results/planner.md, "How optimistic?")."""
+
+FEW_ACTIONS: int = 41
+"""Actions up to which a problem counts as small: 8 subgoals with 5 attempts each, and finish. One wrong guess then ends
+the search too early. Tuned as ``OPTIMISM``."""
+
+OPTIMISM_OF_FEW: float = 0.7
+"""Optimism of small problems. Tuned as ``OPTIMISM``: the mean regret over 12 rows of problems falls from 0.08 to 0.06 %
+and the worst from 5.9 to 4.1 %."""
+
+ALL_CONDITIONS = 0xFFFFFFFF
+"""A word of a mask over conditions in which every bit is set."""
 
 
 @struct.dataclass(kw_only=True)
-class _Descent:
-    """One descent of all rows: at ``node`` with ``pending_cost`` pending, or about to leave the graph by ``action``
-    and ``success`` (``expands``), or at an outcome that satisfies the task (``accepted``).
+class Context:
+    """What stays the same during a search.
 
-    The rest are records per level: the node's ``values``; after the child's value ``v`` is known,
-    ``Q = base + weight * v``, and likewise the bound from ``base_bound``; ``rival`` and ``low_rival`` are the least Q
-    and bound of the node's other actions of the same kind (that leave the unknown region, or that stay inside);
-    ``add`` is what to add on the way up: the pending cost at the node, in the mode ``AUTHORS_CODE`` the sampled cost of
-    the step.
-    Levels that a row did not reach hold a node beyond the tree's capacity.
+    Attributes:
+      model: the problems.
+      rule: guesses the value of outcomes without a node.
+      relevant: per state of the automaton, mask over the conditions that later choices can depend on.
+      optimism: of each problem.
+    """
+
+    model: Model
+    rule: Rule
+    relevant: UInt32[Array, "*B Z W"]
+    optimism: Float32[Array, "*B"]
+
+
+@struct.dataclass(kw_only=True)
+class Path:
+    """Records of a descent by level, for the way up. Levels that a row did not reach hold the spare node.
+
+    The value of a node depends on the action taken there by ``Q = base + weight * v``, where ``v`` is the value of the
+    outcome that was followed, and on the others by ``rival``; likewise its bound. So the way up needs no lookup.
+
+    Attributes:
+      nodes: node left at each level.
+      actions: action taken there.
+      inside: whether the action stays in the unknown region.
+      values: packed ``NodeValues`` of the node before the descent.
+      base: the part of Q that the followed outcome does not change.
+      base_bound: the same part of the bound.
+      weight: probability of the followed outcome.
+      rival: least Q of the node's other actions of the same kind (that stay inside, or that leave).
+      rival_bound: least bound of those.
+      pending_cost: at the node.
+    """
+
+    nodes: Int32[Array, "*D B"]
+    actions: Int32[Array, "*D B"]
+    inside: Bool[Array, "*D B"]
+    values: Float32[Array, "*D B 5"]
+    base: Float32[Array, "*D B"]
+    base_bound: Float32[Array, "*D B"]
+    weight: Float32[Array, "*D B"]
+    rival: Float32[Array, "*D B"]
+    rival_bound: Float32[Array, "*D B"]
+    pending_cost: Float32[Array, "*D B"]
+
+    @staticmethod
+    def empty(depth: int, batch: int, spare: int) -> "Path":
+        """Nothing recorded."""
+        floats = jnp.zeros((depth, batch), jnp.float32)
+        return Path(
+            nodes=jnp.full((depth, batch), spare, jnp.int32),
+            actions=jnp.zeros((depth, batch), jnp.int32),
+            inside=jnp.zeros((depth, batch), jnp.bool_),
+            values=jnp.zeros((depth, batch, len(dataclasses.fields(NodeValues))), jnp.float32),
+            base=floats,
+            base_bound=floats,
+            weight=floats,
+            rival=floats,
+            rival_bound=floats,
+            pending_cost=floats,
+        )
+
+    def record(self, level: Int32[Array, ""], **entries: Array) -> "Path":
+        """With all fields of one level written."""
+        return Path(
+            **{
+                name: jax.lax.dynamic_update_index_in_dim(getattr(self, name), entry, level, 0)
+                for name, entry in entries.items()
+            }
+        )
+
+
+@struct.dataclass(kw_only=True)
+class Descent:
+    """Where the descent of every row is.
+
+    Attributes:
+      level: actions taken by the rows that are still descending.
+      active: True where a row is still descending.
+      node: the node that the row is at, or from which it left the graph.
+      pending_cost: at ``node``; where the row has left the graph, after its last outcome.
+      action: last action taken.
+      success: its outcome that was followed.
+      expands: True where the row left the graph: the outcome has no node yet.
+      accepted: True where the outcome satisfies the task.
+      path: records for the way up.
     """
 
     level: Int32[Array, ""]
@@ -53,253 +154,290 @@ class _Descent:
     success: Bool[Array, "B"]
     expands: Bool[Array, "B"]
     accepted: Bool[Array, "B"]
-    nodes: Int32[Array, "D B"]
-    actions: Int32[Array, "D B"]
-    outcomes: Int32[Array, "D B"]
-    inside: Bool[Array, "D B"]
-    values: Float32[Array, "D B 5"]
-    base: Float32[Array, "D B"]
-    base_bound: Float32[Array, "D B"]
-    weight: Float32[Array, "D B"]
-    rival: Float32[Array, "D B"]
-    low_rival: Float32[Array, "D B"]
-    add: Float32[Array, "D B"]
+    path: Path
 
 
-def is_open(context: Context, tree: Tree, config: SearchConfig) -> Bool[Array, "B"]:
-    """Whether more simulations can change anything."""
-    if config.mode is SearchMode.AUTHORS_CODE:
-        return jnp.any(jnp.isfinite(tree.q_values[:, Tree.ROOT]), axis=1)
-    value, bound = arrival(tree.values[:, Tree.ROOT], context.root.pending_cost, context.dead_end_cost)
+@struct.dataclass(kw_only=True)
+class Leaf:
+    """What a descent ended at, from which to back up.
+
+    Attributes:
+      child: node of the last action's outcome, ``Tree.UNVISITED`` where it has none.
+      value: expected cost after the descent's last outcome.
+      bound: the same with optimistic guesses.
+    """
+
+    child: Int32[Array, "B"]
+    value: Float32[Array, "B"]
+    bound: Float32[Array, "B"]
+
+
+def prepare(problems: PlanningProblem, seeds: UInt32[Array, "B 2"], config: SearchConfig) -> Context:
+    """Tables, guessing rule and optimism of a batch of problems.
+
+    Args:
+      problems: every leaf has the leading axis B.
+      seeds: not used: nothing is sampled.
+      config: ``guess_failures`` and ``optimism`` matter.
+
+    Returns:
+      What the other verbs look up.
+    """
+    del seeds
+    model = make_model(problems)
+    reach = jax.vmap(_reachable_states)(model.tables)
+    terms = jax.vmap(terms_of_all)(model.tables, model.root)
+    rule = make_rule(
+        model.tables,
+        model.product_states,
+        terms.success_probability,
+        terms.success_cost,
+        reach,
+        problems.dead_end_cost,
+        config.guess_failures,
+    )
+    return Context(
+        model=model,
+        rule=rule,
+        relevant=jax.vmap(_relevant_conditions)(model.tables, reach),
+        optimism=_optimism(problems, config),
+    )
+
+
+def plant(context: Context, config: SearchConfig) -> Tree:
+    """Graphs of the roots alone."""
+    root = _new_node(context, context.model.root, config)
+    return plant_tree(context.model, root, config)
+
+
+def is_open(context: Context, tree: Tree) -> Bool[Array, "B"]:
+    """Whether a gap between value and bound is left at the root, so that more simulations can change something."""
+    value, bound = _root_value(context, tree)
     return value > bound
 
 
 def simulate(context: Context, tree: Tree, config: SearchConfig) -> Tree:
-    """One descent of all rows that are open."""
+    """One descent of all rows that are open.
+
+    Args:
+      context: of the problems.
+      tree: the graphs.
+      config: ``max_depth`` bounds the descent.
+
+    Returns:
+      The graphs with at most one more node each; rows that are not open are unchanged.
+    """
     descent = _descend(context, tree, config)
-    tree, child, value, bound = _expand(context, tree, descent, config)
-    return _back_up(tree, descent, child, value, bound, config)
+    tree, leaf = _expand(context, tree, descent, config)
+    return _count(_back_up(tree, descent, leaf), descent)
 
 
-@struct.dataclass(kw_only=True)
-class Choice:
-    """What to do at the root, as in ``pouct.Plan``."""
-
-    action: Int32[Array, "*B"]
-    subgoal: Int32[Array, "*B"]
-    from_state: Int32[Array, "*B"]
-    to_state: Int32[Array, "*B"]
-    value: Float32[Array, "*B"]
-    gap: Float32[Array, "*B"]
-    status: UInt32[Array, "*B"]
+def choose(context: Context, tree: Tree) -> Plan:
+    """The action of least Q at the root."""
+    _, bound = _root_value(context, tree)
+    q_values = tree.q_values[:, Tree.ROOT]
+    return plan_of_least_score(context.model, q_values, q_values, tree.root_visits, bound, tree.status)
 
 
-def choose(context: Context, tree: Tree, config: SearchConfig) -> Choice:
-    """The action of least Q at the root, the most visited one in the mode ``AUTHORS_CODE``; ties by lowest index."""
-    q_values, finish = tree.q_values[:, Tree.ROOT], tree.q_values.shape[2] - 1
-    index = jnp.arange(finish + 1, dtype=jnp.int32)[None, :]
-    score = q_values
-    if config.mode is SearchMode.AUTHORS_CODE:
-        score = jnp.where(jnp.isinf(q_values), jnp.inf, -tree.root_visits.astype(jnp.float32))
-    least = jnp.min(score, axis=1)
-    available = jnp.any(jnp.isfinite(q_values), axis=1)
-    action = jnp.min(jnp.where(score <= least[:, None], index, finish), axis=1)
-    attempts = available & (action != finish)
-    batch = jnp.arange(action.shape[0], dtype=jnp.int32)
-    row = unpack_rows(context.packed[batch, action], context.tables.actions)
-    accepted = jnp.take_along_axis(context.tables.accepting, context.root.state[:, None], axis=1)[:, 0]
-    value = jnp.where(available, q_values[batch, action], context.dead_end_cost)
-    value = jnp.where(accepted, 0.0, value)
-    _, bound = arrival(tree.values[:, Tree.ROOT], context.root.pending_cost, context.dead_end_cost)
-    if config.mode is SearchMode.AUTHORS_CODE:
-        bound = jnp.full_like(value, -jnp.inf)
-    gap = (value - bound) / jnp.where(value > 0, value, 1.0)
-    return Choice(
-        action=jnp.where(available, action, NO_ACTION),
-        subgoal=jnp.where(attempts, row.subgoal, NO_SUBGOAL),
-        from_state=jnp.where(attempts, row.from_state, NO_STATE),
-        to_state=jnp.where(attempts, row.to_state, NO_STATE),
-        value=value,
-        gap=jnp.where(available, gap, 0.0),
-        status=status_of_rows(accepted, Status.ACCEPTING_ROOT)
-        | status_of_rows(~available & ~accepted, Status.DEAD_END),
-    )
+BEST_FIRST = Search(tree=Tree, prepare=prepare, plant=plant, is_open=is_open, simulate=simulate, choose=choose)
 
 
-def _descend(context: Context, tree: Tree, config: SearchConfig) -> _Descent:
-    """Follow the graph from the root to an outcome not yet expanded, or to the rollout's end. Reads only."""
-    batch, slots, actions = tree.q_values.shape
-    rows, capacity = jnp.arange(batch, dtype=jnp.int32), slots - 1
-    index = jnp.arange(actions, dtype=jnp.int32)[None, :]
-    states, depth = context.tables.accepting.shape[1], config.max_depth
-    authors = config.mode is SearchMode.AUTHORS_CODE
+def _root_value(context: Context, tree: Tree) -> tuple[Float32[Array, "B"], Float32[Array, "B"]]:
+    """Value and bound of the problems."""
+    values = NodeValues.unpack(tree.values[:, Tree.ROOT])
+    return values.on_arrival(context.model.root.pending_cost, context.model.dead_end_cost)
 
-    def goes_on(descent: _Descent) -> Bool[Array, ""]:
-        return jnp.any(descent.active) & (descent.level < depth)
 
-    def descend(descent: _Descent) -> _Descent:
-        def record(array: Array, new: Array) -> Array:
-            return jax.lax.dynamic_update_index_in_dim(array, new, descent.level, 0)
-
-        node, level = descent.node, descent.level
-        # Without the barrier the compiler would look every entry up again for each of the minima below.
-        q_values, bounds, values = jax.lax.optimization_barrier(
-            (tree.q_values[rows, node], tree.bounds[rows, node], tree.values[rows, node])
-        )
-        inside = context.facts[:, :, 0] == (tree.location[rows, node] * states + tree.state[rows, node])[:, None]
-        pending = jnp.where(inside, 0.0, descent.pending_cost[:, None])
-        if authors:
-            width = config.exploration * jnp.sqrt(jnp.log(jnp.maximum(values[:, 4] + 1.0, 2.0)))
-            score = q_values + pending - width[:, None] * bounds
-        else:
-            score = bounds + pending
-        least = least_of_each(score, jnp.inf)
-        # Minimum, then the first index that attains it: faster than argmin, and ties go to the lowest index.
-        action = least_of_each(jnp.where(score <= least[:, None], index, actions - 1), actions - 1)
-        moves = descent.active & ~jnp.isinf(least)
-        chosen = index == action[:, None]
-        goes_inside = inside[rows, action]
-        rivals = (inside == goes_inside[:, None]) & ~chosen
-        others = [least_of_each(jnp.where(rivals, row, jnp.inf), jnp.inf) for row in (q_values, bounds)]
-        accepts = context.facts[rows, action, 1] != 0
-        children = tree.children[rows, node, action]
-        path_cost = context.tables.distance[rows, tree.location[rows, node], tree.state[rows, node], action]
-        odds = _Odds(
-            path_cost=jnp.where(goes_inside, 0.0, path_cost),
-            chance=tree.chances[rows, node, action],
-            success_cost=tree.success_costs[rows, node, action],
-            failure_cost=context.tables.actions.failure_cost[rows, action],
-            failure_value=tree.failure_value[rows, node, action],
-            success_value=tree.success_value[rows, node, action],
-        )
-        if authors:
-            success = uniform(context.seeds, tree.simulations, level) < odds.chance
-            step = _sampled_step(odds, success, q_values[rows, action], bounds[rows, action])
-            step = dataclasses.replace(step, add=step.add + jnp.where(goes_inside, 0.0, descent.pending_cost))
-        else:
-            step = _expected_step(context, tree, odds, children, accepts)
-            step = dataclasses.replace(step, add=descent.pending_cost)
-        outcome = step.success.astype(jnp.int32)
-        child = children[rows, outcome]
-        finished = moves & step.success & accepts
-        expands = moves & ~finished & (child == Tree.UNVISITED)
-        goes_deeper = moves & ~finished & ~expands
-        return _Descent(
-            level=level + 1,
-            active=goes_deeper,
-            node=jnp.where(goes_deeper, child, node),
-            pending_cost=jnp.where(goes_deeper | expands, step.pending_cost, descent.pending_cost),
-            action=jnp.where(moves, action, descent.action),
-            success=jnp.where(moves, step.success, descent.success),
-            expands=descent.expands | expands,
-            accepted=descent.accepted | finished,
-            nodes=record(descent.nodes, jnp.where(moves, node, capacity)),
-            actions=record(descent.actions, action),
-            outcomes=record(descent.outcomes, outcome),
-            inside=record(descent.inside, goes_inside),
-            values=record(descent.values, values),
-            base=record(descent.base, step.base),
-            base_bound=record(descent.base_bound, step.base_bound),
-            weight=record(descent.weight, step.weight),
-            rival=record(descent.rival, others[0]),
-            low_rival=record(descent.low_rival, others[1]),
-            add=record(descent.add, step.add),
-        )
-
-    integers, floats = jnp.zeros((depth, batch), jnp.int32), jnp.zeros((depth, batch), jnp.float32)
+def _descend(context: Context, tree: Tree, config: SearchConfig) -> Descent:
+    """Follow the graph from the root to an outcome without a node, or to the rollout's end."""
+    batch = tree.size.shape[0]
     nowhere = jnp.zeros((batch,), jnp.bool_)
-    start = _Descent(
+    start = Descent(
         level=jnp.int32(0),
-        active=is_open(context, tree, config),
+        active=is_open(context, tree),
         node=jnp.full((batch,), Tree.ROOT, jnp.int32),
-        pending_cost=context.root.pending_cost,
+        pending_cost=context.model.root.pending_cost,
         action=jnp.zeros((batch,), jnp.int32),
         success=nowhere,
         expands=nowhere,
         accepted=nowhere,
-        nodes=jnp.full((depth, batch), capacity, jnp.int32),
-        actions=integers,
-        outcomes=integers,
-        inside=jnp.zeros((depth, batch), jnp.bool_),
-        values=jnp.zeros((depth, batch, 5), jnp.float32),
-        base=floats,
-        base_bound=floats,
-        weight=floats,
-        rival=floats,
-        low_rival=floats,
-        add=floats,
+        path=Path.empty(config.max_depth, batch, tree.capacity),
     )
-    return jax.lax.while_loop(goes_on, descend, start)
+
+    def goes_on(descent: Descent) -> Bool[Array, ""]:
+        return jnp.any(descent.active) & (descent.level < config.max_depth)
+
+    return jax.lax.while_loop(goes_on, lambda descent: _descend_once(context, tree, descent), start)
+
+
+def _descend_once(context: Context, tree: Tree, descent: Descent) -> Descent:
+    """Take one action in every row that is still descending."""
+    model, node = context.model, descent.node
+    rows = model.rows
+    selection = _select_action(model, tree, descent)
+    action, moves = selection.action, selection.moves
+    children = tree.children[rows, node, action]
+    accepts = model.accepts[rows, action]
+    step = _follow_gap(context, _attempt_at(model, tree, descent, selection), children, accepts, tree)
+    child = children[rows, step.success.astype(jnp.int32)]
+    accepted = moves & step.success & accepts
+    expands = moves & ~accepted & (child == Tree.UNVISITED)
+    deeper = moves & ~accepted & ~expands
+    path = descent.path.record(
+        descent.level,
+        # Rows that have ended write to the spare node on the way up.
+        nodes=jnp.where(moves, node, tree.capacity),
+        actions=action,
+        inside=selection.inside,
+        values=selection.values,
+        base=step.base,
+        base_bound=step.base_bound,
+        weight=step.weight,
+        rival=selection.rival,
+        rival_bound=selection.rival_bound,
+        pending_cost=descent.pending_cost,
+    )
+    return Descent(
+        level=descent.level + 1,
+        active=deeper,
+        node=jnp.where(deeper, child, node),
+        pending_cost=jnp.where(deeper | expands, step.pending_cost, descent.pending_cost),
+        action=jnp.where(moves, action, descent.action),
+        success=jnp.where(moves, step.success, descent.success),
+        expands=descent.expands | expands,
+        accepted=descent.accepted | accepted,
+        path=path,
+    )
 
 
 @struct.dataclass(kw_only=True)
-class _Odds:
-    """One action of each row: D without the pending cost, P_S, R_S, R_F, and the guessed values after both outcomes."""
+class _Selection:
+    """The action that a row takes next.
+
+    Attributes:
+      action: the action of least bound, ties by lowest index; finish where none is available.
+      moves: True where the row is descending and has an action.
+      inside: whether the action stays in the unknown region.
+      values: packed ``NodeValues`` of the row's node.
+      rival: least Q of the node's other actions of the same kind.
+      rival_bound: least bound of those.
+    """
+
+    action: Int32[Array, "B"]
+    moves: Bool[Array, "B"]
+    inside: Bool[Array, "B"]
+    values: Float32[Array, "B 5"]
+    rival: Float32[Array, "B"]
+    rival_bound: Float32[Array, "B"]
+
+
+def _select_action(model: Model, tree: Tree, descent: Descent) -> _Selection:
+    """The action of least bound at every row's node."""
+    rows, node = model.rows, descent.node
+    # Without the barrier XLA would look every entry up again for each of the minima below.
+    q_values, bounds, values = jax.lax.optimization_barrier(
+        (tree.q_values[rows, node], tree.bounds[rows, node], tree.values[rows, node])
+    )
+    inside = model.stays_inside(tree.location[rows, node], tree.state[rows, node])
+    score = bounds + jnp.where(inside, 0.0, descent.pending_cost[:, None])
+    action, least = first_of_least(score)
+    goes_inside = inside[rows, action]
+    chosen = jnp.arange(score.shape[1], dtype=jnp.int32)[None, :] == action[:, None]
+    rivals = (inside == goes_inside[:, None]) & ~chosen
+    rival, rival_bound = (
+        least_of_each(jnp.where(rivals, values_of_actions, jnp.inf), jnp.inf)
+        for values_of_actions in (q_values, bounds)
+    )
+    return _Selection(
+        action=action,
+        moves=descent.active & ~jnp.isinf(least),
+        inside=goes_inside,
+        values=values,
+        rival=rival,
+        rival_bound=rival_bound,
+    )
+
+
+@struct.dataclass(kw_only=True)
+class _Attempt:
+    """One action of each row, at the node where it is taken.
+
+    Attributes:
+      path_cost: cost of the path to it, 0 where it stays inside; D without the pending cost.
+      chance: P_S.
+      success_cost: R_S.
+      failure_cost: R_F.
+      success_value: guessed expected cost after success.
+      failure_value: guessed expected cost after failure.
+    """
 
     path_cost: Float32[Array, "B"]
     chance: Float32[Array, "B"]
     success_cost: Float32[Array, "B"]
     failure_cost: Float32[Array, "B"]
-    failure_value: Float32[Array, "B"]
     success_value: Float32[Array, "B"]
+    failure_value: Float32[Array, "B"]
+
+
+def _attempt_at(model: Model, tree: Tree, descent: Descent, selection: _Selection) -> _Attempt:
+    """Look the terms of the selected actions up."""
+    rows, node, action = model.rows, descent.node, selection.action
+    path_cost = model.tables.distance[rows, tree.location[rows, node], tree.state[rows, node], action]
+    return _Attempt(
+        path_cost=jnp.where(selection.inside, 0.0, path_cost),
+        chance=tree.chances[rows, node, action],
+        success_cost=tree.success_costs[rows, node, action],
+        failure_cost=model.tables.actions.failure_cost[rows, action],
+        success_value=tree.success_values[rows, node, action],
+        failure_value=tree.failure_values[rows, node, action],
+    )
 
 
 @struct.dataclass(kw_only=True)
 class _Step:
-    """An outcome to follow, the pending cost after it, and how the action depends on it (see ``_Descent``)."""
+    """The outcome of an action that a descent follows.
+
+    Attributes:
+      success: which outcome.
+      pending_cost: after it.
+      base: see ``Path``.
+      base_bound: see ``Path``.
+      weight: see ``Path``.
+    """
 
     success: Bool[Array, "B"]
     pending_cost: Float32[Array, "B"]
     base: Float32[Array, "B"]
     base_bound: Float32[Array, "B"]
     weight: Float32[Array, "B"]
-    add: Float32[Array, "B"]
 
 
-def _expected_step(
-    context: Context,
-    tree: Tree,
-    odds: _Odds,
-    children: Int32[Array, "B 2"],
-    accepts: Bool[Array, "B"],
+def _follow_gap(
+    context: Context, attempt: _Attempt, children: Int32[Array, "B 2"], accepts: Bool[Array, "B"], tree: Tree
 ) -> _Step:
-    """Follow the outcome that contributes more to the gap between its Q and its bound."""
-    chance = odds.chance
-    success_value, success_bound = _outcome(context, tree, children[:, 1], odds.success_value, odds.success_cost)
-    failure_value, failure_bound = _outcome(context, tree, children[:, 0], odds.failure_value, odds.failure_cost)
+    """Follow the outcome that contributes more to the gap between the action's Q and its bound."""
+    chance = attempt.chance
+    success_value, success_bound = _outcome_value(
+        context, tree, children[:, SUCCESS], attempt.success_value, attempt.success_cost
+    )
+    failure_value, failure_bound = _outcome_value(
+        context, tree, children[:, FAILURE], attempt.failure_value, attempt.failure_cost
+    )
     success = chance * (success_value - success_bound) >= (1.0 - chance) * (failure_value - failure_bound)
     # Nothing is to be learnt from satisfying the task, and a certain success cannot fail.
     success = (success & ~accepts) | (chance >= 1.0)
-    known = odds.path_cost + chance * odds.success_cost + (1.0 - chance) * odds.failure_cost
+    known = attempt.path_cost + chance * attempt.success_cost + (1.0 - chance) * attempt.failure_cost
     weight, rest = jnp.where(success, chance, 1.0 - chance), jnp.where(success, 1.0 - chance, chance)
     return _Step(
         success=success,
-        pending_cost=jnp.where(success, odds.success_cost, odds.failure_cost),
+        pending_cost=jnp.where(success, attempt.success_cost, attempt.failure_cost),
         base=known + rest * jnp.where(success, failure_value, success_value),
         base_bound=known + rest * jnp.where(success, failure_bound, success_bound),
         weight=weight,
-        add=jnp.zeros_like(weight),
     )
 
 
-def _sampled_step(
-    odds: _Odds, success: Bool[Array, "B"], q_value: Float32[Array, "B"], spread: Float32[Array, "B"]
-) -> _Step:
-    """The sampled outcome; Q is the mean of the sampled costs."""
-    pending_cost = jnp.where(success, odds.success_cost, odds.failure_cost)
-    cost = odds.path_cost + pending_cost
-    count = jnp.round(1.0 / (spread * spread)) + 1.0
-    return _Step(
-        success=success,
-        pending_cost=pending_cost,
-        base=q_value + (cost - q_value) / count,
-        base_bound=jax.lax.rsqrt(count),
-        weight=1.0 / count,
-        add=cost,
-    )
-
-
-def _outcome(
+def _outcome_value(
     context: Context,
     tree: Tree,
     child: Int32[Array, "B"],
@@ -307,123 +445,151 @@ def _outcome(
     pending_cost: Float32[Array, "B"],
 ) -> tuple[Float32[Array, "B"], Float32[Array, "B"]]:
     """Value and bound of an outcome: those of its node, or by the guess where there is none."""
-    rows = jnp.arange(child.shape[0], dtype=jnp.int32)
-    value, bound = arrival(tree.values[rows, jnp.maximum(child, 0)], pending_cost, context.dead_end_cost)
+    values = tree.values_at(context.model.rows, jnp.maximum(child, 0))
+    value, bound = values.on_arrival(pending_cost, context.model.dead_end_cost)
     new = child == Tree.UNVISITED
     return jnp.where(new, guessed, value), jnp.where(new, (1.0 - context.optimism) * guessed, bound)
 
 
-def _expand(
-    context: Context, tree: Tree, descent: _Descent, config: SearchConfig
-) -> tuple[Tree, Int32[Array, "B"], Float32[Array, "B"], Float32[Array, "B"]]:
-    """Add the node that the descent reached, unless another order of the same events has led there before.
+def _expand(context: Context, tree: Tree, descent: Descent, config: SearchConfig) -> tuple[Tree, Leaf]:
+    """Add the node that the descent reached, unless another order of the same events has led there before."""
+    model = context.model
+    parent = tree.history(model.rows, descent.node, descent.pending_cost)
+    history = model.step(parent, descent.action, descent.success)
+    node = _new_node(context, history, config)
+    lookup = find(tree, history, context.relevant)
+    is_new = descent.expands & (lookup.node == Tree.UNVISITED)
+    # Where a row ends without a new node: the node that it found, or the last one of a descent that was cut.
+    end = jnp.where(descent.expands, jnp.maximum(lookup.node, 0), descent.node)
+    existing = tree.values[model.rows, end]
+    tree, values, added = add_node(tree, model, node, history, lookup, is_new)
+    values = NodeValues.unpack(jnp.where(is_new[:, None], values.pack(), existing))
+    value, bound = values.on_arrival(descent.pending_cost, model.dead_end_cost)
+    child = jnp.where(added, tree.size - 1, jnp.where(descent.expands, lookup.node, Tree.UNVISITED))
+    overflow = status_of_rows(is_new & ~added, Status.TREE_OVERFLOW)
+    # Rows that are still active when the descent is over have reached the depth limit.
+    overflow |= status_of_rows(descent.active, Status.DEPTH_OVERFLOW)
+    leaf = Leaf(
+        child=child,
+        value=jnp.where(descent.accepted, 0.0, value),
+        bound=jnp.where(descent.accepted, 0.0, bound),
+    )
+    return dataclasses.replace(tree, status=tree.status | overflow), leaf
 
-    Returns the tree, the last action's child (``UNVISITED`` where it has none), and the value and bound from which to
-    back up.
-    """
+
+def _new_node(context: Context, history: History, config: SearchConfig) -> NewNode:
+    """The numbers of one node per row when nothing below it has been seen."""
+    # The pending cost is left out of a node's numbers; the guess needs it, to know what the next action pays.
+    free = dataclasses.replace(history, pending_cost=jnp.zeros_like(history.pending_cost))
+    terms = jax.vmap(terms_of_all)(context.model.tables, free)
+    chance, available = terms.success_probability, terms.available
+    failure_values, success_values = guess_outcomes(
+        context.rule,
+        context.model.product_state(history.location, history.state),
+        history.pending_cost,
+        available,
+        chance,
+        terms.success_cost,
+        config.guess_failures,
+    )
+    known = terms.distance + chance * terms.success_cost + (1.0 - chance) * terms.failure_cost
+    guessed = chance * success_values + (1.0 - chance) * failure_values
+    return NewNode(
+        q_values=jnp.where(available, known + guessed, jnp.inf),
+        bounds=jnp.where(available, known + (1.0 - context.optimism[:, None]) * guessed, jnp.inf),
+        chances=chance,
+        success_costs=terms.success_cost,
+        failure_values=failure_values,
+        success_values=success_values,
+    )
+
+
+def _back_up(tree: Tree, descent: Descent, leaf: Leaf) -> Tree:
+    """From the leaf to the root: Q and bound of the actions taken, and what their nodes pass up."""
     rows = jnp.arange(tree.size.shape[0], dtype=jnp.int32)
-    capacity = tree.q_values.shape[1] - 1
-    row = unpack_rows(context.packed[rows, descent.action], context.tables.actions)
-    parent = tree.history(descent.node, descent.pending_cost)
-    history = jax.vmap(step_row)(context.tables, row, parent, descent.success)
-    node = new_node(context, history, config)
-    known, key, slot = find(context, tree, history)
-    if config.mode is SearchMode.AUTHORS_CODE:
-        known = jnp.full_like(known, Tree.UNVISITED)
-    has_room = tree.size < capacity
-    is_new = descent.expands & (known == Tree.UNVISITED)
-    added = is_new & has_room
-    arrived = tree.values[rows, jnp.where(descent.expands, jnp.maximum(known, 0), descent.node)]
-    entry = jnp.concatenate([key, tree.size[:, None]], axis=1)
-    # A node that is not added goes to the spare slot behind the others.
-    index = jnp.where(is_new, tree.size, capacity)
-
-    def write(array: Array, new: Array, index: Array = index) -> Array:
-        return array.at[rows, index].set(new, mode="drop", unique_indices=True)
-
-    tree = dataclasses.replace(
-        tree,
-        q_values=write(tree.q_values, node.q_values),
-        bounds=write(tree.bounds, node.bounds),
-        chances=write(tree.chances, node.chances),
-        success_costs=write(tree.success_costs, node.success_costs),
-        failure_value=write(tree.failure_value, node.failure_value),
-        success_value=write(tree.success_value, node.success_value),
-        location=write(tree.location, history.location),
-        state=write(tree.state, history.state),
-        holds=write(tree.holds, history.holds),
-        fails=write(tree.fails, history.fails),
-        visited=write(tree.visited, history.visited),
-        table=write(tree.table, entry, jnp.where(added, slot, tree.table.shape[1])),
-        size=tree.size + added.astype(jnp.int32),
-        status=tree.status
-        | status_of_rows(is_new & ~has_room, Status.TREE_OVERFLOW)
-        | status_of_rows(descent.active, Status.DEPTH_OVERFLOW),
-    )
-    # Read back what was written: minima over rows still to be computed would compute them again and again.
-    values = least_values(
-        context, tree.q_values[rows, index], tree.bounds[rows, index], history.location, history.state
-    )
-    tree = dataclasses.replace(tree, values=write(tree.values, values))
-    values = jnp.where(is_new[:, None], values, arrived)
-    value, bound = arrival(values, descent.pending_cost, context.dead_end_cost)
-    if config.mode is SearchMode.AUTHORS_CODE:
-        dead = jnp.isinf(jnp.minimum(values[:, 0], values[:, 1]))
-        value = jnp.where(dead, context.dead_end_cost, 0.0)
-    value, bound = (jnp.where(descent.accepted, 0.0, number) for number in (value, bound))
-    child = jnp.where(added, tree.size - 1, jnp.where(descent.expands, known, Tree.UNVISITED))
-    return tree, child, value, bound
-
-
-def _back_up(
-    tree: Tree,
-    descent: _Descent,
-    child: Int32[Array, "B"],
-    value: Float32[Array, "B"],
-    bound: Float32[Array, "B"],
-    config: SearchConfig,
-) -> Tree:
-    """From the leaf to the root: Q of the actions taken, and the values of their nodes. Writes only."""
-    batch, slots, actions = tree.q_values.shape
-    rows, capacity = jnp.arange(batch, dtype=jnp.int32), slots - 1
-    authors = config.mode is SearchMode.AUTHORS_CODE
 
     def ascend(carry):
         level, value, bound, tree = carry
-        node, action, inside = descent.nodes[level], descent.actions[level], descent.inside[level]
-        leave, stay, low_leave, low_stay, count = descent.values[level].T
-        weight, add = descent.weight[level], descent.add[level]
-        taken = node < capacity
-        q_value = descent.base[level] + weight * value
-        low = descent.base_bound[level] + (0.0 if authors else weight * bound)
-        least, low_least = jnp.minimum(descent.rival[level], q_value), jnp.minimum(descent.low_rival[level], low)
-        leave, low_leave = jnp.where(inside, leave, least), jnp.where(inside, low_leave, low_least)
-        stay, low_stay = jnp.where(inside, least, stay), jnp.where(inside, low_least, low_stay)
-        up = value + add if authors else jnp.minimum(add + leave, stay)
-        value = jnp.where(taken, up, value)
-        bound = jnp.where(taken, jnp.minimum(add + low_leave, low_stay), bound)
-        numbers = jnp.stack([leave, stay, low_leave, low_stay, count + 1.0], axis=-1)
+        step = jax.tree.map(lambda records: records[level], descent.path)
+        taken = step.nodes < tree.capacity
+        q_value, low = step.base + step.weight * value, step.base_bound + step.weight * bound
+        values = _with_action(step, q_value, low)
+        value = jnp.where(taken, jnp.minimum(step.pending_cost + values.leave, values.stay), value)
+        bound = jnp.where(taken, jnp.minimum(step.pending_cost + values.leave_bound, values.stay_bound), bound)
 
         def write(array: Array, new: Array, *index: Array) -> Array:
-            return array.at[rows, node, *index].set(new, mode="drop", unique_indices=True)
+            return array.at[rows, step.nodes, *index].set(new, mode="drop", unique_indices=True)
 
         tree = dataclasses.replace(
             tree,
-            q_values=write(tree.q_values, q_value, action),
-            bounds=write(tree.bounds, low, action),
-            values=write(tree.values, numbers),
+            q_values=write(tree.q_values, q_value, step.actions),
+            bounds=write(tree.bounds, low, step.actions),
+            values=write(tree.values, values.pack()),
         )
         return level - 1, value, bound, tree
 
-    tree = jax.lax.while_loop(lambda carry: carry[0] >= 0, ascend, (descent.level - 1, value, bound, tree))[3]
-    moved = descent.nodes[0] < capacity
-    parent = jnp.where(child == Tree.UNVISITED, capacity, descent.node)
-    outcome = descent.success.astype(jnp.int32)
-    first = jnp.where(moved, descent.actions[0], actions)
+    start = (descent.level - 1, leaf.value, leaf.bound, tree)
+    tree = jax.lax.while_loop(lambda carry: carry[0] >= 0, ascend, start)[3]
+    # Link the child last, to the node that the descent left the graph from.
+    parent = jnp.where(leaf.child == Tree.UNVISITED, tree.capacity, descent.node)
+    at = (rows, parent, descent.action, descent.success.astype(jnp.int32))
+    return dataclasses.replace(tree, children=tree.children.at[at].set(leaf.child, mode="drop", unique_indices=True))
+
+
+def _with_action(step: Path, q_value: Float32[Array, "B"], bound: Float32[Array, "B"]) -> NodeValues:
+    """What a node passes up once the action taken there has this Q and bound; ``step`` is one level of a path."""
+    before = NodeValues.unpack(step.values)
+    least, least_bound = jnp.minimum(step.rival, q_value), jnp.minimum(step.rival_bound, bound)
+    return NodeValues(
+        leave=jnp.where(step.inside, before.leave, least),
+        stay=jnp.where(step.inside, least, before.stay),
+        leave_bound=jnp.where(step.inside, before.leave_bound, least_bound),
+        stay_bound=jnp.where(step.inside, least_bound, before.stay_bound),
+        visits=before.visits + 1.0,
+    )
+
+
+def _count(tree: Tree, descent: Descent) -> Tree:
+    """Count the descent and its actions, in the rows that took one."""
+    rows, first = jnp.arange(tree.size.shape[0], dtype=jnp.int32), descent.path.nodes[0]
+    moved = first < tree.capacity
+    action = jnp.where(moved, descent.path.actions[0], tree.root_visits.shape[1])
     return dataclasses.replace(
         tree,
-        children=tree.children.at[rows, parent, descent.action, outcome].set(child, mode="drop", unique_indices=True),
-        root_visits=tree.root_visits.at[rows, first].add(1, mode="drop", unique_indices=True),
+        root_visits=tree.root_visits.at[rows, action].add(1, mode="drop", unique_indices=True),
         simulations=tree.simulations + moved.astype(jnp.int32),
-        steps=tree.steps + jnp.sum(descent.nodes < capacity, axis=0, dtype=jnp.int32),
+        steps=tree.steps + jnp.sum(descent.path.nodes < tree.capacity, axis=0, dtype=jnp.int32),
     )
+
+
+def _optimism(problems: PlanningProblem, config: SearchConfig) -> Float32[Array, "B"]:
+    """``SearchConfig.optimism`` of each problem; by its number of actions where the configuration names none."""
+    subgoals = jnp.sum(problems.subgoal_mask, axis=1, dtype=jnp.int32)
+    if config.optimism is not None:
+        return jnp.full(subgoals.shape, config.optimism, jnp.float32)
+    # Real actions, so that padding does not change the optimism.
+    actions = subgoals * jnp.sum(problems.task.edge_mask, axis=1, dtype=jnp.int32) + 1
+    return jnp.where(actions <= FEW_ACTIONS, OPTIMISM_OF_FEW, OPTIMISM).astype(jnp.float32)
+
+
+def _reachable_states(tables: ActionTables) -> Bool[Array, "Z Z"]:
+    """``[z, z']``: travel and attempts can lead from z to z'."""
+    rows, states = tables.actions, tables.accepting.shape[0]
+    own = jnp.arange(states, dtype=jnp.int32)
+    attempts = rows.from_state[:, None] == own[None, :]
+    travels = jnp.any(jnp.any(jnp.isfinite(tables.distance), axis=0)[:, :, None] & attempts[None, :, :], axis=1)
+    succeeds = jnp.any(attempts[:, :, None] & (rows.to_state[:, None] == own[None, :])[:, None, :], axis=0)
+    return transitive_closure(travels | succeeds | (own[:, None] == own[None, :]))
+
+
+def _relevant_conditions(tables: ActionTables, reach: Bool[Array, "Z Z"]) -> UInt32[Array, "Z W"]:
+    """Per state, the conditions of actions that can still be attempted.
+
+    All of them where conditions of several cubes exist: what is known of one may then close another.
+    """
+    rows = tables.actions
+    attempts = rows.from_state[:, None] == jnp.arange(reach.shape[0], dtype=jnp.int32)[None, :]
+    useful = jnp.any(reach[:, None, :] & attempts[None, :, :], axis=2)
+    bits = jnp.where(useful[:, :, None], rows.condition_bits[None], jnp.uint32(0))
+    combined = jax.lax.reduce(bits, jnp.uint32(0), jax.lax.bitwise_or, (1,))
+    return jnp.where(jnp.any(tables.compound_mask), jnp.uint32(ALL_CONDITIONS), combined)

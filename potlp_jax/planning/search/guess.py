@@ -1,10 +1,11 @@
-"""What lies beyond an outcome, guessed by following a simple rule: what guides the search.
+"""The guessed value of outcomes that have no node: what guides best-first search.
 
-The rule takes the action of least cost per chance of success. While attempts fail, one history follows another and no
-branch opens, so that the expected cost of the rule is a sum along a single chain, with exact knowledge of what has
-failed, exact ways, and a dead end where the chain has nothing left; each success along it is worth what the rule costs
-from there on with nothing known. Ordering by cost per chance is optimal for independent tests without ways in between
-(Mitten 1960); with ways it is a policy like any other, so that a guess is seldom too low.
+A simple rule is followed: take the action of least cost per chance of success. While attempts fail, one history follows
+another and no branch opens, so the expected cost of the rule is a sum along a single **chain** of failures, with exact
+knowledge of what has failed, exact path costs, and a dead end where no action remains. Each success along the chain is
+worth what the rule costs from there on with nothing known. Ordering by cost per chance is optimal for independent tests
+without path costs between them (Mitten 1960). With path costs the rule is a policy like any other, so that a guess is
+seldom too low.
 
 Everything here has a leading batch axis, written out by hand: a chain is a loop of a few operations on all rows.
 
@@ -20,24 +21,30 @@ from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 
 from potlp_jax.planning.history import ActionTables
-from potlp_jax.planning.search.arrays import least_of_each
+from potlp_jax.planning.search.arrays import first_of_least
 from potlp_jax.types import NO_STATE
 
 NEGLIGIBLE: float = 1e-3
-"""Probability of getting that far below which a chain is cut; what is left counts as a dead end."""
+"""A chain is cut where the probability of getting there is below this; the rest counts as a dead end. With the default
+dead-end cost, 4 (H + W) cells, the error is a fraction of a cell. Not tuned."""
 
 PASSES: int = 4
-"""Times that the successes are valued where the automaton has cycles; without, each is valued once, the last first."""
+"""How often the successes are valued where the automaton has cycles. Without cycles each is valued once, the last
+first, and is then final. Not tuned: a cycle needs two successes, so each pass sees one round more."""
 
 
 @struct.dataclass(kw_only=True)
 class Rule:
-    """The rule in a batch of problems.
+    """The rule in a batch of problems; ``R`` is the batch axis, ``P`` numbers product states.
 
-    ``path_costs[r, p, a]`` is the path cost to action ``a`` from the product state ``p = location * Z + state``;
-    ``product_states`` where each action is attempted, -1 for finish. ``closes[r, a, b]``: if ``a`` fails, so does
-    ``b``. ``after_success`` is the guessed cost after each action's success, the pending cost included; 0 where that
-    satisfies the task, and after finish.
+    Attributes:
+      path_costs: ``[r, p, a]``, path cost from the product state ``p = location * Z + state`` to action ``a``.
+      product_states: where each action is attempted; negative for finish and padding.
+      failure_cost: R_F of each action.
+      closes: ``[r, a, b]``: a failure of ``a`` closes the condition of ``b``, so that ``b`` fails too.
+      after_success: guessed expected cost after each action's success, the cost that is then pending included; 0 where
+        the success satisfies the task, and for finish.
+      dead_end_cost: of each problem.
     """
 
     path_costs: Float32[Array, "*R P A"]
@@ -49,17 +56,68 @@ class Rule:
 
 
 @struct.dataclass(kw_only=True)
-class _Chain:
-    """Actions in the order in which the rule tries them as long as they fail, per level and row.
+class _Starts:
+    """Where chains begin; several may begin in one problem.
 
-    ``action`` is A where a row has ended; ``cost`` is the expected cost of an attempt, what is left after its success
-    included, ``chance`` its P_S, ``rest`` the expected cost from this level on, given that all before have failed.
+    Attributes:
+      problem: row of the rule, for each chain.
+      product_state: where the chain begins.
+      pending_cost: there.
+      available: actions that the chain may take.
+      chance: P_S of each action, given what is known there.
+      attempt_cost: expected cost of each attempt without the path to it (``_attempt_cost``).
+    """
+
+    problem: Int32[Array, "N"]
+    product_state: Int32[Array, "N"]
+    pending_cost: Float32[Array, "N"]
+    available: Bool[Array, "N A"]
+    chance: Float32[Array, "N A"]
+    attempt_cost: Float32[Array, "N A"]
+
+
+@struct.dataclass(kw_only=True)
+class _Chain:
+    """Actions in the order in which the rule tries them as long as they fail, by level.
+
+    Attributes:
+      action: the action; A where the chain has ended.
+      cost: expected cost of its attempt, what follows its success included.
+      chance: its P_S.
+      rest: expected cost from this level on, given that all before have failed.
     """
 
     action: Int32[Array, "L N"]
     cost: Float32[Array, "L N"]
     chance: Float32[Array, "L N"]
     rest: Float32[Array, "L1 N"]
+
+
+@struct.dataclass(kw_only=True)
+class _Walk:
+    """The head of every chain while it is followed.
+
+    Attributes:
+      level: failures so far.
+      active: True where the chain goes on.
+      product_state: where the head is.
+      pending_cost: there.
+      inverse_chance: 1 / P_S, inf where an action is not available or has failed.
+      reached: probability that all attempts so far have failed.
+      action: see ``_Chain``.
+      cost: see ``_Chain``.
+      chance: see ``_Chain``.
+    """
+
+    level: Int32[Array, ""]
+    active: Bool[Array, "N"]
+    product_state: Int32[Array, "N"]
+    pending_cost: Float32[Array, "N"]
+    inverse_chance: Float32[Array, "N A"]
+    reached: Float32[Array, "N"]
+    action: Int32[Array, "L N"]
+    cost: Float32[Array, "L N"]
+    chance: Float32[Array, "L N"]
 
 
 def make_rule(
@@ -70,20 +128,24 @@ def make_rule(
     reach: Bool[Array, "R Z Z"],
     dead_end_cost: Float32[Array, "R"],
     length: int,
-    solve: bool = True,
 ) -> Rule:
-    """The rule with the values of all successes (without them where ``solve`` is False).
+    """The rule with the values of all successes.
 
     Args:
       tables: of a batch of problems.
-      product_states: ``location * Z + state`` of each action's attempt.
-      chance, success_cost: P_S and R_S with nothing known.
+      product_states: where each action is attempted, negative for finish and padding.
+      chance: P_S with nothing known.
+      success_cost: R_S with nothing known.
       reach: ``[r, z, z']``: from z the rollout can get to z'.
       dead_end_cost: of each problem.
       length: failures in a row that are followed.
+
+    Returns:
+      One rule per problem.
     """
     rows = tables.actions
     count, actions = product_states.shape
+    # A failure closes all conditions that imply the failed one, at the same subgoal.
     closes = jnp.any(rows.backward[:, :, None, :] & rows.condition_bits[:, None, :, :] != 0, axis=-1)
     closes &= rows.subgoal[:, :, None] == rows.subgoal[:, None, :]
     rule = Rule(
@@ -91,11 +153,10 @@ def make_rule(
         product_states=product_states,
         failure_cost=rows.failure_cost,
         closes=closes,
+        # Until they are valued, successes lead nowhere.
         after_success=jnp.where(rows.accepts, 0.0, dead_end_cost[:, None]).at[:, -1].set(0.0),
         dead_end_cost=dead_end_cost,
     )
-    if not solve:
-        return rule
     real = (rows.from_state != NO_STATE).at[:, -1].set(True)
     return _value_successes(rule, tables, jnp.where(real, chance, 0.0), success_cost, reach, length)
 
@@ -109,36 +170,98 @@ def guess_outcomes(
     success_cost: Float32[Array, "R A"],
     length: int,
 ) -> tuple[Float32[Array, "R A"], Float32[Array, "R A"]]:
-    """What is guessed to be left after the failure and after the success of every action of one history per problem.
+    """Guessed expected cost after every action of one history per problem.
 
-    After the failure of the rule's first action that is the rest of its chain. After that of another action the chain
-    begins there and does without it. What does not depend on the history is kept in ``rule``.
+    After the failure of the rule's first action the rest of its chain follows. After the failure of another action the
+    chain begins where that action failed, and does without it.
+
+    Args:
+      rule: of the problems.
+      product_state: where the history is.
+      pending_cost: there.
+      available: its actions.
+      chance: their P_S, given what is known.
+      success_cost: their R_S, given what is known.
+      length: failures in a row that are followed.
+
+    Returns:
+      The guess after failure and the guess after success, the costs that are then pending included.
     """
-    problem = jnp.arange(product_state.shape[0], dtype=jnp.int32)
-    gain = _gain(rule, problem, chance, success_cost)
-    chain = _follow(rule, problem, product_state, pending_cost, available, chance, gain, length)
-    first, levels, actions = chain.action[0], chain.action.shape[0], available.shape[1]
-    index = jnp.arange(actions, dtype=jnp.int32)[None, :]
+    rows = jnp.arange(product_state.shape[0], dtype=jnp.int32)
+    attempt_cost = _attempt_cost(rule, rows, chance, success_cost)
+    starts = _Starts(
+        problem=rows,
+        product_state=product_state,
+        pending_cost=pending_cost,
+        available=available,
+        chance=chance,
+        attempt_cost=attempt_cost,
+    )
+    chain = _follow_chain(rule, starts, length)
+    whole = jnp.broadcast_to(chain.rest[0][:, None], available.shape)
+    without = whole.at[rows[None, :], chain.action].set(_costs_without(chain), mode="drop", unique_indices=True)
+    return without + _cost_to_begin_elsewhere(rule, starts, chain), rule.after_success
+
+
+def _costs_without(chain: _Chain) -> Float32[Array, "L N"]:
+    """Expected cost of each chain with the action of one level left out."""
 
     def skip(carry, level):
         spent, reached = carry
         left_out = spent + reached * chain.rest[level + 1]
         return (spent + reached * chain.cost[level], reached * (1.0 - chain.chance[level])), left_out
 
-    nothing = jnp.zeros_like(pending_cost), jnp.ones_like(pending_cost)
-    _, left_out = jax.lax.scan(skip, nothing, jnp.arange(levels, dtype=jnp.int32))
-    whole = jnp.broadcast_to(chain.rest[0][:, None], available.shape)
-    without = whole.at[problem[None, :], chain.action].set(left_out, mode="drop", unique_indices=True)
+    levels, count = chain.action.shape
+    nothing_yet = jnp.zeros((count,), jnp.float32), jnp.ones((count,), jnp.float32)
+    return jax.lax.scan(skip, nothing_yet, jnp.arange(levels, dtype=jnp.int32))[1]
 
-    # The chain without an action begins where that action has failed instead of here.
+
+def _cost_to_begin_elsewhere(rule: Rule, starts: _Starts, chain: _Chain) -> Float32[Array, "R A"]:
+    """How much more the chain's first step costs from where each action fails than from where the history is."""
+    rows, actions = starts.problem, starts.available.shape[1]
+    first = chain.action[0]
     start = jnp.minimum(first, actions - 1)
-    cost_here = chain.cost[0] - gain[problem, start]
+    cost_here = chain.cost[0] - starts.attempt_cost[rows, start]
     product_states = jnp.maximum(rule.product_states, 0)
-    cost_there = rule.path_costs[problem[:, None], product_states, start[:, None]] + rule.failure_cost
-    cost_there = jnp.where(rule.product_states == rule.product_states[problem, start][:, None], 0.0, cost_there)
+    cost_there = rule.path_costs[rows[:, None], product_states, start[:, None]] + rule.failure_cost
+    # Who is there already pays nothing; who cannot get there is treated as if still here.
+    cost_there = jnp.where(rule.product_states == rule.product_states[rows, start][:, None], 0.0, cost_there)
     cost_there = jnp.where(jnp.isinf(cost_there), cost_here[:, None], cost_there)
-    moved = jnp.where(index == first[:, None], 0.0, cost_there - cost_here[:, None])
-    return without + moved, rule.after_success
+    index = jnp.arange(actions, dtype=jnp.int32)[None, :]
+    return jnp.where(index == first[:, None], 0.0, cost_there - cost_here[:, None])
+
+
+@struct.dataclass(kw_only=True)
+class _Order:
+    """In which order successes are valued: edges that end nearest to acceptance first.
+
+    Attributes:
+      edges: edges in that order.
+      targets: state z'' of each edge, negative on padding.
+      is_final: True where the success needs no value: it satisfies the task, or the edge is padding.
+      cyclic: True where the automaton can return to a state.
+    """
+
+    edges: Int32[Array, "R E"]
+    targets: Int32[Array, "R E"]
+    is_final: Bool[Array, "R E"]
+    cyclic: Bool[Array, "R"]
+
+
+def _order_of_successes(tables: ActionTables, reach: Bool[Array, "R Z Z"], subgoals: int, edges: int) -> _Order:
+    rows, count, states = tables.actions, reach.shape[0], reach.shape[1]
+    targets = jnp.max(rows.to_state[:, :-1].reshape(count, subgoals, edges), axis=1)
+    is_final = jnp.all(rows.accepts[:, :-1].reshape(count, subgoals, edges), axis=1) | (targets < 0)
+    # The fewer states a state can get to, the nearer it is to the end.
+    depth = jnp.sum(reach, axis=2, dtype=jnp.int32)
+    late = jnp.where(is_final, states + 1, jnp.take_along_axis(depth, jnp.maximum(targets, 0), axis=1))
+    others = ~jnp.eye(states, dtype=jnp.bool_)
+    return _Order(
+        edges=jnp.argsort(late, axis=1, stable=True).astype(jnp.int32),
+        targets=targets,
+        is_final=is_final,
+        cyclic=jnp.any(reach & jnp.swapaxes(reach, 1, 2) & others[None], axis=(1, 2)),
+    )
 
 
 def _value_successes(
@@ -149,109 +272,102 @@ def _value_successes(
     reach: Bool[Array, "R Z Z"],
     length: int,
 ) -> Rule:
-    """Fill in ``after_success``, edges that end nearest to acceptance first."""
+    """Fill in ``after_success``: a chain from every subgoal, for one edge of every problem at a time."""
     count, actions = rule.product_states.shape
     states, subgoals = reach.shape[1], tables.distance.shape[1] - 1
     edges = (actions - 1) // max(subgoals, 1)
     if edges == 0:
         return rule
-    targets = jnp.max(tables.actions.to_state[:, :-1].reshape(count, subgoals, edges), axis=1)
-    ends = jnp.all(tables.actions.accepts[:, :-1].reshape(count, subgoals, edges), axis=1) | (targets < 0)
-    depth = jnp.sum(reach, axis=2, dtype=jnp.int32)
-    late = jnp.where(ends, states + 1, jnp.take_along_axis(depth, jnp.maximum(targets, 0), axis=1))
-    order = jnp.argsort(late, axis=1, stable=True).astype(jnp.int32)
-    todo = jnp.max(jnp.sum(~ends, axis=1, dtype=jnp.int32))
-    others = ~jnp.eye(states, dtype=jnp.bool_)
-    cyclic = jnp.any(reach & jnp.swapaxes(reach, 1, 2) & others[None], axis=(1, 2))
+    order = _order_of_successes(tables, reach, subgoals, edges)
+    todo = jnp.max(jnp.sum(~order.is_final, axis=1, dtype=jnp.int32))
     problem = jnp.repeat(jnp.arange(count, dtype=jnp.int32), subgoals)
     subgoal = jnp.tile(jnp.arange(subgoals, dtype=jnp.int32), count)
     chances, costs, tried = chance[problem], success_cost[problem], chance[problem] > 0
 
-    def value(step, after_success):
-        edge = order[problem, step % jnp.maximum(todo, 1)]
+    def value_edge(step, after_success):
+        edge = order.edges[problem, step % jnp.maximum(todo, 1)]
         action = subgoal * edges + edge
         now = dataclasses.replace(rule, after_success=after_success)
-        product_state = subgoal * states + jnp.maximum(targets[problem, edge], 0)
-        pending_cost = success_cost[problem, action]
-        gain = _gain(now, problem, chances, costs)
-        chain = _follow(now, problem, product_state, pending_cost, tried, chances, gain, length)
+        starts = _Starts(
+            problem=problem,
+            product_state=subgoal * states + jnp.maximum(order.targets[problem, edge], 0),
+            pending_cost=success_cost[problem, action],
+            available=tried,
+            chance=chances,
+            attempt_cost=_attempt_cost(now, problem, chances, costs),
+        )
+        chain = _follow_chain(now, starts, length)
         # A problem without cycles is not valued again because another of the batch has them.
-        stays = ends[problem, edge] | ((step >= todo) & ~cyclic[problem])
-        left = jnp.where(stays, after_success[problem, action], chain.rest[0])
-        return after_success.at[problem, action].set(left, unique_indices=True)
+        keeps = order.is_final[problem, edge] | ((step >= todo) & ~order.cyclic[problem])
+        value = jnp.where(keeps, after_success[problem, action], chain.rest[0])
+        return after_success.at[problem, action].set(value, unique_indices=True)
 
-    steps = todo * jnp.where(jnp.any(cyclic), PASSES, 1)
-    return dataclasses.replace(rule, after_success=jax.lax.fori_loop(0, steps, value, rule.after_success))
+    steps = todo * jnp.where(jnp.any(order.cyclic), PASSES, 1)
+    return dataclasses.replace(rule, after_success=jax.lax.fori_loop(0, steps, value_edge, rule.after_success))
 
 
-def _gain(
+def _attempt_cost(
     rule: Rule, problem: Int32[Array, "N"], chance: Float32[Array, "N A"], success_cost: Float32[Array, "N A"]
 ) -> Float32[Array, "N A"]:
-    """Expected cost of each attempt without the way to it, what is left after success included, after failure not."""
+    """Expected cost of each attempt without the path to it: what follows success is included, what follows failure
+    is not."""
     return chance * (success_cost + rule.after_success[problem]) + (1.0 - chance) * rule.failure_cost[problem]
 
 
-def _follow(
-    rule: Rule,
-    problem: Int32[Array, "N"],
-    product_state: Int32[Array, "N"],
-    pending_cost: Float32[Array, "N"],
-    available: Bool[Array, "N A"],
-    chance: Float32[Array, "N A"],
-    gain: Float32[Array, "N A"],
-    length: int,
-) -> _Chain:
-    """The chain of the rule from a product state of each problem row; ``problem`` is the problem of each row."""
-    count, actions = available.shape
-    index = jnp.arange(actions, dtype=jnp.int32)[None, :]
-    number = jnp.arange(count, dtype=jnp.int32)
-    product_states, inverse = rule.product_states[problem], jnp.where(available, 1.0 / chance, jnp.inf)
-    none = jnp.full((length, count), actions, jnp.int32)
+def _follow_chain(rule: Rule, starts: _Starts, length: int) -> _Chain:
+    """The chain of the rule from each start."""
+    count, actions = starts.available.shape
     zeros = jnp.zeros((length, count), jnp.float32)
-
-    def goes_on(carry):
-        return (carry[0] < length) & jnp.any(carry[4])
-
-    def advance(carry):
-        level, product_state, pending_cost, inverse, active, reached, records = carry
-        path_cost = rule.path_costs[problem, product_state]
-        distance = jnp.where(product_states == product_state[:, None], 0.0, path_cost + pending_cost[:, None])
-        score = jax.lax.optimization_barrier(jnp.where(jnp.isinf(inverse), jnp.inf, (distance + gain) * inverse))
-        least = least_of_each(score, jnp.inf)
-        action = least_of_each(jnp.where(score <= least[:, None], index, actions - 1), actions - 1)
-        moves = active & ~jnp.isinf(least)
-        odds = chance[number, action]
-        new = (jnp.where(moves, action, actions), jnp.where(moves, least * odds, 0.0), jnp.where(moves, odds, 0.0))
-        records = tuple(
-            jax.lax.dynamic_update_index_in_dim(old, entry, level, 0) for old, entry in zip(records, new, strict=True)
-        )
-        inverse = jnp.where(rule.closes[problem, action], jnp.inf, inverse)
-        reached = reached * (1.0 - odds)
-        return (
-            level + 1,
-            jnp.where(moves, product_states[number, action], product_state),
-            jnp.where(moves, rule.failure_cost[problem, action], pending_cost),
-            inverse,
-            moves & (reached > NEGLIGIBLE),
-            reached,
-            records,
-        )
-
-    start = (
-        jnp.int32(0),
-        product_state,
-        pending_cost,
-        inverse,
-        jnp.ones_like(product_state, bool),
-        jnp.ones_like(pending_cost),
-        (none, zeros, zeros),
+    walk = _Walk(
+        level=jnp.int32(0),
+        active=jnp.ones((count,), jnp.bool_),
+        product_state=starts.product_state,
+        pending_cost=starts.pending_cost,
+        inverse_chance=jnp.where(starts.available, 1.0 / starts.chance, jnp.inf),
+        reached=jnp.ones((count,), jnp.float32),
+        action=jnp.full((length, count), actions, jnp.int32),
+        cost=zeros,
+        chance=zeros,
     )
-    action, cost, odds = jax.lax.while_loop(goes_on, advance, start)[-1]
+    walk = jax.lax.while_loop(
+        lambda walk: (walk.level < length) & jnp.any(walk.active), lambda walk: _fail_once(rule, starts, walk), walk
+    )
 
     def add(rest, level):
-        rest = cost[level] + (1.0 - odds[level]) * rest
+        rest = walk.cost[level] + (1.0 - walk.chance[level]) * rest
         return rest, rest
 
-    end = rule.dead_end_cost[problem]
+    end = rule.dead_end_cost[starts.problem]
     _, rest = jax.lax.scan(add, end, jnp.arange(length, dtype=jnp.int32), reverse=True)
-    return _Chain(action=action, cost=cost, chance=odds, rest=jnp.concatenate([rest, end[None]]))
+    return _Chain(action=walk.action, cost=walk.cost, chance=walk.chance, rest=jnp.concatenate([rest, end[None]]))
+
+
+def _fail_once(rule: Rule, starts: _Starts, walk: _Walk) -> _Walk:
+    """Take the action of least cost per chance in every chain that goes on, and go on as if it had failed."""
+    problem, actions = starts.problem, starts.available.shape[1]
+    number = jnp.arange(problem.shape[0], dtype=jnp.int32)
+    product_states = rule.product_states[problem]
+    path_cost = rule.path_costs[problem, walk.product_state]
+    inside = product_states == walk.product_state[:, None]
+    distance = jnp.where(inside, 0.0, path_cost + walk.pending_cost[:, None])
+    ratio = jnp.where(jnp.isinf(walk.inverse_chance), jnp.inf, (distance + starts.attempt_cost) * walk.inverse_chance)
+    # Without the barrier XLA would compute the ratios anew for each minimum over them.
+    action, least = first_of_least(jax.lax.optimization_barrier(ratio))
+    moves = walk.active & ~jnp.isinf(least)
+    chance = starts.chance[number, action]
+    reached = walk.reached * (1.0 - chance)
+
+    def record(array: Array, new: Array) -> Array:
+        return jax.lax.dynamic_update_index_in_dim(array, new, walk.level, 0)
+
+    return _Walk(
+        level=walk.level + 1,
+        active=moves & (reached > NEGLIGIBLE),
+        product_state=jnp.where(moves, product_states[number, action], walk.product_state),
+        pending_cost=jnp.where(moves, rule.failure_cost[problem, action], walk.pending_cost),
+        inverse_chance=jnp.where(rule.closes[problem, action], jnp.inf, walk.inverse_chance),
+        reached=reached,
+        action=record(walk.action, jnp.where(moves, action, actions)),
+        cost=record(walk.cost, jnp.where(moves, least * chance, 0.0)),
+        chance=record(walk.chance, jnp.where(moves, chance, 0.0)),
+    )

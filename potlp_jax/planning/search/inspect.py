@@ -9,9 +9,10 @@ import numpy as np
 from potlp_jax.planning.history import ActionTerms, History, action_terms, initial_history, step
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.graph import Tree
+from potlp_jax.planning.search.uct import UctTree
 
 
-def tree_top(problem: PlanningProblem, tree: Tree, *, depth: int = 2, width: int = 4) -> dict[str, Any]:
+def tree_top(problem: PlanningProblem, tree: Tree | UctTree, *, depth: int = 2, width: int = 4) -> dict[str, Any]:
     """The best of a searched tree as nested plain values. Host only.
 
     Args:
@@ -33,17 +34,19 @@ def tree_top(problem: PlanningProblem, tree: Tree, *, depth: int = 2, width: int
 class _TreeViewer:
     """Replays histories down a tree on the host."""
 
-    def __init__(self, problem: PlanningProblem, tree: Tree, width: int) -> None:
+    def __init__(self, problem: PlanningProblem, tree: Tree | UctTree, width: int) -> None:
         self._problem, self._width = problem, width
         self._q_values, self._root_visits = np.asarray(tree.q_values), np.asarray(tree.root_visits)
-        self._children, self._values = np.asarray(tree.children), np.asarray(tree.values)
+        self._children, self._node_visits = np.asarray(tree.children), np.asarray(tree.node_visits)
+        self._q_includes_pending_cost = tree.Q_INCLUDES_PENDING_COST
         self._accepting = np.asarray(problem.task.accepting)
 
     def node(self, index: int, history: History, depth: int) -> dict[str, Any]:
         """A node of the tree with the branches below it, as this history arrives there."""
         terms = _action_terms(self._problem, history)
-        # The tree leaves out the pending cost; the terms of the history include it.
-        q_values = self._q_values[index] + self._paid(history)
+        q_values = self._q_values[index]
+        if not self._q_includes_pending_cost:
+            q_values = q_values + self._paid(history)
         order = [int(a) for a in np.argsort(q_values, kind="stable")[: self._width] if np.isfinite(q_values[a])]
         actions = [self._action(index, a, float(q_values[a]), terms, history, depth) for a in order if depth > 0]
         accepting, dead_end = bool(self._accepting[int(history.state)]), bool(np.isinf(q_values).all())
@@ -51,14 +54,14 @@ class _TreeViewer:
         return {
             **self._where(history),
             "value": 0.0 if accepting else value,
-            "visits": int(self._values[index, -1]),
+            "visits": int(self._node_visits[index]),
             "accepting": accepting,
             "dead_end": not accepting and dead_end,
             "actions": actions,
         }
 
     def _paid(self, history: History) -> np.ndarray:
-        """What each action pays of the pending cost: all of it, or nothing where it goes on inside."""
+        """What each action pays of the pending cost: nothing where it stays in the unknown region, otherwise all."""
         location, state, edges = int(history.location), int(history.state), max(self._problem.edge_count, 1)
         paid = np.full(self._problem.action_count, float(history.pending_cost))
         if location < self._problem.subgoal_count:
@@ -74,7 +77,7 @@ class _TreeViewer:
         if index == Tree.ROOT:
             return int(self._root_visits[action])
         reached = [int(child) for child in self._children[index, action] if child != Tree.UNVISITED]
-        return sum(int(self._values[child, -1]) for child in reached)
+        return sum(int(self._node_visits[child]) for child in reached)
 
     def _action(
         self, index: int, action: int, q_value: float, terms: ActionTerms, history: History, depth: int

@@ -1,0 +1,117 @@
+"""``potlp fit``: an estimator from a dataset, or from nothing but a recipe."""
+
+import dataclasses
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from potlp_jax.cli.collect import collection_bars, require_training_extra
+from potlp_jax.cli.group import Command, command_app
+from potlp_jax.cli.options import Processes, RecipeName, Settings
+from potlp_jax.cli.output import console, fail, make_folder, progress_bar
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+    from potlp_jax.recipes.journal import Display
+
+logger = logging.getLogger(__name__)
+
+app = command_app()
+
+
+@app.command(
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp fit --recipe firefighting --out out/firefighting --processes 2[/cyan] - collect, then fit
+
+[cyan]potlp fit data/training --validation data/validation --out out/fit --epochs 7[/cyan]
+
+[cyan]potlp fit data/training --validation data/validation --out out/fit --set training.learning_rate=1e-3[/cyan]
+
+[dim]The same command again resumes after an interruption and ends with the same parameters. --out then holds
+estimator.npz, log.csv, curves.png and what TensorBoard shows. Needs the extra: pip install 'potlp-jax\\[train]'.
+docs/estimator.md says more.[/dim]
+""",
+)
+def fit(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for everything that is written.")],
+    dataset: Annotated[
+        Path | None,
+        typer.Argument(metavar="DATASET", help="Folder that `potlp collect` wrote; none: collect as the recipe says."),
+    ] = None,
+    validation: Annotated[
+        Path | None, typer.Option("--validation", help="Dataset of other worlds; decides which parameters are kept.")
+    ] = None,
+    recipe: RecipeName = None,
+    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="Passes over the panoramas, at most.")] = None,
+    minutes: Annotated[
+        float | None, typer.Option("--minutes", help="Plan as many steps as fit into this time.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Of parameters, order and augmentation.")] = None,
+    exclusive_within: Annotated[
+        float | None,
+        typer.Option(
+            "--exclusive-within", help="Cells within which subgoals exclude each other (`python -m eval.exclusion`)."
+        ),
+    ] = None,
+    fovea: Annotated[
+        int | None, typer.Option("--fovea", help="Columns beside each subgoal that are seen at full resolution.")
+    ] = None,
+    processes: Processes = 1,
+    settings: Settings = None,
+) -> None:
+    """Fit an estimator to a dataset, or make one from nothing with --recipe."""
+    require_training_extra()
+    from potlp_jax.codec import settings_from_words, with_settings
+    from potlp_jax.learning.dataset import read_dataset
+    from potlp_jax.recipes import fitting
+    from potlp_jax.recipes.recipe import follow, read_recipe
+
+    if (dataset is None) != (validation is None):
+        fail("give a DATASET and, with --validation, another of other worlds: both, or neither with --recipe")
+    if dataset is None and recipe is None:
+        fail("give a DATASET and --validation, or a recipe with --recipe")
+    given = None if recipe is None else read_recipe(recipe)
+    config = with_settings(
+        fitting.FitConfig() if given is None else given.fit, settings_from_words(settings or []), "--set"
+    )
+    options = {"epochs": epochs, "minutes": minutes, "exclusive_within": exclusive_within, "fovea": fovea}
+    config = with_settings(config, _given(**options) | {"training": _given(seed=seed)}, "options")
+    folder = make_folder(out)
+    with progress_bar() as progress:
+        if dataset is not None and validation is not None:
+            trained = fitting.fit(read_dataset(dataset), read_dataset(validation), folder, config, _display(progress))
+        else:
+            assert given is not None
+            chosen = dataclasses.replace(given, fit=config)
+            trained = follow(chosen, folder, processes, collection_bars(progress), _display(progress))
+    console().print(
+        f"{folder / fitting.ESTIMATOR}: step {trained.best_step} of {trained.steps}, validation loss "
+        f"{trained.best_loss:.4f}; ended by {trained.reason} after {trained.seconds / 60:.1f} min",
+        markup=False,
+        soft_wrap=True,
+    )
+
+
+def _given(**options: Any) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def _display(progress: "Progress") -> "Display":
+    """A bar of steps, a line about each epoch, and the picture of the curves."""
+    from potlp_jax.recipes.journal import Display
+    from potlp_jax.view.training_curves import draw_curves
+
+    bars: list[TaskID] = []
+
+    def advance(done: int, planned: int) -> None:
+        if not bars:
+            bars.append(progress.add_task("steps", total=planned))
+        progress.update(bars[0], completed=done)
+
+    return Display(say=logger.info, advance=advance, draw=draw_curves)

@@ -1,0 +1,95 @@
+"""Settings of the searches: the type of the configuration says which search runs.
+
+Each has a ``kind`` that says the same as text, for records and settings files: ``{kind: uct, simulations: 1000}``.
+"""
+
+import dataclasses
+from typing import Literal
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchConfig:
+    """Settings of the best-first search on bounds (``search.best_first``), the default.
+
+    Attributes:
+      simulations: descents per search; each adds at most one node. The search ends earlier once no gap between value
+        and bound is left at the root.
+      optimism: fraction by which guessed values are assumed to be too high: the descent takes the action that would be
+        best if they all were. With 1 the search examines all that the guesses cannot rule out, so that a search that
+        ends by itself is exact. None: 0.7 in problems of up to 41 actions, where one wrong guess weighs more and there
+        is less to examine, otherwise 0.3 (docs/results/planner.md, "How optimistic?").
+      max_depth: actions per descent. A descent that gets there is cut, valued by what is known of its last node, and
+        flagged.
+      tree_capacity: nodes per tree, at least 1; None for one more than simulations. A full tree is flagged.
+      guess_failures: failures in a row that the guess at outcomes without a node follows; a dead end counts after them.
+      kind: ``best-first``.
+    """
+
+    simulations: int = 300
+    optimism: float | None = None
+    max_depth: int = 32
+    tree_capacity: int | None = None
+    guess_failures: int = 24
+    kind: Literal["best-first"] = "best-first"
+
+    def __post_init__(self) -> None:
+        _check_kind(self, "best-first")
+        _check_at_least_one(self, "simulations", "max_depth", "tree_capacity", "guess_failures")
+        if self.optimism is not None and not 0 <= self.optimism <= 1:
+            raise ValueError(f"SearchConfig.optimism is {self.optimism}, must lie in [0, 1]")
+
+    @property
+    def capacity(self) -> int:
+        """Nodes per tree."""
+        return self.simulations + 1 if self.tree_capacity is None else self.tree_capacity
+
+    @property
+    def slots(self) -> int:
+        """Slots of the hash table of nodes: a power of two, at most half of them taken."""
+        return 1 << max(self.capacity * 2 - 1, 1).bit_length()
+
+
+@dataclasses.dataclass(frozen=True)
+class UctConfig:
+    """Settings of PO-UCT as published (``search.uct``).
+
+    Attributes:
+      simulations: sampled rollouts per search; each adds at most one node. PO-UCT has no criterion to end earlier, and
+        needs more of them than best-first search: 1,000 to 100,000 for a mean regret near 1 %
+        (docs/results/planner.md).
+      exploration: weight of the exploration term, a cost: a rollout takes the least
+        ``Q - exploration * sqrt(log(n) / n_a)``. The code of Bradley et al. uses 50.
+      max_depth: actions per rollout. A rollout that gets there is cut, costs nothing beyond its last node, and is
+        flagged.
+      tree_capacity: nodes per tree, at least 1; None for one more than simulations. A full tree is flagged.
+      kind: ``uct``.
+    """
+
+    simulations: int = 1000
+    exploration: float = 50.0
+    max_depth: int = 32
+    tree_capacity: int | None = None
+    kind: Literal["uct"] = "uct"
+
+    def __post_init__(self) -> None:
+        _check_kind(self, "uct")
+        _check_at_least_one(self, "simulations", "max_depth", "tree_capacity")
+        if not self.exploration >= 0:
+            raise ValueError(f"UctConfig.exploration is {self.exploration}, must not be negative")
+
+    @property
+    def capacity(self) -> int:
+        """Nodes per tree."""
+        return self.simulations + 1 if self.tree_capacity is None else self.tree_capacity
+
+
+def _check_kind(config: SearchConfig | UctConfig, kind: str) -> None:
+    if config.kind != kind:
+        raise ValueError(f"{type(config).__name__}.kind is {config.kind!r}, must be {kind!r}")
+
+
+def _check_at_least_one(config: SearchConfig | UctConfig, *names: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        if value is not None and value < 1:
+            raise ValueError(f"{type(config).__name__}.{name} is {value}, must be at least 1")

@@ -1,0 +1,119 @@
+"""How a search runs: in lockstep on all rows of a batch, to which ``jax.vmap`` is routed.
+
+A search is four verbs on a batch of problems (``Search``). The functions here know nothing of what the verbs do, so
+that a test can run them on a search of its own.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, UInt32
+
+from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.search.plan import Plan
+
+
+@dataclasses.dataclass(frozen=True)
+class Search:
+    """A search as verbs. All arrays have a leading batch axis; every verb is pure.
+
+    Attributes:
+      tree: the class of its tree, a flat dataclass of arrays.
+      prepare: ``(problems, seeds, config) -> context``: what stays the same during the search.
+      plant: ``(context, config) -> tree``: the roots alone.
+      is_open: ``(context, tree) -> bool [B]``: whether more simulations can change anything.
+      simulate: ``(context, tree, config) -> tree``: one descent of every row that is open; others stay as they are.
+      choose: ``(context, tree) -> plan``.
+    """
+
+    tree: type
+    prepare: Callable[..., Any]
+    plant: Callable[..., Any]
+    is_open: Callable[..., Any]
+    simulate: Callable[..., Any]
+    choose: Callable[..., Plan]
+
+
+def run_search(
+    search: Search, config: Any, problems: PlanningProblem, seeds: UInt32[Array, "B 2"], trees: Any
+) -> tuple[Plan, Any]:
+    """Search a batch of problems; ``jax.vmap`` of this adds its axis to the batch.
+
+    Args:
+      search: which one.
+      config: its settings; ``config.simulations`` are run at most.
+      problems: every leaf has the leading axis B.
+      seeds: two random words per row.
+      trees: of an earlier search of the same problems, to go on with; None to begin.
+
+    Returns:
+      Plans and trees with the leading axis B.
+    """
+    leaves, structure = jax.tree.flatten(problems)
+    kernel = _routed_kernel(search, config, structure, len(leaves))
+    arrays = kernel(seeds, *leaves, *([] if trees is None else _arrays_of(trees)))
+    count = len(dataclasses.fields(Plan))
+    return _from_arrays(Plan, arrays[:count]), _from_arrays(search.tree, arrays[count:])
+
+
+@functools.lru_cache(maxsize=64)
+def _routed_kernel(search: Search, config: Any, structure: Any, leaf_count: int) -> Callable[..., Any]:
+    """The search on flat lists of arrays with a leading batch axis; vmap merges its own axis into that one.
+
+    Flat lists, because the rule of a ``custom_vmap`` receives and returns flags in the structure of its arguments, and
+    dataclasses of arrays do not hold flags.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def kernel(seeds, *arrays):
+        leaves, trees = arrays[:leaf_count], arrays[leaf_count:]
+        problems = jax.tree.unflatten(structure, leaves)
+        tree = _from_arrays(search.tree, trees) if trees else None
+        plan, tree = _search_batch(problems, seeds, tree, search=search, config=config)
+        return _arrays_of(plan) + _arrays_of(tree)
+
+    @kernel.def_vmap
+    def merge_axes(axis_size, in_batched, *arrays):
+        full = [
+            array if batched else jnp.broadcast_to(array[None], (axis_size, *array.shape))
+            for array, batched in zip(arrays, in_batched, strict=True)
+        ]
+        rows = full[0].shape[0] * full[0].shape[1]
+        results = kernel(*[array.reshape(rows, *array.shape[2:]) for array in full])
+        split = [result.reshape(axis_size, rows // max(axis_size, 1), *result.shape[1:]) for result in results]
+        return split, [True] * len(split)
+
+    return kernel
+
+
+@functools.partial(jax.jit, static_argnames=("search", "config"))
+def _search_batch(
+    problems: PlanningProblem, seeds: UInt32[Array, "B 2"], tree: Any, *, search: Search, config: Any
+) -> tuple[Plan, Any]:
+    """Simulate until no row is open or the simulations are spent, then choose."""
+    context = search.prepare(problems, seeds, config)
+    tree = search.plant(context, config) if tree is None else tree
+
+    def unfinished(carry: tuple[Array, Any]) -> Array:
+        count, tree = carry
+        return (count < config.simulations) & jnp.any(search.is_open(context, tree))
+
+    def advance(carry: tuple[Array, Any]) -> tuple[Array, Any]:
+        count, tree = carry
+        return count + 1, search.simulate(context, tree, config)
+
+    _, tree = jax.lax.while_loop(unfinished, advance, (jnp.int32(0), tree))
+    return search.choose(context, tree), tree
+
+
+def _arrays_of(value: Any) -> list[Array]:
+    return [getattr(value, field.name) for field in dataclasses.fields(value)]
+
+
+def _from_arrays(kind: type, arrays: Sequence[Array]) -> Any:
+    names = [field.name for field in dataclasses.fields(kind)]
+    return kind(**dict(zip(names, arrays, strict=True)))
