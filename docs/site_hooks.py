@@ -1,6 +1,7 @@
 """Pages of the site that follow from the sources: the API by room, the notebooks, how to contribute, what changed.
 
-mkdocs calls ``on_config``, ``on_files`` and ``on_page_markdown`` (`hooks` in mkdocs.yml). Generated pages never go stale when a module moves.
+mkdocs calls ``on_config``, ``on_files`` and ``on_page_markdown`` (`hooks` in mkdocs.yml). Generated pages never go
+stale when a module moves.
 """
 
 import ast
@@ -8,7 +9,6 @@ import json
 import re
 from pathlib import Path
 from typing import Any
-
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "potlp_jax"
