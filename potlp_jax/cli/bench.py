@@ -15,7 +15,7 @@ from potlp_jax.cli.output import console, fail, package_version, print_json, pro
 if TYPE_CHECKING:
     from potlp_jax.bench.planner import DistanceRow, PhaseRow, Scene, SearchRow
     from potlp_jax.learning.estimator import TrainedEstimator
-    from potlp_jax.planning.policies import DecisionConfig
+    from potlp_jax.planning.situation import DecisionConfig
 
 # In the order in which they are measured and shown.
 PARTS = ("search", "distances", "decision", "perception")
@@ -69,6 +69,7 @@ def run_bench(
     from potlp_jax.cli.inputs import setting_changes, trial_config
     from potlp_jax.environments.registry import make
     from potlp_jax.learning.estimator import estimator_for
+    from potlp_jax.planning.search.config import SearchConfig
 
     chosen = _read_parts(parts)
     # All words are read before anything is measured: measuring takes minutes.
@@ -78,11 +79,13 @@ def run_bench(
     # Before anything starts XLA, which counts the cores once and makes a thread for each.
     _pin(core)
     decision = trial_config(setting_changes(simulations=simulations)).decision
+    # Of the two searches the default is measured; `eval.bench` compares them.
+    searching = SearchConfig() if simulations is None else SearchConfig(simulations=simulations)
     rows: dict[str, list[Any]] = {}
     with progress_bar() as progress:
         bar = progress.add_task("compiling and measuring", total=None)
         if "search" in chosen:
-            rows["search"] = [measure_search(family, subgoals, batch, decision.search, repeats) for batch in counts]
+            rows["search"] = [measure_search(family, subgoals, batch, searching, repeats) for batch in counts]
         if set(chosen) - {"search"}:
             progress.update(bar, description="exploring a world")
             asked = make(environment).task(task)
