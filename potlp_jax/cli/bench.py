@@ -96,6 +96,7 @@ def run_bench(
             rows |= _measure_scene(
                 scene, parts=chosen, trained=trained, decision=decision, sources=sources, repeats=repeats
             )
+    # Figures mean nothing without the machine: every table and document begins with it.
     where = describe_environment()
     if json:
         print_json({"potlp_jax": package_version(), "environment": where, "rows": _plain(rows)})
@@ -196,6 +197,7 @@ def _search_table(rows: "list[SearchRow]") -> Table:
             str(row.batch),
             f"{row.simulations_per_s:,.0f}",
             f"{row.searches_per_s:,.1f}",
+            # Not every search counts its depth.
             "-" if row.mean_depth is None else f"{row.mean_depth:.2f}",
             _bytes(row.tree_bytes),
             _bytes(row.batch_tree_bytes),
@@ -230,12 +232,14 @@ def _phase_table(title: str, rows: "list[PhaseRow]") -> Table:
             "-" if memory is None else _bytes(memory["temporaries"]),
             _seconds(row.timing.trace_s),
             _seconds(row.timing.compile_s),
+            # The last phase is the whole decision, apart from its parts.
             end_section=row is rows[-2],
         )
     return table
 
 
 def _seconds(seconds: float) -> str:
+    # Three digits: repeated runs agree in no more.
     return f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"
 
 

@@ -117,6 +117,7 @@ def _draw(trial: "Trial", decision: "Decision", out: Path, *, depth: int, estima
     if not decision.observations:
         return [out]
     seen = {look: np.asarray(panorama_at(trial, trial.decisions[look])) for look in decision.observations}
+    # Panoramas are photographs, for which PNG serves whatever format the tree is wanted in.
     beside = out.with_name(f"{out.stem}-panoramas.png")
     save_figure(draw_panoramas(trial, decision, seen), beside)
     return [out, beside]
