@@ -8,7 +8,8 @@ from potlp_jax.bench.planner import PhaseRow, Phases, Scene, measure_decision, w
 from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator
 from potlp_jax.learning.memory import remember
 from potlp_jax.learning.network import EstimatorNetwork
-from potlp_jax.planning.policies import DecisionConfig, Policy, assess
+from potlp_jax.planning.policies import Policy
+from potlp_jax.planning.situation import DecisionConfig, assess
 from potlp_jax.trials.robot import photograph
 from potlp_jax.world.camera import CameraConfig, Disturbance
 
@@ -46,8 +47,8 @@ def measure_perception(
     features = phases.measure(
         "first stage", lambda params, image: network.encode(params, image), trained.params, panorama
     )
-    views = phases.measure("remember", remember, blind.views, features, scene.belief, scene.cell)
-    estimator = NetworkEstimator(params=trained.params, views=views, config=trained.config)
+    memory = phases.measure("remember", remember, blind.memory, features, scene.belief, scene.cell)
+    estimator = NetworkEstimator(params=trained.params, memory=memory, config=trained.config)
     subgoals = assess(scene.belief, scene.cell, scene.state, scene.task, config.frontiers).subgoals
     phases.measure(
         "distances to subgoals",

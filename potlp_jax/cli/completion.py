@@ -10,8 +10,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from potlp_jax.environments.families import GROUP, NAMED, PREFIXED
-from potlp_jax.plugins import entry_points
+from potlp_jax import plugins
+from potlp_jax.environments.families import NAMED, PREFIXED
 
 TASKS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -25,12 +25,13 @@ TASKS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 """Numbers of the tasks of the environments that need no file."""
 
 POLICIES = ("known-map", "baseline", "optimistic", "oracle", "potlp")
+SEARCHES = ("best-first", "uct")
 SPLITS = ("calibration", "training", "validation", "test")
 
 
 def complete_environment(incomplete: str) -> list[str]:
     """Names of environments, those that other installed packages declare among them."""
-    return _starting([*NAMED, *PREFIXED, *entry_points(GROUP)], incomplete)
+    return _starting([*NAMED, *PREFIXED, *plugins.entry_points(plugins.ENVIRONMENTS)], incomplete)
 
 
 def complete_task(ctx: Any, incomplete: str) -> list[str]:
@@ -42,14 +43,15 @@ def complete_task(ctx: Any, incomplete: str) -> list[str]:
 
 
 def complete_policy(incomplete: str) -> list[str]:
-    """Names of policies."""
-    return _starting(POLICIES, incomplete)
+    """Names of policies, those that other installed packages declare among them."""
+    return _starting(_policies(), incomplete)
 
 
 def complete_policies(incomplete: str) -> list[str]:
     """Names of policies after those that are there already, joined by commas."""
     *before, last = incomplete.split(",")
-    return [",".join([*before, name]) for name in _starting(POLICIES, last) if name not in before]
+    # The shell replaces the whole word, so that what stands before the last comma is part of every proposal.
+    return [",".join([*before, name]) for name in _starting(_policies(), last) if name not in before]
 
 
 def complete_recipe(incomplete: str) -> list[str]:
@@ -58,9 +60,18 @@ def complete_recipe(incomplete: str) -> list[str]:
     return _starting([path.stem for path in sorted(folder.glob("*.yaml"))], incomplete)
 
 
+def complete_search(incomplete: str) -> list[str]:
+    """Names of the searches of policies that search."""
+    return _starting(SEARCHES, incomplete)
+
+
 def complete_split(incomplete: str) -> list[str]:
     """Names of splits."""
     return _starting(SPLITS, incomplete)
+
+
+def _policies() -> list[str]:
+    return [*POLICIES, *plugins.entry_points(plugins.POLICIES)]
 
 
 def _starting(words: Sequence[str], incomplete: str) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Any
 from potlp_jax.codec import with_settings
 from potlp_jax.environments.base import Generator
 from potlp_jax.errors import PotlpWarning
-from potlp_jax.planning.policies import DecisionConfig
+from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.world.camera import CameraConfig, Disturbance
 from potlp_jax.world.grid import World
 from potlp_jax.world.sensing import SensorConfig

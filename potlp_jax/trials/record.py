@@ -182,7 +182,7 @@ class Trial(RunRecord):
             "policy": self.policy,
             "task": self.task_text,
             "environment": self.environment,
-            "seed": self.seed,
+            "world": self.seed,
             "status": list(status_names(self.status)),
         }
 

@@ -19,7 +19,8 @@ from potlp_jax.learning.estimator import TrainedEstimator, estimator_for
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimator
-from potlp_jax.planning.policies import Move, MoveKind, Policy, PolicyFunction
+from potlp_jax.planning.move import Move, MoveKind
+from potlp_jax.planning.policies import Policy, PolicyFunction
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import Outcome
