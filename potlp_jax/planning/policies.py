@@ -174,7 +174,7 @@ def named_policy(policy: Policy | PolicyFunction | str) -> Policy | PolicyFuncti
     if own in list(Policy):
         return Policy(own)
     found = plugins.load(policy, group=plugins.POLICIES, kind="policy", known=list(Policy))
-    if not callable(found):
+    if not isinstance(found, PolicyFunction):
         raise PluginError(f"policy {policy!r}: {type(found).__name__} is no function (PolicyFunction)")
     return found
 

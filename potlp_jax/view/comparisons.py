@@ -91,7 +91,7 @@ def remark_lines(comparison: Comparison) -> list[str]:
             lines.append(f"{policy}: {', '.join(others)}")
     lines += loss_lines(comparison)
     if 0 < satisfied.pairs < FEW_WORLDS:
-        lines.append(f"{satisfied.pairs} worlds are few: the interval says how little they settle.")
+        lines.append(f"{satisfied.pairs} worlds are few: the interval says how far the share may be off.")
     return lines
 
 
