@@ -44,14 +44,14 @@ def complete_task(ctx: Any, incomplete: str) -> list[str]:
 
 def complete_policy(incomplete: str) -> list[str]:
     """Names of policies, those that other installed packages declare among them."""
-    return _starting([*POLICIES, *plugins.entry_points(plugins.POLICIES)], incomplete)
+    return _starting(_policies(), incomplete)
 
 
 def complete_policies(incomplete: str) -> list[str]:
     """Names of policies after those that are there already, joined by commas."""
     *before, last = incomplete.split(",")
     # The shell replaces the whole word, so that what stands before the last comma is part of every proposal.
-    return [",".join([*before, name]) for name in complete_policy(last) if name not in before]
+    return [",".join([*before, name]) for name in _starting(_policies(), last) if name not in before]
 
 
 def complete_recipe(incomplete: str) -> list[str]:
@@ -68,6 +68,10 @@ def complete_search(incomplete: str) -> list[str]:
 def complete_split(incomplete: str) -> list[str]:
     """Names of splits."""
     return _starting(SPLITS, incomplete)
+
+
+def _policies() -> list[str]:
+    return [*POLICIES, *plugins.entry_points(plugins.POLICIES)]
 
 
 def _starting(words: Sequence[str], incomplete: str) -> list[str]:
