@@ -8,16 +8,9 @@ import numpy as np
 
 from potlp_jax.environments.ros.places import Places
 from potlp_jax.errors import DatasetError, LogError
+from potlp_jax.learning import recording
 from potlp_jax.learning.dataset import DatasetMetadata, finished_shards, write_shard
 from potlp_jax.learning.questions import TaskDistribution
-from potlp_jax.learning.recording import (
-    Pose,
-    Recorder,
-    RecordingConfig,
-    draws_of_world,
-    record_views,
-    recording_metadata,
-)
 from potlp_jax.learning.sample_weights import WeightBounds
 from potlp_jax.logs.drive import Drive, PanoramaReader
 from potlp_jax.trials.loop import versions
@@ -25,31 +18,44 @@ from potlp_jax.world.moves import step_lengths
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class LogCollectConfig(RecordingConfig):
+class LogCollectConfig(recording.RecordingConfig):
     """What is recorded of each log: more views than of a simulated world, for there are few logs."""
 
     views_per_world: int = 200
 
 
-def poses_of(drive: Drive) -> Iterator[Pose]:
+def poses_of(drive: Drive) -> Iterator[recording.Pose]:
     """The poses of a drive at which there is a picture."""
     travelled = np.cumsum([0.0, *step_lengths(drive.path)]).tolist()
     for step, cell in enumerate(drive.path):
         if step in drive.pictures:
-            yield Pose(belief=drive.belief_at(step), cell=cell, step=step, travelled=travelled[step])
+            yield recording.Pose(belief=drive.belief_at(step), cell=cell, step=step, travelled=travelled[step])
 
 
 def collect_drives(
     drives: Sequence[Drive], places: Places, folder: Path, environment: str, split: str, config: LogCollectConfig
 ) -> list[int]:
-    """Write a dataset with a shard for each drive; returns the number of views of each.
+    """Write a dataset with a shard for each drive.
+
+    Args:
+        drives: with cells of one size.
+        places: where the propositions are.
+        folder: without a dataset.
+        environment: name of the dataset's environment.
+        split: name of the dataset's split.
+        config: what is recorded.
+
+    Returns:
+        The number of views of each drive.
 
     Raises:
         LogError: no drive, the drives have cells of different sizes, or not one has a picture.
         DatasetError: there is a dataset in the folder already.
     """
+    # Shards are numbered by log: adding to a dataset would mix numbers and draws.
     if finished_shards(folder):
         raise DatasetError(f"{folder} holds a dataset: choose an empty folder, and give all bags at once")
+    # The network counts in metres, but labels of one dataset share one size of cells.
     resolutions = sorted({float(drive.world.resolution) for drive in drives})
     if len(resolutions) != 1:
         raise LogError(f"the logs have cells of {resolutions} m: give one --resolution for all")
@@ -61,11 +67,12 @@ def collect_drives(
     tasks = TaskDistribution(places.names, config.held_out)
     metadata = _metadata(drives, places, environment, split, config)
     counts = []
+    # A shard per drive, with draws of its own: the order of the others does not matter.
     for number, drive in enumerate(drives):
-        recorder = Recorder(number, config, WeightBounds(**metadata.weights))
-        rng, pool = draws_of_world(config, split, number, tasks)
+        recorder = recording.Recorder(number, config, WeightBounds(**metadata.weights))
+        rng, pool = recording.draws_of_world(config, split, number, tasks)
         reader = PanoramaReader(drive, config.camera)
-        record_views(
+        recording.record_views(
             recorder,
             drive.world,
             number,
@@ -84,8 +91,9 @@ def _metadata(
     drives: Sequence[Drive], places: Places, environment: str, split: str, config: LogCollectConfig
 ) -> DatasetMetadata:
     resolution = float(drives[0].world.resolution)
+    # Weights are bounded by the largest map, so that all shards share them.
     height, width = (max(drive.world.shape[axis] for drive in drives) for axis in (0, 1))
-    return recording_metadata(
+    return recording.recording_metadata(
         config,
         WeightBounds.of_map(height, width, resolution),
         versions(),
