@@ -219,8 +219,8 @@ def _plan_program(task: Task, subgoals: int, search: SearchConfig | UctConfig) -
                 (subgoals + 1, states, subgoals, states),
                 "float32",
                 "[u, z, s, z']: path cost through known space from node u in state z to subgoal s in state z', inf "
-                "where there is no path; nodes 0 .. S-1 are the subgoals, S is the robot. From a subgoal the path starts "
-                "by re-entering the subgoal's cell",
+                "where there is no path; nodes 0 .. S-1 are the subgoals, S is the robot. From a subgoal the path "
+                "starts by re-entering the subgoal's cell",
             ),
             _Value(
                 "finish",

@@ -106,6 +106,7 @@ class Path:
     @staticmethod
     def empty(depth: int, batch: int, spare: int) -> "Path":
         """Nothing recorded."""
+        # Separate arrays: stacked into one, XLA recomputed the step for each part (docs/results/dropped.md, "Search").
         floats = jnp.zeros((depth, batch), jnp.float32)
         return Path(
             nodes=jnp.full((depth, batch), spare, jnp.int32),

@@ -354,6 +354,6 @@ def add_node(
         size=tree.size + added.astype(jnp.int32),
     )
     # Read back what was written: XLA would compute rows that are still to be written anew for each minimum over them,
-    # which made the search up to ten times slower (docs/results/planner.md, "What did not work").
+    # which made the search up to ten times slower (docs/results/dropped.md, "Search").
     values = least_values(model, tree.q_values[rows, index], tree.bounds[rows, index], history)
     return dataclasses.replace(tree, values=write(tree.values, values.pack())), values, added
