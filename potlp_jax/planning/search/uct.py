@@ -47,6 +47,7 @@ class UctTree:
         are none, inf where the action is not available.
       visits: rollouts that took each action.
       node_visits: rollouts that took any.
+      dead_end: True where a node has no action.
       distances: D of each action, the pending cost included.
       chances: P_S of each action.
       success_costs: R_S of each action.
@@ -67,6 +68,7 @@ class UctTree:
     q_values: Float32[Array, "*B N A"]
     visits: Int32[Array, "*B N A"]
     node_visits: Int32[Array, "*B N"]
+    dead_end: Bool[Array, "*B N"]
     distances: Float32[Array, "*B N A"]
     chances: Float32[Array, "*B N A"]
     success_costs: Float32[Array, "*B N A"]
@@ -194,6 +196,7 @@ def plant(context: Context, config: UctConfig) -> UctTree:
         q_values=first(_new_q_values(terms), jnp.inf),
         visits=jnp.zeros((batch, config.capacity + 1, actions), jnp.int32),
         node_visits=jnp.zeros((batch, config.capacity + 1), jnp.int32),
+        dead_end=first(~jnp.any(terms.available, axis=1)),
         distances=first(terms.distance),
         chances=first(terms.success_probability),
         success_costs=first(terms.success_cost),
@@ -331,8 +334,9 @@ def _expand(context: Context, tree: UctTree, rollout: Rollout) -> tuple[UctTree,
     history = model.step(tree.history(model.rows, rollout.node), rollout.action, rollout.success)
     terms = jax.vmap(terms_of_all)(model.tables, history)
     # A rollout that did not leave the tree ends at its last node: a dead end, or the depth limit.
-    q_values = jnp.where(rollout.expands[:, None], _new_q_values(terms), tree.q_values[model.rows, rollout.node])
-    dead = ~jnp.any(jnp.isfinite(q_values), axis=1) & ~rollout.accepted
+    # Kept per node: reading a row of Q values here, before they are written, would make XLA copy them all.
+    is_dead = ~jnp.any(terms.available, axis=1)
+    dead = jnp.where(rollout.expands, is_dead, tree.dead_end[model.rows, rollout.node]) & ~rollout.accepted
     # A full tree: the rollout still counts, but its last outcome gets no node.
     added = rollout.expands & (tree.size < tree.capacity)
     index = jnp.where(added, tree.size, tree.capacity)
@@ -354,6 +358,7 @@ def _expand(context: Context, tree: UctTree, rollout: Rollout) -> tuple[UctTree,
         distances=write(tree.distances, terms.distance),
         chances=write(tree.chances, terms.success_probability),
         success_costs=write(tree.success_costs, terms.success_cost),
+        dead_end=write(tree.dead_end, is_dead),
         size=tree.size + added.astype(jnp.int32),
         status=tree.status | overflow,
         **{name: write(getattr(tree, name), getattr(history, name)) for name in _HISTORY_FIELDS},
