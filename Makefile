@@ -1,6 +1,6 @@
 # Two commands for a newcomer: `make demo` and `make test`. Both make their own virtual environment first.
-SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
-PYTHON ?= $(shell for name in python3.12 python3.11 python3; do \
+SUPPORTED := import sys; sys.exit(not sys.version_info >= (3, 11))
+PYTHON ?= $(shell for name in python3.12 python3.11 python3.13 python3.14 python3; do \
   $$name -c '$(SUPPORTED)' 2>/dev/null && echo $$name && break; done)
 VENV := .venv
 BIN := $(VENV)/bin
@@ -9,7 +9,7 @@ BIN := $(VENV)/bin
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" && $(PYTHON) -c '$(SUPPORTED)' \
-	  || { echo "potlp-jax needs Python 3.11 or 3.12; name one: make PYTHON=/path/to/python3.11 demo"; exit 1; }
+	  || { echo "potlp-jax needs Python 3.11 or later; name one: make PYTHON=/path/to/python3.12 demo"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev,docs]'
 	@touch $@

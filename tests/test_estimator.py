@@ -16,7 +16,7 @@ from potlp_jax.learning.estimator import (
     SURE,
     estimator_for,
     exclusive_chances,
-    look,
+    observe_panorama,
     read_estimator,
     shipped_estimator,
 )
@@ -106,7 +106,7 @@ def test_answers_equal_the_network_asked_pair_by_pair(world, task, trained, reso
     world = dataclasses.replace(world, resolution=jnp.float32(resolution))
     belief = observe(BeliefMap.unobserved(world), world, world.start, NEAR.sensor)
     subgoals = find_subgoals(belief, belief.free, jnp.zeros(world.shape), FrontierConfig())
-    eyes = look(trained.start(*world.shape), render(world, world.start), belief, world.start)
+    eyes = observe_panorama(trained.start(*world.shape), render(world, world.start), belief, world.start)
     estimates = eyes(belief, subgoals, task.arrays)
     network = EstimatorNetwork(trained.config)
     features = network.encode(trained.params, render(world, world.start))
@@ -121,9 +121,9 @@ def test_answers_equal_the_network_asked_pair_by_pair(world, task, trained, reso
         row, column = subgoals.cells[s].tolist()
         angle = jnp.float32(math.atan2(row - start[0], column - start[1]))
         distance = jnp.float32(resolution * distances[((row, column), 0)])
-        gaze = network.centre(features, angle[None], distance[None])
+        centred = network.centre(features, angle[None], distance[None])
         for c, (stay, go) in enumerate(task.classes):
-            answer = network.answer(trained.params, gaze, jnp.asarray([stay], jnp.int8), jnp.asarray([go], jnp.int8))
+            answer = network.answer(trained.params, centred, jnp.asarray([stay], jnp.int8), jnp.asarray([go], jnp.int8))
             chances[s, c] = answer.success_probability[0]
             pair = (estimates.success_cost, estimates.failure_cost)
             expected = (answer.success_cost, answer.failure_cost)
@@ -143,7 +143,7 @@ def test_a_trial_is_satisfied_and_repeats(world, task, trained, trial):
     assert trial.versions["estimator"] == trained.identity
 
 
-def test_looks_name_earlier_decisions(trial):
+def test_observations_name_earlier_decisions(trial):
     assert any(decision.observations for decision in trial.decisions)
     for decision in trial.decisions:
         assert len(decision.observations) == len(decision.subgoals)

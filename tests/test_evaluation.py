@@ -229,8 +229,8 @@ def test_every_sample_gets_its_own_answer():
 
     @jax.jit
     def one(image, bearing, distance, phi_stay, phi_go):
-        gaze = NETWORK.centre(NETWORK.encode(params, image), bearing, distance)
-        return NETWORK.answer(params, gaze, phi_stay, phi_go)
+        centred = NETWORK.centre(NETWORK.encode(params, image), bearing, distance)
+        return NETWORK.answer(params, centred, phi_stay, phi_go)
 
     for k in range(0, 150, 7):
         image = jnp.asarray(decode(samples.images[samples.view_of[k]]))

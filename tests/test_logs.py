@@ -17,7 +17,7 @@ from potlp_jax.environments.ros.places import Places, load_places
 from potlp_jax.errors import LogError, MapError, RecordError
 from potlp_jax.learning.dataset import decode, encode, finished_shards, read_dataset, samples_file, views_file
 from potlp_jax.learning.questions import TaskDistribution
-from potlp_jax.learning.recording import Pose, Recorder, RecordingConfig, record_views, settled, survey
+from potlp_jax.learning.recording import Pose, Recorder, RecordingConfig, is_answered, record_views, survey
 from potlp_jax.learning.sample_weights import WeightBounds
 from potlp_jax.logs import writing
 from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
@@ -301,7 +301,7 @@ def test_subgoals_are_settled_where_the_final_map_is_closed_behind_them():
     assert sorted(cells) == [[3, 2], [3, 5]]
     unexplored = np.zeros(occupied.shape, bool)
     unexplored[2, 6] = True  # beside the cell u
-    answers = settled(world, belief, scene.subgoals, unexplored)
+    answers = is_answered(world, belief, scene.subgoals, unexplored)
     assert {tuple(cell): bool(answer) for cell, answer in zip(cells, answers, strict=False)} == {
         (3, 2): True,
         (3, 5): False,
@@ -310,7 +310,7 @@ def test_subgoals_are_settled_where_the_final_map_is_closed_behind_them():
 
 
 def test_what_a_drive_did_not_explore_is_left_out(bags, tmp_path):
-    """A drive that ends at the door: all that lies behind is unsettled."""
+    """A drive that ends at the door: all that lies behind has no answer."""
     bag = rewrite(bags, tmp_path / "x.bag", lambda topic, _, time: topic == "/tf_static" or step_of(time) < 6.0)
     places = places_of(bags)
     drive = drive_of(bag, places)

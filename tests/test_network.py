@@ -40,14 +40,14 @@ def _questions(shape, seed=1):
     return bearing, jnp.asarray(random.uniform(0, 60, shape), jnp.float32), *phi
 
 
-def _gaze(network, params, image, bearing, distance):
+def _centred(network, params, image, bearing, distance):
     """Of one image toward subgoals, or of several, each toward its own."""
     centre = network.centre if image.ndim == 3 else jax.vmap(network.centre)
     return centre(network.encode(params, image), bearing, distance)
 
 
 def _answers(params, image, bearing, distance, phi_stay, phi_go):
-    return NETWORK.answer(params, _gaze(NETWORK, params, image, bearing, distance), phi_stay, phi_go)
+    return NETWORK.answer(params, _centred(NETWORK, params, image, bearing, distance), phi_stay, phi_go)
 
 
 @pytest.mark.parametrize("columns", [1, 3, -2])
@@ -84,13 +84,13 @@ def test_centring_brings_the_bearing_into_the_centre():
     own = (np.arange(COLUMNS) + 0.5) * step - np.pi
     features = jnp.broadcast_to(jnp.asarray(own, jnp.float32)[None, :, None], (4, COLUMNS, 1))
     bearings = np.linspace(-2 * np.pi, 2 * np.pi, 41).astype(np.float32)
-    gaze = NETWORK.centre(features, jnp.asarray(bearings), jnp.zeros(41))
-    assert gaze.features.shape == (41, 4, COLUMNS, 1)
-    assert float(jnp.max(jnp.abs(gaze.residual))) <= step / 2 + 1e-5
+    centred = NETWORK.centre(features, jnp.asarray(bearings), jnp.zeros(41))
+    assert centred.features.shape == (41, 4, COLUMNS, 1)
+    assert float(jnp.max(jnp.abs(centred.residual))) <= step / 2 + 1e-5
     # The centre of the picture is the line between the two middle columns.
-    left, right = (np.asarray(gaze.features[:, 0, COLUMNS // 2 - side, 0]) for side in (1, 0))
+    left, right = (np.asarray(centred.features[:, 0, COLUMNS // 2 - side, 0]) for side in (1, 0))
     centre = np.angle(np.exp(1j * left) + np.exp(1j * right))
-    error = np.angle(np.exp(1j * (centre + np.asarray(gaze.residual) - bearings)))
+    error = np.angle(np.exp(1j * (centre + np.asarray(centred.residual) - bearings)))
     np.testing.assert_allclose(error, 0, atol=1e-5)
 
 
@@ -98,12 +98,12 @@ def test_the_fovea_changes_answers_and_nothing_of_a_network_without_it(params):
     network = EstimatorNetwork(dataclasses.replace(CONFIG, fovea=5))
     keen = network.init(jax.random.key(3))
     image, (bearing, distance, *phi) = _images(1), _questions((1,))
-    gaze = _gaze(network, keen, image, bearing, distance)
-    without = _gaze(NETWORK, params | {"first": keen["first"]}, image, bearing, distance)
-    np.testing.assert_array_equal(gaze.features, without.features)
+    centred = _centred(network, keen, image, bearing, distance)
+    without = _centred(NETWORK, params | {"first": keen["first"]}, image, bearing, distance)
+    np.testing.assert_array_equal(centred.features, without.features)
     assert without.fovea is None
-    answer = network.answer(keen, gaze, *phi)
-    blind = network.answer(keen, dataclasses.replace(gaze, fovea=jnp.zeros_like(gaze.fovea)), *phi)
+    answer = network.answer(keen, centred, *phi)
+    blind = network.answer(keen, dataclasses.replace(centred, fovea=jnp.zeros_like(centred.fovea)), *phi)
     assert float(answer.success_logit[0]) != float(blind.success_logit[0])
 
 
@@ -112,11 +112,11 @@ def test_what_the_fovea_says_depends_on_who_is_looked_for(params):
     network = EstimatorNetwork(dataclasses.replace(CONFIG, fovea=5))
     keen = network.init(jax.random.key(3))
     bearing, distance, stay, go = _questions((1,))
-    gaze = _gaze(network, keen, _images(1), bearing, distance)
-    other = dataclasses.replace(gaze, fovea=-gaze.fovea)
+    centred = _centred(network, keen, _images(1), bearing, distance)
+    other = dataclasses.replace(centred, fovea=-centred.fovea)
 
     def difference(go):
-        pair = [network.answer(keen, seen, stay, go).success_logit[0] for seen in (gaze, other)]
+        pair = [network.answer(keen, seen, stay, go).success_logit[0] for seen in (centred, other)]
         return float(pair[0] - pair[1])
 
     assert difference(go) != pytest.approx(difference(-go), rel=1e-2)
@@ -128,10 +128,10 @@ def test_one_call_over_subgoals_and_classes_equals_a_loop(params):
     bearing, distance, _, _ = _questions((subgoals,))
     _, _, stay, go = _questions((classes,), seed=7)
     pairs = (subgoals, classes)
-    gaze = _gaze(NETWORK, params, image, bearing, distance)
+    centred = _centred(NETWORK, params, image, bearing, distance)
     answers = NETWORK.answer(
         params,
-        jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], (*pairs, *leaf.shape[1:])), gaze),
+        jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], (*pairs, *leaf.shape[1:])), centred),
         jnp.broadcast_to(stay[None], (*pairs, 3)),
         jnp.broadcast_to(go[None], (*pairs, 3)),
     )
@@ -165,7 +165,7 @@ def test_gradients_reach_every_parameter(fovea):
     bearing, distance, stay, go = _questions((6,))
 
     def total(params):
-        answers = network.answer(params, _gaze(network, params, image, bearing, distance), stay, go)
+        answers = network.answer(params, _centred(network, params, image, bearing, distance), stay, go)
         return jnp.sum(answers.success_logit + answers.success_cost + answers.failure_cost)
 
     gradients = jax.tree_util.tree_leaves_with_path(jax.grad(total)(network.init(jax.random.key(3))))
@@ -178,7 +178,7 @@ def test_costs_keep_their_bounds_whatever_the_parameters(params, factor):
     wild = jax.tree.map(lambda leaf: leaf * factor, params)
     network = EstimatorNetwork(dataclasses.replace(CONFIG, step=0.5))
     bearing, distance, stay, go = _questions((8,))
-    answers = network.answer(wild, _gaze(network, wild, _images(8), bearing, distance * 1e3), stay, go)
+    answers = network.answer(wild, _centred(network, wild, _images(8), bearing, distance * 1e3), stay, go)
     assert np.all(np.asarray(answers.success_cost) >= 0.5)
     assert np.all(np.asarray(answers.failure_cost) >= 0)
     assert np.all((answers.success_probability >= 0) & (answers.success_probability <= 1))
@@ -240,7 +240,7 @@ def test_configurations_that_do_not_fit_are_refused(change, message):
 def test_other_shapes_of_input_are_refused_by_name(params):
     with pytest.raises(NetworkError, match=r"\(64, 64\).*\(64, 128\)"):
         NETWORK.encode(params, jnp.zeros((1, 64, 64, 3), jnp.uint8))
-    gaze = NETWORK.centre(jnp.zeros(CONFIG.feature_shape), jnp.zeros(1), jnp.zeros(1))
+    centred = NETWORK.centre(jnp.zeros(CONFIG.feature_shape), jnp.zeros(1), jnp.zeros(1))
     phi = jnp.zeros((1, 2), jnp.int8)
     with pytest.raises(NetworkError, match="fire, alarm, exit"):
-        NETWORK.answer(params, gaze, phi, phi)
+        NETWORK.answer(params, centred, phi, phi)

@@ -13,7 +13,7 @@ from potlp_jax.codec import config_from_dict
 from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import RecordError
-from potlp_jax.learning.estimator import TrainedEstimator, look
+from potlp_jax.learning.estimator import TrainedEstimator, observe_panorama
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning import policies
@@ -77,7 +77,7 @@ def test_trials_keep_their_promises(policy):
 
 def test_an_episode_compiles_nothing_new():
     """After one trial of each policy, another world and another task run with the programs that are there."""
-    programs = (trial_module._decide, robot.follow, robot._observe, robot.photograph, look)
+    programs = (trial_module._decide, robot.follow, robot._observe, robot.photograph, observe_panorama)
 
     def run_all(number):
         for policy in Policy:

@@ -47,8 +47,8 @@ def measure_perception(
     features = phases.measure(
         "first stage", lambda params, image: network.encode(params, image), trained.params, panorama
     )
-    views = phases.measure("remember", remember, blind.views, features, scene.belief, scene.cell)
-    estimator = NetworkEstimator(params=trained.params, views=views, config=trained.config)
+    memory = phases.measure("remember", remember, blind.memory, features, scene.belief, scene.cell)
+    estimator = NetworkEstimator(params=trained.params, memory=memory, config=trained.config)
     subgoals = assess(scene.belief, scene.cell, scene.state, scene.task, config.frontiers).subgoals
     phases.measure(
         "distances to subgoals",

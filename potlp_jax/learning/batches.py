@@ -18,6 +18,7 @@ from potlp_jax.errors import TrainingError
 from potlp_jax.learning.dataset import Samples, decode
 from potlp_jax.learning.network import Answers, EstimatorNetwork, Params
 
+# Batches decoded ahead: a few, because each holds its images as pixels.
 _PREFETCHED = 4
 
 
@@ -51,16 +52,20 @@ class Batches:
     """
 
     def __init__(self, samples: Samples, views: int, samples_per_view: int, seed: int) -> None:
+        # Checked here, where every use of a data set begins.
         if not len(samples.view_of):
             raise TrainingError("the data set has no samples")
         self._samples = samples
         self._seed = seed
+        # Stable, so that the samples of a view keep the data set's order and batches do not depend on the sort.
         self._order = np.argsort(samples.view_of, kind="stable")
         self._views, first, counts = np.unique(samples.view_of[self._order], return_index=True, return_counts=True)
         self._members = [self._order[start : start + count] for start, count in zip(first, counts, strict=True)]
+        # A data set smaller than a batch makes batches of its own size.
         self.views = min(views, len(self._views))
         self.samples_per_view = samples_per_view
         self.per_epoch = len(self._views) // self.views
+        # Two epochs are remembered: batches are made ahead, so that one may begin before the other has ended.
         self._permutation = functools.lru_cache(2)(
             lambda epoch: np.random.default_rng((seed, epoch)).permutation(len(self._views))
         )
@@ -86,6 +91,7 @@ class Batches:
         members = self._members[view]
         if len(members) <= self.samples_per_view:
             return members
+        # The last number keeps these draws apart from those of the permutation, whose seed is (seed, epoch).
         random = np.random.default_rng((self._seed, epoch, view, 1))
         return random.choice(members, self.samples_per_view, replace=False)
 
@@ -96,6 +102,7 @@ class Batches:
             index[row, : len(members)] = members
             mask[row, : len(members)] = True
         images = [decode(self._samples.images[self._views[view]]) for view, _ in groups]
+        # The last group of an evaluation may be short: black panoramas fill it up, and their samples are masked.
         images += [np.zeros_like(images[0])] * (self.views - len(groups))
         columns = {
             name: jnp.asarray(getattr(self._samples, name)[index])
@@ -106,7 +113,15 @@ class Batches:
 
 
 def prefetched(make: Callable[[int], Batch], start: int, stop: int) -> Iterator[Batch]:
-    """``make(start)``, ..., ``make(stop - 1)`` in this order, made a few ahead in another thread."""
+    """``make(start)``, ..., ``make(stop - 1)`` in this order, made a few ahead in another thread.
+
+    Args:
+        make: the batch of a number; OpenCV decodes without Python's lock, so it runs beside the caller.
+        start, stop: the range of numbers.
+
+    Returns:
+        An iterator; closing it cancels what was not made yet.
+    """
     with ThreadPoolExecutor(1, thread_name_prefix="decode") as pool:
         pending = [pool.submit(make, number) for number in range(start, min(start + _PREFETCHED, stop))]
         try:
@@ -127,7 +142,17 @@ def batch_answers(
     bearing: Float32[Array, "G K"],
     batch: Batch,
 ) -> Answers:
-    """The network's answers for a batch: the first stage once per panorama."""
+    """The network's answers for a batch: the first stage once per panorama.
+
+    Args:
+        network, params: the estimator.
+        pixels: in [0, 1], perhaps augmented.
+        bearing: of the subgoals, mirrored where the pixels are.
+        batch: the rest of what is asked; its images and bearings are not used.
+
+    Returns:
+        Answers of shape ``G K``, also where the batch is padded.
+    """
     features = network.encode_pixels(params, pixels)
-    gaze = jax.vmap(network.centre)(features, bearing, batch.distance)
-    return network.answer(params, gaze, batch.phi_stay, batch.phi_go)
+    centred = jax.vmap(network.centre)(features, bearing, batch.distance)
+    return network.answer(params, centred, batch.phi_stay, batch.phi_go)

@@ -29,6 +29,7 @@ CHECKPOINT_FORMAT: str = "potlp-checkpoint-1"
 def checkpoint_steps(folder: Path | str) -> list[int]:
     """Steps of the whole checkpoints in the folder, in increasing order; none where there is no such folder."""
     folder = Path(folder)
+    # Orbax writes under another name until a checkpoint is whole, so a number is a whole one.
     found = [path.name for path in folder.iterdir() if path.is_dir()] if folder.is_dir() else []
     return sorted(int(name) for name in found if re.fullmatch(r"\d+", name))
 
@@ -39,9 +40,14 @@ def save_checkpoint(
     """Write ``state`` (a pytree of arrays) as the checkpoint of ``step`` and delete all but the newest ``keep``.
 
     Args:
+        folder: of all checkpoints of a training; made if it is not there.
+        step: the checkpoint's name.
+        state: a pytree of arrays.
         identity: JSON-able; what a training must share with the checkpoint to resume from it.
         progress: JSON-able; given back on loading and not compared.
+        keep: checkpoints that stay. Two: a newest one that turns out damaged can be deleted.
     """
+    # Orbax wants absolute paths.
     folder = Path(folder).absolute()
     folder.mkdir(parents=True, exist_ok=True)
     arrays = named_arrays(state)
@@ -52,7 +58,9 @@ def save_checkpoint(
         "arrays": array_shapes(arrays),
         "checksum": _checksum(arrays),
     }
+    # Arrays by name and not the state itself: reading then needs no class that may have changed.
     ocp.save(str(folder / str(step)), arrays, custom_metadata=description, overwrite=True)
+    # After the new one is whole, never before.
     for old in checkpoint_steps(folder)[:-keep]:
         shutil.rmtree(folder / str(old))
 
@@ -63,14 +71,20 @@ def load_checkpoint(
     """The state and the progress that were saved at ``step``.
 
     Args:
+        folder: of all checkpoints of a training.
+        step: which one.
         like: a state of the same structure, shapes and types.
         identity: as given to ``save_checkpoint``.
+
+    Returns:
+        The state, bit for bit, and the progress.
 
     Raises:
         CheckpointError: damaged, of another format, or of another training; the message names every difference.
     """
     path = Path(folder).absolute() / str(step)
     wanted = named_arrays(like)
+    # Orbax raises whatever its layers raise on a damaged folder; all of it means the same here.
     try:
         description: Any = ocp.metadata(str(path)).custom_metadata
     except Exception as error:
@@ -86,6 +100,7 @@ def load_checkpoint(
         arrays = ocp.load(str(path), {name: np.empty_like(array) for name, array in wanted.items()})
     except Exception as error:
         raise _damaged_checkpoint(path, error) from error
+    # Orbax does not notice every flipped bit.
     if _checksum(arrays) != description["checksum"]:
         raise _damaged_checkpoint(path, "its checksum differs")
     leaves = [jnp.asarray(arrays[name]) for name in wanted]
@@ -98,6 +113,7 @@ def _damaged_checkpoint(path: Path, why: Any) -> CheckpointError:
 
 def _checksum(arrays: Mapping[str, np.ndarray]) -> int:
     total = 0
+    # By name, so that the order of a dictionary does not matter.
     for name in sorted(arrays):
         total = zlib.crc32(np.ascontiguousarray(arrays[name]).tobytes(), total)
     return total

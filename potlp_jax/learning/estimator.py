@@ -20,7 +20,13 @@ from jaxtyping import Array, Float32, Int32, UInt8
 
 from potlp_jax import plugins
 from potlp_jax.errors import CheckpointError, PluginError
-from potlp_jax.learning.memory import Views, look_of_subgoals, no_views, places_of_looks, remember
+from potlp_jax.learning.memory import (
+    PanoramaMemory,
+    empty_memory,
+    observation_of_subgoals,
+    remember,
+    slots_of_observations,
+)
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
 from potlp_jax.learning.serialization import load_estimator, require_propositions
 from potlp_jax.planning.distances.product import product_distances
@@ -30,9 +36,6 @@ from potlp_jax.types import NO_STATE
 from potlp_jax.world.camera import bearing
 from potlp_jax.world.frontiers import Subgoals
 from potlp_jax.world.grid import BeliefMap
-
-GROUP: str = "potlp_jax.estimators"
-"""Entry points of this group are estimators of other packages."""
 
 MEMORY: int = 32
 """Panoramas that are remembered. A trial takes 14 to 100, of which seldom more than a dozen still show a frontier."""
@@ -49,31 +52,36 @@ class NetworkEstimator:
     """P_S, R_S and R_F from the panoramas seen so far (Bradley et al. 2021, section IV). ``config`` is static."""
 
     params: Params
-    views: Views
+    memory: PanoramaMemory
     config: NetworkConfig = struct.field(pytree_node=False)
 
     def __call__(self, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays) -> Estimates:
-        """Estimates of every real (subgoal, class); padded pairs have P_S = 0. At least one look must be remembered.
+        """Estimates of every real (subgoal, class); padded pairs have P_S = 0.
+
+        At least one observation must be remembered.
 
         The network counts in the unit of the worlds that it learned from, which is the belief's: cells or metres.
         Subgoals are asked one after the other, of each so many classes at a time, so that padding costs little.
         """
-        places = places_of_looks(self.views, look_of_subgoals(self.views, subgoals))
+        # Each subgoal is judged from the panorama in which it was last in sight, taken from where the robot then stood.
+        places = slots_of_observations(self.memory, observation_of_subgoals(self.memory, subgoals))
         distance = self.distances(belief, subgoals)
-        angle = jax.vmap(bearing)(self.views.cells[places], subgoals.cells)
+        angle = jax.vmap(bearing)(self.memory.cells[places], subgoals.cells)
         classes = task.class_mask.shape[0]
 
         def ask(subgoal: Int32[Array, ""], answers: Float32[Array, "3 S C"]) -> Float32[Array, "3 S C"]:
-            features = self.views.features[places[subgoal]]
+            features = self.memory.features[places[subgoal]]
             found = self._ask_of_subgoal(features, angle[subgoal], distance[subgoal], task, answers[:, subgoal])
             return answers.at[:, subgoal].set(found)
 
-        # Real subgoals come first.
+        # Real subgoals come first, so the loop ends with the last of them: what padding would cost is the second stage
+        # of the network, which is most of the work.
         real = jnp.sum(subgoals.mask, dtype=jnp.int32)
         nothing = jnp.stack(
             [jnp.zeros((subgoals.mask.shape[0], classes)), *[jnp.ones((subgoals.mask.shape[0], classes))] * 2]
         )
         probability, success_cost, failure_cost = jax.lax.fori_loop(0, real, ask, nothing)
+        # Rows of masked subgoals keep P_S = 0 from the start; columns of masked classes may hold anything.
         probability = jnp.where(task.class_mask[None, :], probability, 0.0)
         return Estimates(
             success_probability=exclusive_chances(probability, subgoals, self.config.exclusive_within),
@@ -91,10 +99,12 @@ class NetworkEstimator:
     ) -> Float32[Array, "3 C"]:
         """P_S, R_S and R_F of the real classes beyond one subgoal; ``answers`` keeps what it has of the others."""
         network, classes = EstimatorNetwork(self.config), task.class_mask.shape[0]
-        gaze = network.centre(features, angle, distance)
-        repeated = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (QUESTIONS, *leaf.shape)), gaze)
+        centred = network.centre(features, angle, distance)
+        repeated = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (QUESTIONS, *leaf.shape)), centred)
+        # The features of a subgoal are the same for all of its classes, so they are broadcast once.
         # Real classes first; those that fill up the last portion are dropped where they are written.
         order = jnp.argsort(~task.class_mask, stable=True).astype(jnp.int32)
+        # An index of ``classes`` is out of bounds, and mode="drop" ignores it.
         order = jnp.pad(order, (0, -classes % QUESTIONS), constant_values=classes)
         portions = -(-jnp.sum(task.class_mask, dtype=jnp.int32) // QUESTIONS)
 
@@ -111,15 +121,24 @@ class NetworkEstimator:
 
         0 where masked, or where known space does not lead there.
         """
-        poses = self.views.cells[places_of_looks(self.views, look_of_subgoals(self.views, subgoals))]
+        poses = self.memory.cells[slots_of_observations(self.memory, observation_of_subgoals(self.memory, subgoals))]
         return _distances(belief, poses, subgoals)
 
-    def look(
+    def observe(
         self, panorama: UInt8[Array, "rows columns 3"], belief: BeliefMap, cell: Int32[Array, "2"]
     ) -> "NetworkEstimator":
-        """The estimator after it has seen ``panorama`` from ``cell``."""
+        """The estimator after an observation.
+
+        Args:
+            panorama: what the camera saw, in the frame of the map.
+            belief: the map after the observation.
+            cell: where the panorama was taken.
+
+        Returns:
+            The same estimator with one panorama more in memory.
+        """
         features = EstimatorNetwork(self.config).encode(self.params, panorama)
-        return dataclasses.replace(self, views=remember(self.views, features, belief, cell))
+        return dataclasses.replace(self, memory=remember(self.memory, features, belief, cell))
 
 
 def exclusive_chances(chances: Float32[Array, "S C"], subgoals: Subgoals, within: float) -> Float32[Array, "S C"]:
@@ -130,18 +149,31 @@ def exclusive_chances(chances: Float32[Array, "S C"], subgoals: Subgoals, within
     chances (``eval.exclusion``). Eq. 3 takes attempts as independent. The logarithms of the chances to fail are scaled
     by a common factor, so that all subgoals ``within`` so many cells of one fail together with ``1 - sum``, at least
     ``1 - SURE``. With ``within`` 0 nothing is raised.
+
+    Args:
+        chances: P_S as the network answers it, in [0, 1].
+        subgoals: where they are; masked ones neither raise others nor are raised.
+        within: distance in cells between subgoals that exclude each other; static.
+
+    Returns:
+        P_S of the same shape, nowhere lower than ``chances``.
     """
     apart = subgoals.cells[:, None] - subgoals.cells[None, :]
     near = jnp.sum(apart**2, axis=2) <= math.floor(within**2)
     near = jnp.where(near & subgoals.mask[:, None] & subgoals.mask[None, :], 1.0, 0.0)
+    # Logarithms of the chance to fail: a product over neighbours becomes a matrix product.
+    # Kept off 1, where the logarithm is infinite.
     fails = jnp.log1p(-jnp.minimum(chances, jnp.float32(1.0 - 1e-6)))
     independent, together = near @ fails, jnp.log1p(-jnp.minimum(near @ chances, SURE))
+    # Where no neighbour can succeed both logarithms are 0, and there is nothing to scale.
     factor = jnp.where(independent < 0.0, together / jnp.minimum(independent, -1e-12), 1.0)
+    # Never below 1: subgoals that exclude each other do not make each other less likely.
     return -jnp.expm1(fails * jnp.maximum(factor, 1.0))
 
 
 def _distances(belief: BeliefMap, poses: Int32[Array, "S 2"], subgoals: Subgoals) -> Float32[Array, " S"]:
     """From each pose to its subgoal through known space, letters ignored; 0 where masked."""
+    # One automaton state for all free cells: letters do not matter for how far away something was seen.
     open_cells = jnp.where(belief.free, 0, NO_STATE).astype(jnp.int32)[:, :, None]
     states = jnp.where(subgoals.mask, 0, NO_STATE).astype(jnp.int32)
     fields = product_distances(open_cells, belief.free, poses, states, belief.resolution)
@@ -166,18 +198,27 @@ class TrainedEstimator:
         return f"{self.name} {self.digest}"
 
     def start(self, height: int, width: int, memory: int = MEMORY) -> NetworkEstimator:
-        """For a new trial on a map of this size: nothing seen yet."""
-        views = no_views(memory, self.config.feature_shape, height, width)
-        return NetworkEstimator(params=self.params, views=views, config=self.config)
+        """The estimator for a new trial: nothing observed yet.
+
+        Args:
+            height, width: of the map's array.
+            memory: panoramas that are remembered.
+
+        Returns:
+            What a decision calls inside jit.
+        """
+        empty = empty_memory(memory, self.config.feature_shape, height, width)
+        return NetworkEstimator(params=self.params, memory=empty, config=self.config)
 
 
-look = jax.jit(NetworkEstimator.look)
-"""``NetworkEstimator.look`` compiled: one compilation per network and size of the map."""
+observe_panorama = jax.jit(NetworkEstimator.observe)
+"""``NetworkEstimator.observe`` compiled: one compilation per network and size of the map."""
 
 
 @functools.lru_cache(maxsize=8)
 def read_estimator(path: Path) -> TrainedEstimator:
     """Read an estimator. Raises CheckpointError where the file is none."""
+    # A digest and not the name: two files of one name are two estimators in records.
     params, config, metadata = load_estimator(path)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
     return TrainedEstimator(params=params, config=config, metadata=metadata, name=path.stem, digest=digest)
@@ -200,9 +241,9 @@ def named_estimator(name: str | Path) -> TrainedEstimator | Estimator:
     """
     path = Path(name)
     # A file goes first: its name may well contain a colon.
-    if path.is_file() or not plugins.is_known(str(name), GROUP):
+    if path.is_file() or not plugins.is_known(str(name), plugins.ESTIMATORS):
         return read_estimator(path)
-    found = plugins.load(str(name), group=GROUP, kind="estimator")
+    found = plugins.load(str(name), group=plugins.ESTIMATORS, kind="estimator")
     estimator = found() if isinstance(found, type) else found
     if not (isinstance(estimator, TrainedEstimator) or callable(estimator)):
         raise PluginError(
@@ -221,6 +262,7 @@ def identity_of(estimator: TrainedEstimator | Estimator) -> str:
 
 def shipped_estimator(propositions: tuple[str, ...]) -> TrainedEstimator | None:
     """The estimator that comes with the package for these propositions, in this order; None where there is none."""
+    # Which propositions an estimator knows stands in its file, so a new shipped file needs no line of code.
     with resources.as_file(resources.files("potlp_jax.learning") / "data") as folder:
         found = [read_estimator(path) for path in sorted(folder.glob("*.npz"))]
     return next((estimator for estimator in found if estimator.config.propositions == propositions), None)

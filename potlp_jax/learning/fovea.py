@@ -1,4 +1,4 @@
-"""A close look at a subgoal: the pixels around the point of the panorama where its cell meets the floor.
+"""The pixels around a subgoal at full resolution: around the point of the panorama where its cell meets the floor.
 
 The bearing of a subgoal says the column, and its distance the row, because the camera's height above the floor is
 known. A door down a hallway is a few columns wide and as many rows high: the convolutions' features are too coarse to
@@ -17,6 +17,7 @@ from jaxtyping import Array, Float32
 BAND: int = 4
 """Rows of pixels in a band."""
 
+# What lies beyond a subgoal is seen above the point where it meets the floor; below it there is floor alone.
 ABOVE: int = 8
 BELOW: int = 4
 
@@ -55,9 +56,12 @@ def patch(
         bearing: of the points, in radians.
         row: of the points, in rows of pixels, 0 in the middle of the first.
         reach: columns on each side; static.
+
+    Returns:
+        The patch of each point, the point in its middle column and on the border of the bands above and below.
     """
-    look = jnp.vectorize(functools.partial(_patch_at, bands, reach), signature="(),()->(r,c,d)")
-    return look(bearing, row)
+    around = jnp.vectorize(functools.partial(_patch_at, bands, reach), signature="(),()->(r,c,d)")
+    return around(bearing, row)
 
 
 def _patch_at(
@@ -69,6 +73,7 @@ def _patch_at(
     # The middle of the first band lies (BAND - 1) / 2 rows below the middle of the first row; the point lies on the
     # border between the bands above and below.
     down = (row - jnp.float32((BAND - 1) / 2)) / BAND + jnp.arange(-ABOVE, BELOW, dtype=jnp.float32) + 0.5
+    # Bilinear: a point between pixels moves the patch by parts of a pixel, so that mirroring the panorama mirrors it.
     left, top = jnp.floor(across), jnp.floor(down)
     right_share, lower_share = (across - left)[None, :, None], (down - top)[:, None, None]
     sides = [(left.astype(jnp.int32) + step)[None, :] % columns for step in (0, 1)]

@@ -24,6 +24,8 @@ from potlp_jax.world.frontiers import Subgoals, frontier_cells
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.moves import dilate
 
+# Phases of a path beyond a subgoal: still on the subgoal's own frontier, in what is not observed, or out again in what
+# is. They are the states of the automaton with which distances are solved.
 PORCH, HIDDEN, SEEN = range(3)
 
 
@@ -42,6 +44,15 @@ def true_labels(world: World, belief: BeliefMap, subgoals: Subgoals, task: TaskA
 
     P_S is 0 or 1. R_S is the shortest successful path from the subgoal (the resolution where P_S = 0), R_F the
     distance of the farthest unobserved cell that can be reached while staying, one way, 0 if there is none.
+
+    Args:
+        world: the true map.
+        belief: what the robot knows of it.
+        subgoals: of the belief, with masks.
+        task: whose classes are asked, or a sheet of questions (``questions.question_sheet``).
+
+    Returns:
+        Costs in the world's unit.
     """
     count, states = subgoals.mask.shape[0], task.transitions.shape[0]
     lanes = max(min(SOURCES_AT_ONCE, count * states), 1)
@@ -51,6 +62,7 @@ def true_labels(world: World, belief: BeliefMap, subgoals: Subgoals, task: TaskA
     state_of_class = jnp.argmax(same_stay, axis=1)
     used = jnp.any((state_of_class[:, None] == jnp.arange(states)[None, :]) & task.class_mask[:, None], axis=0)
 
+    # Pairs of a subgoal and a state: the distances of a pair answer for all classes with these staying letters.
     # Real pairs first, so that padding costs nothing.
     real = (subgoals.mask[:, None] & used[None, :]).reshape(-1)
     order = jnp.argsort(~real, stable=True).astype(jnp.int32)
@@ -70,6 +82,7 @@ def true_labels(world: World, belief: BeliefMap, subgoals: Subgoals, task: TaskA
         jnp.zeros(pairs.shape[0], jnp.float32),
     )
     success_cost, failure_cost = jax.lax.fori_loop(0, chunks, label, nothing)
+    # From the order of work to that of the pairs.
     back = jnp.argsort(order)
     success_cost = success_cost[back].reshape(count, states, -1)
     failure_cost = failure_cost[back].reshape(count, states)
@@ -107,6 +120,8 @@ def _labels_of_lanes(
             phase = jnp.where(allowed & staying, next_phase, phase)
         return phase
 
+    # From each phase: where a path may go next. It never comes back to its own frontier, and once it has come out into
+    # what is observed it stays there: coming out and going in again is another attempt.
     transitions = jnp.stack(
         [
             enter((porch, PORCH), (hidden, HIDDEN)),
@@ -119,12 +134,14 @@ def _labels_of_lanes(
 
     # The last move of a success: where it may lead from each phase, whatever the letter.
     ends = (hidden, hidden | way_back, ~hidden & ~own)
+    # The cost to enter a cell from the best neighbour, also a cell whose letter ends the stay: that is the success.
     arrival = arrivals_per_source(cost, free, world.resolution)
     last = jnp.min(jnp.stack([jnp.where(way, arrival[phase], jnp.inf) for phase, way in enumerate(ends)]), axis=0)
 
     def cheapest(go: Bool[Array, " L"]) -> Float32[Array, " lanes"]:
         return jnp.min(jnp.where((go[world.letters] & free)[:, :, None], last, jnp.inf), axis=(0, 1))
 
+    # What a robot explores in vain: all that it can reach beyond the subgoal while it keeps the state.
     explored = hidden & jnp.isfinite(cost[HIDDEN])
     failure_cost = jnp.max(jnp.where(explored, cost[HIDDEN], 0.0), axis=(0, 1))
     return jax.lax.map(cheapest, task.class_go).T, failure_cost

@@ -62,6 +62,7 @@ class DataScale:
         """The figures of these samples. Raises TrainingError where there are none."""
         if not len(samples.success):
             raise TrainingError("the data set has no samples")
+        # The weight of what happened; a label between 0 and 1 is that share of a success.
         weight = samples.success * samples.success_weight + (1 - samples.success) * samples.failure_weight
         return cls(float(np.mean(weight, dtype=np.float64)), float(np.mean(samples.success, dtype=np.float64)))
 
@@ -93,11 +94,21 @@ def network_config(
 ) -> NetworkConfig:
     """A network for these samples: their propositions and camera, and normalisers from their distances and costs.
 
-    The other arguments as in ``NetworkConfig``; training does not depend on ``exclusive_within``. Raises TrainingError
-    where a fovea is asked for and the data do not say how their camera sees the floor.
+    Args:
+        samples: the training data.
+        image_shape: rows and columns of their panoramas.
+        exclusive_within, fovea, second_widths: as in ``NetworkConfig``; training does not depend on the first.
+
+    Returns:
+        The configuration, in which everything that was measured on the data is a number.
+
+    Raises:
+        TrainingError: a fovea is asked for, and the data do not say how their camera sees the floor.
     """
     step = float(samples.metadata.resolution)
+    # Each cost is scaled by its spread where it counts in the loss.
     succeeded, failed = samples.success > 0, (samples.success < 1) & np.isfinite(samples.failure_cost)
+    # Scales are rounded nowhere: they are part of what the network answers and stored with it.
     return NetworkConfig(
         propositions=tuple(samples.metadata.propositions),
         image_shape=image_shape,
@@ -125,12 +136,25 @@ def _geometry(samples: Samples) -> dict[str, Any]:
 
 def _spread(values: np.ndarray, least: float) -> float:
     """Standard deviation, at least ``least``."""
+    # In float64: a sum of a million squares in float32 loses digits. At least a cell, should all values be equal.
     return max(float(np.std(values, dtype=np.float64)), least) if len(values) else least
 
 
 def loss_sums(answers: Answers, batch: Batch, config: NetworkConfig, scale: DataScale, weighting: float) -> Sums:
-    """The sums over a batch; padding and costs that are not known count nothing."""
+    """The sums over a batch; padding and costs that are not known count nothing.
+
+    Args:
+        answers: the network's, of the batch's shape.
+        batch: labels, weights and mask (True: a real sample).
+        config: of the network, for the scales of costs.
+        scale: figures of the training data, also when validation data are summed.
+        weighting: 1: weights as they are; 0: none; between: a mix.
+
+    Returns:
+        Sums in float32.
+    """
     real = batch.mask.astype(jnp.float32)
+    # Padding is replaced before anything is computed with it: 0 * NaN would still be NaN.
     success = jnp.where(batch.mask, batch.success, jnp.float32(0))
     mean = jnp.float32(scale.mean_weight)
     of_success = weighting * jnp.where(batch.mask, batch.success_weight, jnp.float32(0)) / mean + (1 - weighting)
@@ -139,6 +163,7 @@ def loss_sums(answers: Answers, batch: Batch, config: NetworkConfig, scale: Data
     missed = success * of_success * jax.nn.softplus(-answers.success_logit)
     taken = (1 - success) * of_failure * jax.nn.softplus(answers.success_logit)
     probability = answers.success_probability
+    # A label of 0 < P_S < 1, as real data may have, counts in both costs, each by its share.
     known_success = batch.mask & (success > 0) & jnp.isfinite(batch.success_cost)
     known_failure = batch.mask & (success < 1) & jnp.isfinite(batch.failure_cost)
     return Sums(
@@ -171,8 +196,19 @@ def total_loss(sums: Sums, cost_share: float) -> Float32[Array, ""]:
 
 
 def evaluation_of(sums: Sums, config: NetworkConfig, cost_share: float) -> Evaluation:
-    """The scores that follow from sums."""
+    """The scores that follow from sums.
+
+    Args:
+        sums: over all samples that are scored.
+        config: of the network, for the scales of costs.
+        cost_share: factor of both cost terms in the loss.
+
+    Returns:
+        Scores; NaN where nothing of a kind happened.
+    """
+    # On the host, in float64, where a quotient of sums loses nothing more.
     figures = {field.name: float(getattr(sums, field.name)) for field in dataclasses.fields(sums)}
+    # The sums of no samples are 0, and so are their means.
     count = max(figures["count"], 1.0)
 
     def rmse(error: float, number: float, scale: float) -> float:

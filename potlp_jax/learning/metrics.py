@@ -33,6 +33,7 @@ from potlp_jax.learning.dataset import Samples, decode, encode
 from potlp_jax.learning.network import Answers, EstimatorNetwork, NetworkConfig, Params
 from potlp_jax.learning.serialization import require_propositions
 
+# Ten is usual for reliability diagrams.
 BINS: int = 10
 
 DISTANCE_BANDS: tuple[float, ...] = (15.0, 30.0, 60.0, 120.0)
@@ -41,8 +42,10 @@ DISTANCE_BANDS: tuple[float, ...] = (15.0, 30.0, 60.0, 120.0)
 INTACT = "intact"
 ABLATIONS: tuple[str, ...] = ("image", "phi")
 
+# Fixed, so that the ablation of a data set is the same for every estimator.
 SHUFFLE_SEED: int = 0
 
+# As in training by default: the answers do not depend on it, only the memory and the time.
 _VIEWS_PER_BATCH = 16
 _SAMPLES_PER_VIEW = 16
 
@@ -61,6 +64,7 @@ class Predictions:
     @property
     def success(self) -> Float64[np.ndarray, "N"]:
         """P_S."""
+        # In float64 and without overflow on either side.
         return np.exp(-np.logaddexp(0.0, -self.success_logit.astype(np.float64)))
 
 
@@ -145,7 +149,9 @@ def check_fit(
     """Whether the estimator's answers mean the same as the data set's labels.
 
     Args:
+        config: the estimator's network.
         metadata: the estimator's, as ``load_estimator`` gives them.
+        samples: the data set.
         estimator, dataset: their names in messages.
 
     Raises:
@@ -160,6 +166,7 @@ def check_fit(
         raise EvaluationError(
             f"{dataset} has panoramas of {size} pixels; {estimator} was made for {config.image_shape}"
         )
+    # The unit and the camera decide what the numbers and pictures mean; another split or family is fair to ask about.
     trained_on = metadata.get("data", {})
     for name in ("camera", "unit"):
         here = getattr(samples.metadata, name)
@@ -187,9 +194,11 @@ def ablated(samples: Samples, ablation: str) -> Samples:
     if ablation == INTACT:
         return samples
     if ablation == "image":
+        # As PNG: JPEG may not give back what is exactly black.
         black = encode(np.zeros_like(decode(samples.images[0])), "png")
         return dataclasses.replace(samples, images=[black] * len(samples.images))
     if ablation == "phi":
+        # A permutation keeps how often each pair occurs: only its connection with the sample is gone.
         order = np.random.default_rng(SHUFFLE_SEED).permutation(len(samples.view_of))
         return dataclasses.replace(samples, phi_stay=samples.phi_stay[order], phi_go=samples.phi_go[order])
     raise EvaluationError(f"unknown ablation {ablation!r}; choose from: {', '.join(ABLATIONS)}")
@@ -210,9 +219,18 @@ def _make_answer_step(network: EstimatorNetwork) -> Callable[[Params, Batch], An
 def predict(
     network: EstimatorNetwork, params: Params, samples: Samples, on_progress: Callable[[int], None] = lambda done: None
 ) -> Predictions:
-    """The estimator's answers to all samples; ``on_progress`` is told the number of answers so far.
+    """The estimator's answers to all samples.
 
-    Raises TrainingError where there are no samples.
+    Args:
+        network, params: the estimator.
+        samples: what is asked.
+        on_progress: told the number of answers so far, after every batch.
+
+    Returns:
+        Answers in the order of the samples.
+
+    Raises:
+        TrainingError: there are no samples.
     """
     step = _make_answer_step(network)
     names = tuple(Answers.__dataclass_fields__)
@@ -233,7 +251,16 @@ def predict(
 
 
 def evaluate(samples: Samples, predictions: Predictions, prior: Prior) -> Report:
-    """All figures. ``samples`` are the intact ones, also for the predictions of an ablation."""
+    """All figures, of all samples and of each group.
+
+    Args:
+        samples: the intact ones, also for the predictions of an ablation: groups are by what was really asked.
+        predictions: in the order of the samples.
+        prior: the constant answer that skills compare with.
+
+    Returns:
+        The report; groups without a sample have no entry.
+    """
 
     def of(chosen: np.ndarray | slice) -> Figures:
         return figures_of(_part(samples, chosen), _part(predictions, chosen), prior)
@@ -259,11 +286,21 @@ def groups_of(samples: Samples) -> dict[str, dict[str, Bool[np.ndarray, "N"]]]:
 
 
 def figures_of(samples: Samples, predictions: Predictions, prior: Prior) -> Figures:
-    """The figures of at least one sample."""
+    """The figures of some samples.
+
+    Args:
+        samples: at least one.
+        predictions: in the order of the samples.
+        prior: the constant answer that ``skill`` compares with.
+
+    Returns:
+        The figures; NaN where one is not defined.
+    """
     true, said = samples.success.astype(np.float64), predictions.success
     logit = predictions.success_logit.astype(np.float64)
     rate, brier = float(true.mean()), float(np.mean((said - true) ** 2))
     bins = reliability(true, said)
+    # Empty bins have no mean, and weigh nothing.
     gaps = [bin.samples * abs(bin.predicted - bin.observed) for bin in bins if bin.samples]
     return Figures(
         samples=len(true),
@@ -271,6 +308,7 @@ def figures_of(samples: Samples, predictions: Predictions, prior: Prior) -> Figu
         brier=brier,
         skill=_gain(brier, float(np.mean((prior.value - true) ** 2))),
         own_skill=_gain(brier, float(np.mean((rate - true) ** 2))),
+        # From the log odds: the logarithm of a probability that was rounded to 0 or 1 would be infinite.
         log_loss=float(np.mean(true * np.logaddexp(0, -logit) + (1 - true) * np.logaddexp(0, logit))),
         auc=roc_auc(true, logit),
         calibration_error=sum(gaps) / len(true),
@@ -284,6 +322,7 @@ def reliability(true: Float64[np.ndarray, "N"], said: Float64[np.ndarray, "N"]) 
     """The bins of a reliability diagram."""
     index = np.minimum((said * BINS).astype(np.int64), BINS - 1)
     counts = np.bincount(index, minlength=BINS)
+    # 0 / 0 in an empty bin is the NaN that says so.
     with np.errstate(invalid="ignore"):
         predicted, observed = (np.bincount(index, values, BINS) / counts for values in (said, true))
     return tuple(
@@ -307,7 +346,16 @@ def roc_auc(true: Float64[np.ndarray, "N"], score: Float64[np.ndarray, "N"]) -> 
 def cost_errors(
     true: Float32[np.ndarray, "N"], said: Float32[np.ndarray, "N"], share: Float64[np.ndarray, "N"]
 ) -> CostErrors:
-    """Errors over samples with a positive share and a known cost, weighted by the share."""
+    """Errors over samples with a positive share and a known cost, weighted by the share.
+
+    Args:
+        true: the costs, NaN where they are not known.
+        said: the estimator's.
+        share: to which part each sample is of the kind whose cost this is: P_S for R_S, 1 - P_S for R_F.
+
+    Returns:
+        The errors in the unit of the costs; NaN where no sample counts.
+    """
     known = (share > 0) & np.isfinite(true)
     if not known.any():
         return CostErrors(0, *[float("nan")] * 4)
@@ -327,8 +375,14 @@ def cost_errors(
 def most_confident(samples: Samples, predictions: Predictions, count: int) -> dict[str, Int64[np.ndarray, " k"]]:
     """Up to ``count`` samples each of the most confident answers that are right or wrong, one per panorama.
 
-    Keys: ``true positives``, ``true negatives``, ``false positives``, ``false negatives``. A label counts as a success
-    from one half on.
+    Args:
+        samples: the data set.
+        predictions: in the order of the samples.
+        count: of each kind, at most.
+
+    Returns:
+        Indices by kind: ``true positives``, ``true negatives``, ``false positives``, ``false negatives``. A label
+        counts as a success from one half on.
     """
     happened, logit = samples.success >= 0.5, predictions.success_logit
     kinds = {
@@ -341,6 +395,7 @@ def most_confident(samples: Samples, predictions: Predictions, count: int) -> di
     for name, (belongs, doubt) in kinds.items():
         order = np.argsort(doubt, kind="stable")
         order = order[belongs[order]]
+        # The first of each panorama in this order is its most confident one.
         _, first = np.unique(samples.view_of[order], return_index=True)
         chosen[name] = order[np.sort(first)[:count]]
     return chosen
@@ -349,7 +404,15 @@ def most_confident(samples: Samples, predictions: Predictions, count: int) -> di
 def class_in_words(
     phi_stay: Int8[np.ndarray, "P"], phi_go: Int8[np.ndarray, "P"], propositions: tuple[str, ...]
 ) -> tuple[str, str]:
-    """What must hold on the way, and what at its end: ``stay: not fire`` and ``go: alarm, not exit``."""
+    """What must hold on the way, and what at its end.
+
+    Args:
+        phi_stay, phi_go: vectors of the class, entries -1, 0, 1.
+        propositions: their names, in the vectors' order.
+
+    Returns:
+        Two texts such as ``stay: not fire`` and ``go: alarm, not exit``.
+    """
 
     def words(phi: np.ndarray) -> str:
         literals = list(zip(phi.tolist(), propositions, strict=True))

@@ -44,12 +44,17 @@ Params = Any
 STRIDE: int = 16
 """Pixels of the image per column (and row) of the features."""
 
+# The strides multiply to STRIDE; the kernels of the first two layers equal their strides, for the reason given above.
 _FIRST_KERNELS = (4, 2, 3, 3)
 _FIRST_STRIDES = (4, 2, 2, 1)
 _SECOND_STRIDES = (2, 1, 1, 1, 2, 1, 1, 1)
+# The logit of P_S, and R_S and R_F before they are made positive.
 _OUTPUTS = 3
+# Channels in which the bands of pixels of a fovea travel with the features.
 _FINE = STRIDE // BAND * STRIDE * 3
+# Units of the layers that read the fovea; their sizes were not tuned (docs/results/delivery.md).
 _FOVEA_WIDTHS = (256, 128)
+# Of the leaky ReLU below 0, where a plain one would pass no gradient.
 _SLOPE = 0.1
 
 
@@ -100,6 +105,7 @@ class NetworkConfig:
             widths = getattr(self, name)
             if len(widths) != count or min(widths) < 1:
                 raise NetworkError(f"{name} is {widths}; give {count} positive numbers")
+        # Every stage halves or quarters the image: what remains must be whole.
         side = STRIDE * math.prod(_SECOND_STRIDES)
         if any(size < side or size % side for size in self.image_shape):
             raise NetworkError(f"image_shape is {self.image_shape}; rows and columns must be multiples of {side}")
@@ -150,6 +156,7 @@ class Answers:
 def _deviation(gain: float) -> Callable[..., Array]:
     """Initialiser that gives the standard deviation ``sqrt(gain / inputs)``; ``EstimatorNetwork.init`` draws."""
 
+    # The deviation in place of a draw: EstimatorNetwork.init multiplies it by noise drawn once for all leaves.
     def fill(key: PRNGKeyArray, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
         return jnp.full(shape, math.sqrt(gain / math.prod(shape[:-1])), dtype)
 
@@ -157,8 +164,8 @@ def _deviation(gain: float) -> Callable[..., Array]:
 
 
 @struct.dataclass(kw_only=True)
-class Gaze:
-    """A panorama as it looks from the direction of a subgoal: what ``EstimatorNetwork.centre`` makes of it."""
+class CentredView:
+    """A panorama turned toward a subgoal: what ``EstimatorNetwork.centre`` makes of it."""
 
     features: Float32[Array, "*B feature_rows feature_columns F"]
     """Rolled by whole columns so that the subgoal's bearing is in the centre."""
@@ -167,7 +174,7 @@ class Gaze:
     distance: Float32[Array, "*B"]
     """From the panorama's pose to the subgoal."""
     fovea: Float32[Array, "*B patch_rows patch_columns 3"] | None
-    """The pixels around the subgoal, where the network looks at them."""
+    """The pixels around the subgoal; None for a network without a fovea."""
 
 
 class _Convolution(nn.Module):
@@ -185,6 +192,7 @@ class _Convolution(nn.Module):
             x = nn.Dense(self.width, kernel_init=initial)(_patches(x, self.stride))
         else:
             edge = self.kernel // 2
+            # The panorama is a circle: its left neighbour is its right edge. Above and below there is nothing.
             x = jnp.concatenate([x[..., -edge:, :], x, x[..., :edge, :]], axis=-2)
             kernel, strides = (self.kernel, self.kernel), (self.stride, self.stride)
             x = nn.Conv(self.width, kernel, strides, padding=((edge, edge), (0, 0)), kernel_init=initial)(x)
@@ -216,6 +224,7 @@ class _Modulated(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array, condition: Array) -> Array:
+        # A small gain: at the start the condition hardly changes what is seen.
         scale, shift = (nn.Dense(self.width, use_bias=False, kernel_init=_deviation(0.1))(condition) for _ in range(2))
         return nn.leaky_relu(nn.Dense(self.width, kernel_init=_deviation(2.0))(x) * (1 + scale) + shift, _SLOPE)
 
@@ -232,7 +241,9 @@ class _SecondStage(nn.Module):
             keeps = stride == 1 and width == x.shape[-1]
             # Each residual layer adds to the variance; a small gain keeps seven of them in bounds.
             y = _Convolution(width, 3, stride, gain=0.5 if keeps else 2.0)(x)
+            # Where the shape changes there is nothing to add to.
             x = x + y if keeps else y
+        # No pooling: where something is seen matters as much as what is.
         x = x.reshape(x.shape[0], -1)
         if fovea is not None:
             seen = fovea
@@ -248,7 +259,9 @@ class _SecondStage(nn.Module):
         """The first convolution of ``features`` with ``condition`` joined to every element (and to the padding)."""
         width, stride = self.widths[0], _SECOND_STRIDES[0]
         shape = (features.shape[1] // stride, features.shape[2] // stride, width)
+        # Circular padding hides where the centre is; this bias says it (see above).
         position = self.param("position", nn.initializers.constant(0.1), shape)
+        # A constant passes a convolution as one vector: no copies of the condition are convolved.
         of_condition = nn.Dense(width, use_bias=False, kernel_init=_deviation(2.0))(condition)
         return _Convolution(width, 3, stride)(features, position[None] + of_condition[:, None, None, :])
 
@@ -265,6 +278,7 @@ class EstimatorNetwork:
 
     def init(self, key: PRNGKeyArray) -> Params:
         """New parameters: normal with the standard deviations of the modules' initialisers, biases 0."""
+        # Shapes alone decide the deviations: they are computed once, without a draw.
         # One random vector for all: drawn leaf by leaf, the generator is compiled once for each.
         deviations = jax.jit(self._deviations)()
         leaves, structure = jax.tree.flatten(deviations)
@@ -277,12 +291,12 @@ class EstimatorNetwork:
         key = jax.random.key(0)
         pixels = jnp.zeros((1, *self.config.image_shape, 3))
         conditions = jnp.zeros((1, 2 * len(self.config.propositions) + 3))
-        gaze = jax.tree.map(
+        centred = jax.tree.map(
             lambda leaf: leaf[None], self.centre(jnp.zeros(self.config.feature_shape), *[jnp.zeros(())] * 2)
         )
         return {
             "first": self._first.init(key, pixels)["params"],
-            "second": self._second.init(key, gaze.features, conditions, _flat_fovea(gaze))["params"],
+            "second": self._second.init(key, centred.features, conditions, _flat_fovea(centred))["params"],
         }
 
     def encode(
@@ -297,11 +311,13 @@ class EstimatorNetwork:
         """The first stage for pixels in [0, 1]."""
         if pixels.shape[-3:-1] != self.config.image_shape:
             raise NetworkError(f"image of {pixels.shape[-3:-1]}; this network was made for {self.config.image_shape}")
+        # Fixed numbers of the configuration and not of the batch, so that one panorama's features never change.
         normalised = (pixels - jnp.float32(self.config.pixel_mean)) / jnp.float32(self.config.pixel_scale)
         flat = normalised.reshape(-1, *normalised.shape[-3:])
         features = self._first.apply({"params": params["first"]}, flat)
         assert isinstance(features, jax.Array)
         if self.config.fovea:
+            # The pixels themselves come along, so that memory holds one array per panorama.
             features = jnp.concatenate([features, packed(bands_of(flat), STRIDE)], axis=-1)
         return features.reshape(*pixels.shape[:-3], *features.shape[1:])
 
@@ -310,30 +326,49 @@ class EstimatorNetwork:
         features: Float32[Array, "feature_rows feature_columns F"],
         bearing: Float32[Array, "*B"],
         distance: Float32[Array, "*B"],
-    ) -> Gaze:
+    ) -> CentredView:
         """One panorama, as ``encode`` gives it, seen toward subgoals.
 
-        ``distance`` is the known-space distance from the panorama's pose to the subgoal.
+        Args:
+            features: of one panorama.
+            bearing: of the subgoals from where it was taken.
+            distance: through known space from there to each subgoal, in the unit of ``config.step``.
+
+        Returns:
+            What ``answer`` asks about, for each subgoal.
         """
         fovea = None
         if self.config.fovea:
+            # The camera counts in cells; the distance is in the unit of cost.
             row = floor_rows(self._camera, distance / jnp.float32(self.config.step))
             # Pixels depend on no parameter; said here, no gradient is scattered back into the panorama.
             bands = jax.lax.stop_gradient(unpacked(features[..., -_FINE:], STRIDE))
             fovea = patch(bands, bearing, row, self.config.fovea)
             features = features[..., :-_FINE]
+        # Whole columns are rolled, which is exact; the rest of the angle goes into the condition.
         columns = features.shape[1]
         column = jnp.float32(2 * math.pi / columns)
         shift = jnp.round(bearing / column)
         own = jnp.broadcast_to(jnp.arange(columns, dtype=jnp.int32), (*shift.shape, columns))
         source = (own + shift[..., None].astype(jnp.int32)) % columns
         rolled = jnp.moveaxis(features[:, source], 0, -3)
-        return Gaze(features=rolled, residual=bearing - shift * column, distance=distance, fovea=fovea)
+        return CentredView(features=rolled, residual=bearing - shift * column, distance=distance, fovea=fovea)
 
-    def answer(self, params: Params, gaze: Gaze, phi_stay: Int8[Array, "*B P"], phi_go: Int8[Array, "*B P"]) -> Answers:
-        """The second stage. ``*B`` are the leading dimensions of ``gaze``.
+    def answer(
+        self, params: Params, centred: CentredView, phi_stay: Int8[Array, "*B P"], phi_go: Int8[Array, "*B P"]
+    ) -> Answers:
+        """The second stage.
 
-        Raises NetworkError where the vectors phi have another length than the network's propositions.
+        Args:
+            params: as ``init`` made them, or trained.
+            centred: panoramas turned toward subgoals; ``*B`` are its leading dimensions.
+            phi_stay, phi_go: the class of each pair, entries -1, 0, 1 in the order of ``config.propositions``.
+
+        Returns:
+            One answer for each pair.
+
+        Raises:
+            NetworkError: the vectors phi have another length than the network's propositions.
         """
         expected = len(self.config.propositions)
         if phi_stay.shape[-1] != expected or phi_go.shape[-1] != expected:
@@ -342,18 +377,19 @@ class EstimatorNetwork:
                 f"propositions: {', '.join(self.config.propositions)}"
             )
         # Half a column is turned into a quarter of a circle: the sine then uses its whole range.
-        angle = gaze.residual * jnp.float32(self.config.feature_shape[1] / 2)
-        scaled = gaze.distance / jnp.float32(self.config.distance_scale)
+        angle = centred.residual * jnp.float32(self.config.feature_shape[1] / 2)
+        scaled = centred.distance / jnp.float32(self.config.distance_scale)
         scalars = jnp.stack([scaled, jnp.sin(angle), jnp.cos(angle)], axis=-1)
         condition = jnp.concatenate([phi_stay.astype(jnp.float32), phi_go.astype(jnp.float32), scalars], axis=-1)
         outputs = self._second.apply(
             {"params": params["second"]},
-            gaze.features.reshape(-1, *gaze.features.shape[-3:]),
+            centred.features.reshape(-1, *centred.features.shape[-3:]),
             condition.reshape(-1, condition.shape[-1]),
-            _flat_fovea(gaze),
+            _flat_fovea(centred),
         )
         assert isinstance(outputs, jax.Array)
-        logit, success, failure = jnp.moveaxis(outputs.reshape(*gaze.distance.shape, _OUTPUTS), -1, 0)
+        logit, success, failure = jnp.moveaxis(outputs.reshape(*centred.distance.shape, _OUTPUTS), -1, 0)
+        # Softplus keeps costs positive; a success costs at least one step of the grid.
         return Answers(
             success_logit=logit,
             success_cost=jnp.float32(self.config.step)
@@ -376,8 +412,8 @@ class EstimatorNetwork:
         return _SecondStage(self.config.second_widths, self.config.dense_widths)
 
 
-def _flat_fovea(gaze: Gaze) -> Float32[Array, "B pixels"] | None:
-    return None if gaze.fovea is None else gaze.fovea.reshape(-1, math.prod(gaze.fovea.shape[-3:]))
+def _flat_fovea(centred: CentredView) -> Float32[Array, "B pixels"] | None:
+    return None if centred.fovea is None else centred.fovea.reshape(-1, math.prod(centred.fovea.shape[-3:]))
 
 
 def parameter_count(params: Params) -> int:

@@ -38,6 +38,8 @@ HELD_OUT: Mapping[str, tuple[str, ...]] = MappingProxyType(
 LARGEST: TaskSizes = TaskSizes(states=8, propositions=16, edges=24, classes=24, compound=8, cubes=4)
 """Tasks that are drawn fit these sizes (propositions: those of the family)."""
 
+# The probabilities below were not tuned. They give every kind of class a part in the data, simple ones the largest
+# (docs/dataset.md).
 _AVOIDED = (0.25, 0.45, 0.2, 0.1)
 """Probability of 0 to 3 propositions to avoid on a leg."""
 
@@ -48,6 +50,7 @@ _UNLIKELY = 0.2
 """How often a class that needs several propositions at one cell is asked, relative to others: few places offer them,
 and tasks that reach all of several places have many such classes."""
 
+# Draws before giving up: refused draws are common, but so many in a row mean that no formula is left.
 _ATTEMPTS = 200
 
 
@@ -74,6 +77,7 @@ def random_formula(rng: np.random.Generator, propositions: Sequence[str]) -> str
     """A co-safe formula over some of the propositions, in Spot's syntax."""
     names = [_quoted(name) for name in propositions]
     template = _choice(rng, _TEMPLATES)
+    # "reach", "turn" and "detour" have the forms of the paper's fire-fighting tasks, "all" that of its delivery task.
     if template == "reach":
         return _leg(rng, names)
     if template == "turn":
@@ -105,6 +109,7 @@ class TaskDistribution:
         raise ValueError(f"no task was found over {self.propositions}: the formulas that are held out leave none")
 
     def _accepts(self, task: Task) -> bool:
+        # A task that is decided before anything is found (letter 0) asks nothing of the unknown.
         first = task.dfa.transitions[task.dfa.initial, 0]
         asks = len(task.classes) > 0 and not task.dfa.accepting[first] and not task.dfa.trap[first]
         return asks and LARGEST.covers(task.sizes) and language(task) not in self._held_out
@@ -112,6 +117,8 @@ class TaskDistribution:
 
 def language(task: Task) -> tuple[bytes, bytes, int]:
     """Equal for tasks over the same propositions that accept the same words."""
+    # Task.from_formula gives the minimal automaton with its states in a canonical order, so equal languages have equal
+    # arrays, however the formulas are written.
     return task.dfa.transitions.tobytes(), task.dfa.accepting.tobytes(), int(task.dfa.initial)
 
 
@@ -135,10 +142,18 @@ def draw_questions(
 ) -> tuple[Question, ...]:
     """Questions from some of the tasks, distinct by (phi_stay, phi_go).
 
-    Up to ``count``, with at most ``staying_sets`` sets of staying letters; fewer where the tasks have no more.
+    Args:
+        rng: moves on.
+        tasks: the pool that classes are drawn from.
+        count: questions, at most.
+        staying_sets: distinct sets of staying letters among them, at most; each costs a solve of distances.
+
+    Returns:
+        The questions in the order in which they were drawn; fewer where the tasks have no more.
     """
     chosen: dict[tuple[Phi, Phi], Question] = {}
     stays: set[tuple[bool, ...]] = set()
+    # Draws repeat, and some do not fit the sets that are there: eight draws a question find nearly all there are.
     for _ in range(8 * count):
         if len(chosen) == count:
             break
@@ -157,6 +172,14 @@ def question_sheet(questions: Sequence[Question], count: int, staying_sets: int)
 
     State ``k`` keeps itself on the ``k``-th set of staying letters, and no other entry means anything.
 
+    Args:
+        questions: of tasks over the same propositions.
+        count: classes of the sheet, so that all sheets have arrays of one shape.
+        staying_sets: states of the sheet.
+
+    Returns:
+        Arrays of a task without edges, accepting states or traps: only ``true_labels`` can read it.
+
     Raises:
         ValueError: no question, more questions or sets than there is room for, or room for fewer than two sets.
     """
@@ -171,6 +194,7 @@ def question_sheet(questions: Sequence[Question], count: int, staying_sets: int)
     keeps = np.ones((staying_sets, letters), bool)
     keeps[: len(stays)] = stays
     real = np.arange(count) < len(questions)
+    # Where a state does not keep itself it goes to another one, whichever: a path that leaves the set has failed.
     return TaskArrays(
         transitions=jnp.asarray(np.where(keeps, states, (states + 1) % staying_sets)),
         accepting=jnp.zeros(staying_sets, bool),

@@ -80,6 +80,9 @@ def recording_metadata(
         bounds: of the samples' weights.
         versions: of what the records depend on besides the libraries that write them.
         facts: the other fields of ``DatasetMetadata``.
+
+    Returns:
+        Metadata that are equal for collections that may be continued by each other.
     """
     settings = json_copy(dataclasses.asdict(config))
     return DatasetMetadata(
@@ -96,7 +99,17 @@ def recording_metadata(
 def draws_of_world(
     config: RecordingConfig, split: str, index: int, tasks: TaskDistribution
 ) -> tuple[np.random.Generator, list[Task]]:
-    """The random numbers of one world of a dataset and its pool of tasks; no other world shares them."""
+    """What is drawn for one world of a dataset.
+
+    Args:
+        config: for the seed and the size of the pool.
+        split, index: name the world.
+        tasks: what the pool is drawn from.
+
+    Returns:
+        The world's random numbers, which no other world shares, and its pool of tasks.
+    """
+    # crc32 and not hash(): Python's hash of a text is another one in every process.
     rng = np.random.default_rng([config.seed, zlib.crc32(split.encode()), index])
     return rng, [tasks.draw(rng) for _ in range(config.tasks_per_world)]
 
@@ -125,10 +138,21 @@ class Scene:
 def survey(
     world: World, belief: BeliefMap, cell: Int32[Array, "2"], frontiers: FrontierConfig = FrontierConfig()
 ) -> Scene:
-    """The subgoals of a belief by known-space distance, letters ignored. The camera sees without limit of range."""
+    """The subgoals of a belief by known-space distance, letters ignored. The camera sees without limit of range.
+
+    Args:
+        world: the true map: what is in the line of sight.
+        belief: what the robot knows of it.
+        cell: where the robot stands.
+        frontiers: which components of the frontier are subgoals; static.
+
+    Returns:
+        What there is to ask at this pose.
+    """
     distances = grid_distances(belief.free, cell, belief.resolution)
     subgoals = find_subgoals(belief, jnp.isfinite(distances), distances, frontiers)
     seen = visible(world.occupied, cell, SensorConfig(range_cells=float(sum(world.shape))))
+    # A subgoal is in view where any cell of its frontier is.
     index = jnp.arange(subgoals.mask.shape[0], dtype=jnp.int32)[:, None, None]
     in_view = jnp.any((subgoals.component[None] == index) & seen[None], axis=(1, 2))
     return Scene(
@@ -143,20 +167,40 @@ def survey(
 def label(
     world: World, belief: BeliefMap, scene: Scene, sheet: TaskArrays, bounds: WeightBounds
 ) -> tuple[Estimates, Weights]:
-    """True labels and weights of every (subgoal, question), also of subgoals out of view."""
+    """True labels and weights of every (subgoal, question), also of subgoals out of view.
+
+    Args:
+        world: the true map.
+        belief: what the robot knows of it.
+        scene: the subgoals.
+        sheet: the questions (``question_sheet``).
+        bounds: of the weights; static.
+
+    Returns:
+        Labels and weights, 0 where masked.
+    """
+    # Subgoals out of view are labelled too: missing one is cheap where another, seen or not, would do as well.
     labels = true_labels(world, belief, scene.subgoals, sheet)
     mask = scene.subgoals.mask[:, None] & sheet.class_mask[None, :]
     return labels, loss_weights(scene.distance, labels, mask, bounds)
 
 
-def settled(
+def is_answered(
     world: World, belief: BeliefMap, subgoals: Subgoals, unexplored: Bool[np.ndarray, "H W"]
 ) -> Bool[np.ndarray, " S"]:
     """Whether ``world`` answers all that can be asked about each subgoal; False where masked.
 
-    ``unexplored`` are free cells of ``world`` beyond which it is not known how the building goes on. A subgoal is not
-    settled where one of them is on its frontier, or can be reached from it through cells that ``belief`` does not know.
+    Args:
+        world: the final map of a drive, as far as it goes.
+        belief: what was known at this pose.
+        subgoals: of the belief.
+        unexplored: free cells of ``world`` beyond which it is not known how the building goes on.
+
+    Returns:
+        False where one of them is on the subgoal's frontier, or can be reached from it through cells that ``belief``
+        does not know: what lies beyond could be anything.
     """
+    # Regions of free space that the belief does not know yet, numbered from 1; 0 is everything else.
     regions = np.zeros(unexplored.shape, np.int32)
     ndimage.label(np.asarray(belief.unknown) & ~np.asarray(world.occupied), output=regions)
     leads_on = np.unique(regions[unexplored])
@@ -164,6 +208,7 @@ def settled(
     answers = np.zeros(mask.shape, bool)
     for subgoal in np.flatnonzero(mask):
         own = component == subgoal
+        # The regions that touch the frontier are those that a robot enters through it.
         around = np.asarray(ndimage.binary_dilation(own), bool)
         open_beyond = np.isin(regions[around], leads_on[leads_on > 0])
         answers[subgoal] = not (np.any(unexplored & own) or np.any(open_beyond))
@@ -188,7 +233,15 @@ class Recorder:
         scene: Scene,
         questions: Sequence[Question],
     ) -> None:
-        """Record a view and its samples. ``index`` is the world's number."""
+        """Record a view and its samples.
+
+        Args:
+            world, index: the true map and its number.
+            pose: where the robot stands.
+            image: what the camera saw.
+            scene: the subgoals; those in view become samples.
+            questions: what is asked of each of them.
+        """
         config = self.config
         sheet = question_sheet(questions, config.classes, config.staying_sets)
         labels, weights = label(world, pose.belief, scene, sheet, self._bounds)
@@ -220,26 +273,37 @@ def record_views(
 ) -> None:
     """Record views of one world from which a subgoal can be seen, at random intervals along ``poses``.
 
-    ``photograph`` is called once a view, in the order of the poses; None: there is no picture, and the pose is passed
-    over. With ``unexplored`` (see ``settled``) subgoals whose answer ``world`` does not settle are left out.
+    Args:
+        recorder: gets the rows.
+        world, index: the true map and its number.
+        poses: of the robot, in order; not read further than needed.
+        tasks: the pool that questions are drawn from.
+        rng: moves on.
+        photograph: called once a view, in the order of the poses; None: there is no picture, and the pose is passed
+            over.
+        unexplored: as in ``is_answered``; subgoals that ``world`` does not answer for are left out. None: it answers
+            for all.
     """
     config, due, recorded = recorder.config, 0.0, 0
     for pose in poses:
         if recorded == config.views_per_world:
             return
+        # Before the scene is made: finding subgoals is what takes time.
         if pose.travelled < due:
             continue
         scene = survey(world, pose.belief, jnp.asarray(pose.cell, jnp.int32), config.frontiers)
         if unexplored is not None:
-            answered = jnp.asarray(settled(world, pose.belief, scene.subgoals, unexplored))
+            answered = jnp.asarray(is_answered(world, pose.belief, scene.subgoals, unexplored))
             scene = dataclasses.replace(scene, in_view=scene.in_view & answered)
         if not np.any(scene.in_view):
             continue
         image = photograph(pose)
         if image is None:
             continue
+        # After the picture: a pose without one draws nothing, and the views that follow stay as they are.
         questions = draw_questions(rng, tasks, config.classes, config.staying_sets)
         recorder.add(world, index, pose, image, scene, questions)
+        # More views where there is more to choose, which is where a decision matters.
         due = pose.travelled + rng.uniform(*config.spacing) / int(np.sum(scene.in_view))
         recorded += 1
 
@@ -251,6 +315,7 @@ def _sample_columns(
     chosen = np.flatnonzero(scene.in_view)
     count = len(questions)
 
+    # Rows by subgoal, then by question: what belongs to a subgoal is repeated, what belongs to a question runs through.
     def per_subgoal(values: Array) -> list[Any]:
         return np.repeat(np.asarray(values)[chosen], count).tolist()
 

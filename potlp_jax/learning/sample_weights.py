@@ -31,7 +31,16 @@ class WeightBounds:
 
     @classmethod
     def of_map(cls, height: int, width: int, resolution: float) -> "WeightBounds":
-        """A twentieth of, and the whole of, the sum of the map's sides."""
+        """A twentieth of, and the whole of, the sum of the map's sides.
+
+        Args:
+            height, width: of the map's array.
+            resolution: side of a cell in the unit of cost.
+
+        Returns:
+            Bounds in the unit of cost.
+        """
+        # So that every sample counts, and none counts for all.
         size = (height + width) * resolution
         return cls(low=size / 20, high=size)
 
@@ -52,14 +61,24 @@ def loss_weights(
 ) -> Weights:
     """Weights of real pairs (``mask`` True), from the true labels of all subgoals of a view.
 
-    ``distance`` is D, from the robot to each subgoal. Where a class is true beyond no other subgoal, a missed success
-    weighs ``bounds.high``. ``bounds`` is static.
+    Args:
+        distance: D, from the robot to each subgoal.
+        labels: the true ones of all subgoals of the view, seen or not.
+        mask: True for real pairs.
+        bounds: what weights are clipped to; static.
+
+    Returns:
+        Weights in the unit of cost. Where a class is true beyond no other subgoal, a missed success weighs
+        ``bounds.high``.
     """
     count = distance.shape[0]
     holds = (labels.success_probability > 0) & mask
     total = distance[:, None] + labels.success_cost
+    # [this subgoal, other subgoal, class]: whether another one would do as well.
     other = holds[None] & ~jnp.eye(count, dtype=bool)[:, :, None]
     best_other = jnp.min(jnp.where(other, total[None], jnp.inf), axis=1)
+    # The best other may be better than this one: the clip makes such a miss weigh the least, and infinity the most.
     success = jnp.where(holds, jnp.clip(best_other - total, bounds.low, bounds.high), bounds.low)
+    # There and back.
     failure = jnp.clip(2 * labels.failure_cost, bounds.low, bounds.high)
     return Weights(success=jnp.where(mask, success, 0.0), failure=jnp.where(mask, failure, 0.0))

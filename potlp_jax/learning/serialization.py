@@ -26,20 +26,31 @@ ESTIMATOR_FORMAT: str = "potlp-estimator-3"
 """Changed when older files can no longer be read."""
 
 
+# Name of the array that holds the JSON text as bytes; no parameter has a name without a dot.
 _HEADER = "header"
 
 
 def save_estimator(path: Path | str, params: Params, config: NetworkConfig, metadata: Mapping[str, Any]) -> None:
-    """Write an estimator, under a temporary name first; ``metadata`` is any JSON-able mapping."""
+    """Write an estimator.
+
+    Args:
+        path: the file; its folder is made if it is not there.
+        params: float32 arrays.
+        config: of the network.
+        metadata: any JSON-able mapping: how the estimator was made.
+    """
+    # Under a temporary name first: a process that is killed leaves the old estimator or the new one.
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     arrays = named_arrays(params)
     header = json.dumps({"format": ESTIMATOR_FORMAT, "network": dataclasses.asdict(config), "metadata": metadata})
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("wb") as file:
+        # Not compressed: random bits of parameters hardly shrink, and the file loads faster.
         contents: dict[str, Any] = {_HEADER: np.frombuffer(header.encode(), np.uint8), **arrays}
         np.savez(file, **contents)
         file.flush()
+        # Before the rename: otherwise a power cut could leave the name without the contents.
         os.fsync(file.fileno())
     temporary.replace(path)
 
@@ -50,6 +61,7 @@ def load_estimator(path: Path | str) -> tuple[Params, NetworkConfig, dict[str, A
     Raises:
         CheckpointError: no such file, damaged, of another format, or parameters that do not fit the configuration.
     """
+    # All that a file that is no zip, or a damaged one, makes NumPy and zlib raise.
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -65,6 +77,7 @@ def load_estimator(path: Path | str) -> tuple[Params, NetworkConfig, dict[str, A
         config = config_from_dict(NetworkConfig, header["network"], "network")
     except ConfigurationError as error:
         raise CheckpointError(f"{path}: {error}") from error
+    # What the network would have, without computing it: names and shapes must agree before anything is used.
     like = jax.eval_shape(EstimatorNetwork(config).init, jax.random.key(0))
     wanted = named_leaves(like)
     found = differences(array_shapes(arrays), array_shapes(wanted), "array")
@@ -75,7 +88,17 @@ def load_estimator(path: Path | str) -> tuple[Params, NetworkConfig, dict[str, A
 
 
 def require_propositions(config: NetworkConfig, propositions: tuple[str, ...], where: str) -> None:
-    """Raises CheckpointError unless the estimator was trained with these propositions, in this order."""
+    """Check that an estimator was trained with these propositions, in this order.
+
+    Args:
+        config: of the estimator's network.
+        propositions: those of the task or the data.
+        where: names the estimator in the message.
+
+    Raises:
+        CheckpointError: it was not.
+    """
+    # The order matters: an entry of phi means what its position says.
     if config.propositions != propositions:
         raise CheckpointError(
             f"{where} knows the propositions {', '.join(config.propositions)} in this order, and not "

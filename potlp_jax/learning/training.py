@@ -148,6 +148,14 @@ def augment(
 
     The column of a pixel and its bearing change sign together, so mirroring the panorama negates the bearings. It is
     the image that is mirrored, not the features: the first stage's kernels are not symmetrical.
+
+    Args:
+        batch: images as bytes, and bearings.
+        key: used up.
+        config: how much; 0 for none of a kind.
+
+    Returns:
+        Pixels and bearings of the batch's shapes.
     """
     of_mirror, of_brightness, of_colour = jax.random.split(key, 3)
     views = batch.images.shape[0]
@@ -156,6 +164,7 @@ def augment(
     bearing = jnp.where(mirrored[:, None], -batch.bearing, batch.bearing)
     pixels = images.astype(jnp.float32) / jnp.float32(255)
     if config.brightness or config.colour:
+        # As a lamp and a camera's white balance change a picture: by factors, around 1.
         gain = config.brightness * jax.random.normal(of_brightness, (views, 1, 1, 1))
         gain = gain + config.colour * jax.random.normal(of_colour, (views, 1, 1, 3))
         pixels = jnp.clip(pixels * jnp.exp(gain), 0, 1)
@@ -164,6 +173,7 @@ def augment(
 
 def learning_rate_schedule(config: TrainingConfig) -> optax.Schedule:
     """Linear warm-up, then a cosine to 0 at the last planned step."""
+    # At least one step each, so that the schedule is defined for the shortest trainings of tests.
     warmup = max(1, round(config.warmup * config.steps))
     return optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, warmup, max(config.steps, warmup + 1))
 
@@ -184,6 +194,7 @@ def make_optimizer(config: TrainingConfig) -> optax.GradientTransformation:
 
 def initial_state(network: EstimatorNetwork, config: TrainingConfig) -> TrainState:
     """The state before the first step."""
+    # Two keys: changing the augmentation leaves the initial parameters as they were.
     of_params, of_augmentation = jax.random.split(jax.random.key(config.seed))
     params = network.init(of_params)
     return TrainState(
@@ -192,6 +203,7 @@ def initial_state(network: EstimatorNetwork, config: TrainingConfig) -> TrainSta
         params=params,
         optimizer=make_optimizer(config).init(params),
         average=params,
+        # Until the first evaluation; its infinite loss is beaten by any.
         best=params,
         best_loss=jnp.float32(jnp.inf),
         best_step=jnp.int32(0),
@@ -208,7 +220,16 @@ def _no_sums() -> Sums:
 def make_train_step(
     network: EstimatorNetwork, config: TrainingConfig, scale: DataScale
 ) -> Callable[[TrainState, Batch], tuple[TrainState, Float32[Array, ""]]]:
-    """One compiled step: the next state, and the loss of this batch before it."""
+    """One compiled step.
+
+    Args:
+        network: what is trained.
+        config: how; a new configuration compiles again.
+        scale: figures of the training data.
+
+    Returns:
+        A function of state and batch that gives the next state, and the loss of this batch before the step.
+    """
     optimizer = make_optimizer(config)
 
     def loss(params: Params, batch: Batch, key: PRNGKeyArray) -> tuple[Array, Sums]:
@@ -219,6 +240,7 @@ def make_train_step(
 
     @jax.jit
     def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, Float32[Array, ""]]:
+        # By the step and not by splitting: a resumed training has the same keys.
         key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step)
         (value, sums), gradient = jax.value_and_grad(loss, has_aux=True)(state.params, batch, key)
         with jax.numpy_dtype_promotion("standard"):  # Optax mixes integer counters and floats
@@ -245,7 +267,16 @@ def make_train_step(
 def make_evaluate_step(
     network: EstimatorNetwork, scale: DataScale, weighting: float
 ) -> Callable[[Params, Batch], Sums]:
-    """The compiled sums of one batch, not augmented."""
+    """The compiled sums of one batch, not augmented.
+
+    Args:
+        network: what is evaluated.
+        scale: figures of the training data, so that losses compare.
+        weighting: as in training.
+
+    Returns:
+        A function of parameters and batch.
+    """
 
     @jax.jit
     def evaluate_step(params: Params, batch: Batch) -> Sums:
@@ -258,6 +289,7 @@ def make_evaluate_step(
 
 def check_data(training: Samples, validation: Samples) -> None:
     """Raises TrainingError where the two data sets do not belong together."""
+    # The split may differ, and should: everything that decides what a row means may not.
     for name in ("propositions", "environment", "camera", "unit", "resolution"):
         one, other = getattr(training.metadata, name), getattr(validation.metadata, name)
         if one != other:
@@ -265,12 +297,21 @@ def check_data(training: Samples, validation: Samples) -> None:
 
 
 def seconds_per_step(network: EstimatorNetwork, training: Samples, config: TrainingConfig, steps: int = 8) -> float:
-    """Measured time of a step with its share of decoding, after compilation; nothing is kept of these steps."""
+    """Measured time of a step with its share of decoding, after compilation; nothing is kept of these steps.
+
+    Args:
+        network, training, config: as for ``train``.
+        steps: how many are timed.
+
+    Returns:
+        Seconds.
+    """
     batches = Batches(training, config.views_per_batch, config.samples_per_view, config.seed)
     train_step = make_train_step(network, config, DataScale.of(training))
     state = initial_state(network, config)
     started = 0.0
     for number, batch in enumerate(prefetched(batches.training_batch, 0, steps + 2)):
+        # Two steps first: the one that compiles, and one that finds what was decoded during that.
         if number == 2:
             started = time.perf_counter()
         state, value = train_step(state, batch)
@@ -286,7 +327,16 @@ def steps_per_epoch(training: Samples, config: TrainingConfig) -> int:
 def training_identity(
     network: EstimatorNetwork, training: Samples, validation: Samples, config: TrainingConfig
 ) -> dict[str, Any]:
-    """What must be equal for a training to be resumed: network, configuration, data and versions of libraries."""
+    """What must be equal for a training to be resumed.
+
+    Args:
+        network: what is trained.
+        training, validation: the data, of which the sizes and splits are compared.
+        config: how.
+
+    Returns:
+        JSON-able; differences are named on loading. Versions are part of it: others would end with other bits.
+    """
 
     def data(samples: Samples) -> dict[str, Any]:
         return {"views": len(samples.images), "samples": len(samples.success), "split": samples.metadata.split}
@@ -315,22 +365,33 @@ def train(
     """Train, from the newest checkpoint in ``folder`` if there is one, and give the best parameters.
 
     Args:
+        network: what is trained.
+        training: what is learned from.
+        validation: of other worlds; decides which parameters are the best.
+        config: how, and for how many steps.
         folder: where checkpoints go; None for none.
         budget_seconds: training stops after this time, over all resumptions, also where steps are left.
         on_start: told the number of steps already done.
         on_step: told the number of steps done and the last batch's loss.
         on_evaluation: told the scores after every epoch and at the end.
 
+    Returns:
+        The best parameters by validation loss, and why training ended.
+
     Raises:
         TrainingError: the data do not fit, or the loss is not finite.
         CheckpointError: the newest checkpoint is damaged or of another training.
     """
+    # Everything that a checkpoint must hold is in the loop's state: what stands here may be killed at any line.
     check_data(training, validation)
     loop = _Loop(network, training, validation, config, folder)
     on_start(loop.steps_done)
+    # Decoding of the next batches goes on while the device is busy with this one.
     remaining = prefetched(loop.batches.training_batch, loop.steps_done, config.steps)
+    # A training that was over already, as after a second start, makes no step.
     for batch in remaining if loop.reason(budget_seconds) is None else ():
         on_step(loop.steps_done + 1, loop.advance(batch))
+        # The parameters at the end are worth evaluating whatever ended the training.
         out_of_time = loop.seconds >= budget_seconds
         if loop.steps_done % loop.batches.per_epoch == 0 or loop.steps_done == config.steps or out_of_time:
             on_evaluation(loop.evaluate())
@@ -354,6 +415,7 @@ class _Loop:
         folder: Path | None,
     ) -> None:
         self._network, self._config, self._folder = network, config, folder
+        # Figures of the training data also scale the validation loss: they belong to the loss, not to the data.
         scale = DataScale.of(training)
         self.batches = Batches(training, config.views_per_batch, config.samples_per_view, config.seed)
         self._validation = Batches(validation, config.views_per_batch, config.samples_per_view, config.seed)
@@ -366,6 +428,7 @@ class _Loop:
         saved = checkpoint_steps(folder) if folder is not None else []
         if folder is not None and saved:
             self._state, progress = load_checkpoint(folder, saved[-1], self._state, self._identity)
+            # Time counts over all starts, so that a budget is kept.
             before = progress["seconds"]
         self._started = time.perf_counter() - before
         self.steps_done = int(self._state.step)
@@ -377,6 +440,7 @@ class _Loop:
     def advance(self, batch: Batch) -> float:
         """One step; its loss."""
         self._state, value = self._train_step(self._state, batch)
+        # Waits for the step: without it many steps would be queued, and a NaN be found long after its batch.
         loss = float(value)
         if not np.isfinite(loss):
             raise TrainingError(
@@ -395,11 +459,13 @@ class _Loop:
         config, network = self._config, self._network.config
         validation = evaluation_of(sums, network, config.cost_share)
         trained = evaluation_of(self._state.sums, network, config.cost_share)
+        # NaN compares as worse than any best loss, so that training would go on in vain.
         if not np.isfinite(validation.loss):
             raise TrainingError(f"the validation loss after step {self.steps_done} is {validation.loss}")
         state = dataclasses.replace(
             self._state, sums=_no_sums(), evaluations_since_best=self._state.evaluations_since_best + 1
         )
+        # Strictly: of equal losses the first counts, so that patience ends a training that stands still.
         if validation.loss < float(state.best_loss):
             state = dataclasses.replace(
                 state,

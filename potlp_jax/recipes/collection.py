@@ -89,6 +89,7 @@ class _Job:
 
 def collection_of(generator: Generator) -> CollectConfig:
     """What to record in worlds of a family: subgoals as its trials have them, and never the formulas it holds out."""
+    # The estimator is asked about the subgoals of trials, so it must learn from the same ones.
     frontiers = trial_config_for(generator).decision.frontiers
     return CollectConfig(
         frontiers=frontiers,
@@ -126,6 +127,7 @@ def collect(
     shards = _whole_shards(worlds, size)
     if processes < 1:
         raise DatasetError(f"{processes} processes are too few: ask for at least 1")
+    # Before anything is made: a collection with other settings must not mix with what is there.
     metadata = dataset_metadata(generator, environment, split, config)
     finished = finished_shards(folder)
     differences = read_metadata(folder).differences(metadata) if finished else []
@@ -134,7 +136,9 @@ def collect(
             f"{folder} holds a dataset that was collected otherwise ({'; '.join(differences)}): continue with the same "
             "settings, or choose an empty folder"
         )
+    # Nobody else writes to the folder now (docs/dataset.md), so temporary files are of processes that were killed.
     remove_unfinished_files(folder)
+    # What is finished stays as it is; a larger number of worlds adds shards.
     missing = [shard for shard in range(shards) if shard not in finished]
     jobs = [_Job(folder, shard, generator, split, config, metadata) for shard in missing]
     views, done = 0, worlds - len(jobs) * size
@@ -166,6 +170,7 @@ def dataset_metadata(generator: Generator, environment: str, split: Split, confi
     Returns:
         Metadata in which everything that decides what is recorded has a place, so that equal ones may be continued.
     """
+    # All worlds of a family have one array shape and one resolution, so the first stands for all.
     world = generator.generate(world_key(split, 0, generator.name))
     resolution = float(world.resolution)
     return recording_metadata(
@@ -184,6 +189,7 @@ def dataset_metadata(generator: Generator, environment: str, split: Split, confi
 def _collect_shard(job: _Job) -> int:
     """Collect and write one shard; returns the number of its views."""
     tasks = TaskDistribution(job.generator.propositions, job.config.held_out)
+    # The bounds from the metadata: of the family's first world, so that all shards share them.
     recorder = Recorder(job.shard, job.config, WeightBounds(**job.metadata.weights))
     first = job.shard * job.config.worlds_per_shard
     for index in range(first, first + job.config.worlds_per_shard):
@@ -216,12 +222,14 @@ def _image(
 def _run(jobs: Sequence[_Job], processes: int) -> Iterator[int]:
     """Views of each shard as it is done."""
     if processes == 1:
+        # In this process, where errors have their traceback and a debugger works.
         yield from map(_collect_shard, jobs)
         return
     # XLA's threads do not survive a fork.
     context = multiprocessing.get_context("spawn")
     cores = context.SimpleQueue()
     allowed = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
+    # Each worker takes one number when it starts; more workers than cores share them in turn.
     for index in range(processes):
         cores.put(allowed[index % len(allowed)])
     with context.Pool(processes, _start_worker, (cores,)) as pool:
@@ -235,6 +243,7 @@ def _start_worker(cores) -> None:
         # Before XLA starts, which then uses one thread.
         os.sched_setaffinity(0, {core})
     enable_compilation_cache()
+    # A parent that is killed cannot stop its workers, so they watch it.
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
@@ -242,6 +251,7 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])
+        # From a thread sys.exit would end the thread alone.
         os._exit(1)
 
 

@@ -25,12 +25,13 @@ from potlp_jax.trials.robot import SimulatedRobot
 from potlp_jax.trials.rules import Stop
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import BeliefMap, World
-from potlp_jax.world.moves import Cell, path_length
+from potlp_jax.world.moves import Cell, as_cell, path_length
 from potlp_jax.world.sensing import SensorConfig
 
 _HORIZON = 24
 """Moves before the next pose at most, so that there are poses along a way on which nothing new is seen."""
 
+# Tasks drawn before it is given up that one of them leads anywhere: as many as the pool of a world has.
 _TASKS_TRIED = 12
 
 
@@ -67,6 +68,7 @@ class Explorer:
 
     def poses(self) -> Iterator[Pose]:
         """Poses in order, the start first, until nothing can be reached any more or the limit has been travelled."""
+        # The same observe and advance as in a trial, so that poses are where a planner would decide.
         step, travelled = 0, 0.0
         while True:
             belief, cell = self._robot.observe()
@@ -82,7 +84,8 @@ class Explorer:
                 is_frontier=jnp.asarray(target == self._frontier and bool(_ends_at(path, target))),
             )
             cells = self._robot.advance(path, stop).cells
-            assert cells, f"a way from {cell} to {target} has no moves"
+            # Without a move the loop would not end.
+            assert cells, f"a path from {cell} to {target} has no moves"
             letters = np.asarray(self._robot.observe()[0].letters)
             self._read([int(letters[entered]) for entered in cells])
             step += len(cells)
@@ -95,6 +98,7 @@ class Explorer:
             self._state = int(self._task.dfa.transitions[self._task.dfa.initial, letter])
             if not self._is_decided():
                 break
+        # Padded to one size for all tasks: what is compiled for one serves the others.
         sizes = dataclasses.replace(LARGEST, propositions=len(self._task.propositions))
         self._arrays = self._task.padded(sizes)
         self._frontier = None
@@ -113,17 +117,20 @@ class Explorer:
                 situation = _assess(
                     belief, jnp.asarray(cell, jnp.int32), jnp.int32(self._state), self._arrays, self._config.frontiers
                 )
+                # A task that can be finished in known space is finished, as every policy does.
                 if np.isfinite(situation.finish_cost):
-                    return situation, _cell(situation.finish_cell), int(situation.finish_state)
+                    return situation, as_cell(situation.finish_cell), int(situation.finish_state)
                 distances = np.asarray(situation.distances)
                 self._frontier = self._choose_frontier(situation, distances)
                 if self._frontier is not None:
+                    # In whichever state of the task the frontier is nearest.
                     return situation, self._frontier, int(np.argmin(distances[self._frontier]))
             self._take_task(int(belief.letters[cell]))
         return None
 
     def _choose_frontier(self, situation: Situation, distances: np.ndarray) -> Cell | None:
-        """The frontier pursued so far while it is one, else another that can be reached."""
+        """The frontier pursued so far while it is one, otherwise another that can be reached."""
+        # A robot that keeps to its target gets to the ends of hallways and not only to their mouths.
         subgoals = situation.subgoals
         kept = self._frontier
         if kept is not None and subgoals.frontier[kept] and np.isfinite(distances[kept].min()):
@@ -132,8 +139,9 @@ class Explorer:
         cells = cells[np.isfinite(distances[cells[:, 0], cells[:, 1]].min(axis=1))]
         if not len(cells):
             return None
+        # Subgoals are ordered by distance: the first is the nearest.
         nearest = self._rng.random() >= self._config.random_frontier
-        return _cell(cells[0 if nearest else int(self._rng.integers(len(cells)))])
+        return as_cell(cells[0 if nearest else int(self._rng.integers(len(cells)))])
 
 
 @partial(jax.jit, static_argnames="frontiers")
@@ -159,8 +167,4 @@ def _path(situation: Situation, target: Int32[Array, "2"], target_state: Int32[A
 
 
 def _ends_at(path: KnownPath, target: Cell) -> bool:
-    return _cell(np.asarray(path.cells)[int(path.length)]) == target
-
-
-def _cell(cell) -> Cell:
-    return int(cell[0]), int(cell[1])
+    return as_cell(np.asarray(path.cells)[int(path.length)]) == target

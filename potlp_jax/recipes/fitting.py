@@ -87,6 +87,7 @@ def fit(training: Samples, validation: Samples, out: Path, config: FitConfig, di
     """
     network = EstimatorNetwork(_network_config(training, config))
     out.mkdir(parents=True, exist_ok=True)
+    # Measuring counts: the time asked for is that of the whole command.
     began = time.perf_counter()
     plan = _plan(network, training, out, config)
     _say_what_is_fitted(network, training, plan, config, display)
@@ -94,6 +95,7 @@ def fit(training: Samples, validation: Samples, out: Path, config: FitConfig, di
     budget = float("inf")
     if config.minutes is not None:
         budget = config.minutes * 60 * _OVERRUN - (time.perf_counter() - began)
+    # The journal is closed whatever happens, so that TensorBoard's file is whole.
     try:
         trained = train(
             network,
@@ -108,6 +110,7 @@ def fit(training: Samples, validation: Samples, out: Path, config: FitConfig, di
         )
     finally:
         journal.close()
+    # Whoever has the file alone can still say how it was made.
     metadata = _metadata(training, validation, plan, trained, journal)
     save_estimator(out / ESTIMATOR, trained.params, network.config, metadata)
     return trained
@@ -116,6 +119,7 @@ def fit(training: Samples, validation: Samples, out: Path, config: FitConfig, di
 def _network_config(training: Samples, config: FitConfig) -> NetworkConfig:
     if not training.images:
         raise TrainingError("the dataset has no panoramas: collect more worlds")
+    # All panoramas of a dataset have the size of the first.
     rows, columns, _ = decode(training.images[0]).shape
     return network_config(
         training,
@@ -129,6 +133,7 @@ def _network_config(training: Samples, config: FitConfig) -> NetworkConfig:
 def _plan(network: EstimatorNetwork, training: Samples, out: Path, config: FitConfig) -> TrainingConfig:
     """How to train, and for how many steps."""
     options = dataclasses.asdict(config.training)
+    # The number of steps changes neither the batches nor the time of a step, so any serves to find it out.
     one = TrainingConfig(steps=1, **options)
     steps = planned_steps(out, steps_per_epoch(training, one), config, lambda: seconds_per_step(network, training, one))
     return TrainingConfig(steps=steps, **options)
@@ -160,8 +165,10 @@ def planned_steps(folder: Path, epoch: int, config: FitConfig, measure: Callable
     plan = {"asked": asked, "steps": config.epochs * epoch}
     if config.minutes is not None:
         plan["seconds_per_step"] = measure()
+        # At least one step, however short the time: the estimator is then poor, but there is one.
         fitting = int(config.minutes * 60 * (1 - _RESERVE) / plan["seconds_per_step"])
         plan["steps"] = max(1, min(plan["steps"], fitting))
+    # Renamed when it is whole: half a plan would stop every resumption.
     temporary = path.with_suffix(".json.tmp")
     temporary.write_text(json.dumps(plan))
     temporary.replace(path)

@@ -44,6 +44,7 @@ class Journal:
         """Training starts with ``step`` steps done."""
         if step:
             self._display.say(f"resumed at step {step}")
+        # A process may have been killed after it wrote a row and before it saved the checkpoint.
         self._rows = [row for row in _read_rows(self._folder / TABLE) if row["step"] <= step]
         self._display.advance(step, self._planned)
         self._writer = SummaryWriter(str(self._folder / "tensorboard"), purge_step=step + 1)
@@ -57,6 +58,7 @@ class Journal:
         row = _row_of(progress)
         self._rows.append(row)
         self._write_table()
+        # After every epoch, so that a long training can be watched.
         self._display.draw(self._rows, self._folder / CURVES)
         assert self._writer is not None
         for name, value in row.items():

@@ -45,6 +45,7 @@ class Recipe:
 
     def worlds(self, split: Split) -> int:
         """How many worlds of a split are explored; 0 for the splits that training never sees."""
+        # Nothing is learned from worlds of the splits that figures are reported on.
         return {Split.TRAINING: self.training_worlds, Split.VALIDATION: self.validation_worlds}.get(split, 0)
 
 
@@ -60,6 +61,7 @@ def read_recipe(given: str | Path) -> Recipe:
     missing = [name for name in ("environment", "training_worlds", "validation_worlds") if name not in data]
     if missing:
         raise ConfigurationError(f"{path}: {', '.join(missing)} is missing")
+    # The environment first: what is not said is as its family wants it.
     return with_settings(recipe_for(str(data["environment"])), data, str(path))
 
 
@@ -88,6 +90,7 @@ def follow(
     Returns:
         The best parameters.
     """
+    # Both before the fit: it is refused early if the validation worlds cannot be made.
     generator = make(recipe.environment)
     for split in (Split.TRAINING, Split.VALIDATION):
         collect(

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Int32, PRNGKeyArray
 
 from potlp_jax.errors import BatchError
 from potlp_jax.learning.estimator import TrainedEstimator
-from potlp_jax.learning.memory import Views
+from potlp_jax.learning.memory import PanoramaMemory
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy, PolicyFunction, named_policy
 from potlp_jax.task.task import TaskArrays
@@ -122,7 +122,7 @@ def _run(
     views, shared = None, asked
     if isinstance(asked, TrainedEstimator):
         # Parameters are the same in all slots; what a robot has seen is its own.
-        views, shared = asked.start(*first.world.shape).views, asked.params
+        views, shared = asked.start(*first.world.shape).memory, asked.params
     slots: tuple[Scene, Progress] = _empty_slots(first, views, setup, count)
     # Which trial is in which slot is the host's matter; the device knows slots alone.
     held: list[Start | None] = [None] * count
@@ -185,7 +185,7 @@ def _finished(start: Start, progress: Progress, slot: int, seconds: float) -> Fi
     )
 
 
-def _empty_slots(first: Start, views: Views | None, setup: Setup, count: int) -> tuple[Scene, Progress]:
+def _empty_slots(first: Start, views: PanoramaMemory | None, setup: Setup, count: int) -> tuple[Scene, Progress]:
     """Slots without trials, of the shape of ``first``."""
     # Any trial gives the shapes; its values never run, for the slot is marked empty.
     scene, progress = begin(first.world, first.arrays, first.key, views, setup=setup)
@@ -200,7 +200,7 @@ def _fill(
     world: World,
     arrays: TaskArrays,
     key: PRNGKeyArray,
-    views: Views | None,
+    views: PanoramaMemory | None,
     *,
     setup: Setup,
 ) -> tuple[Scene, Progress]:

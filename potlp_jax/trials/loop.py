@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int32, PRNGKeyArray
 
-from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator, identity_of, look
+from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator, identity_of, observe_panorama
 from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.move import Move, MoveKind
@@ -172,7 +172,7 @@ class _Loop:
         at, key = jnp.asarray(cell, jnp.int32), rules.decision_key(self._key, index)
         # Before the decision, so that its estimates know what can be seen from here.
         if isinstance(self._estimator, NetworkEstimator):
-            self._estimator = look(self._estimator, self._robot.panorama(), belief, at)
+            self._estimator = observe_panorama(self._estimator, self._robot.panorama(), belief, at)
         move = _decide(
             belief,
             at,

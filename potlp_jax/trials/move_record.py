@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from potlp_jax.learning.estimator import NetworkEstimator
-from potlp_jax.learning.memory import look_of_subgoals
+from potlp_jax.learning.memory import observation_of_subgoals
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.history import ActionTerms
 from potlp_jax.planning.move import Move, MoveKind
@@ -24,7 +24,7 @@ _KIND_NAMES = {
     MoveKind.OPTIMISTIC: "optimistic",
 }
 
-_observation_numbers = jax.jit(look_of_subgoals)
+_observation_numbers = jax.jit(observation_of_subgoals)
 
 
 def decision_of(
@@ -82,7 +82,7 @@ def _observations(estimator: Estimator | None, move: Move) -> tuple[int, ...]:
     if not isinstance(estimator, NetworkEstimator):
         return ()
     # A subgoal may be out of sight from here and be known from an earlier panorama.
-    numbers = np.asarray(_observation_numbers(estimator.views, move.subgoals))
+    numbers = np.asarray(_observation_numbers(estimator.memory, move.subgoals))
     return tuple(int(number) for number in numbers[np.asarray(move.subgoals.mask)])
 
 

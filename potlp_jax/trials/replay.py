@@ -9,7 +9,7 @@ from jaxtyping import Array, Int32, UInt8
 
 from potlp_jax.codec import config_from_dict
 from potlp_jax.errors import CheckpointError, RecordError
-from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, look
+from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, observe_panorama
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.estimates import Estimator, ask
 from potlp_jax.planning.policies import Policy
@@ -83,7 +83,7 @@ def _replayed_estimator(
     # The decision's own panorama included: it is taken before the decision.
     for decision in trial.decisions[: index + 1]:
         cell = jnp.asarray(decision.cell, jnp.int32)
-        asked = look(asked, panorama_at(trial, decision, config), trial.belief_at(decision.step), cell)
+        asked = observe_panorama(asked, panorama_at(trial, decision, config), trial.belief_at(decision.step), cell)
     return asked
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Int16, Int32, Key, PRNGKeyArray
 
 from potlp_jax.learning.estimator import NetworkEstimator
 from potlp_jax.learning.labels import TrueMapEstimator
-from potlp_jax.learning.memory import Views, remember
+from potlp_jax.learning.memory import PanoramaMemory, remember
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
 from potlp_jax.planning.estimates import Estimates, Estimator, ask
 from potlp_jax.planning.move import Move, MoveKind
@@ -82,7 +82,7 @@ class Progress:
     """
 
     belief: BeliefMap
-    views: Views | None
+    views: PanoramaMemory | None
     first_seen: Int32[Array, "*batch H W"]
     cell: Int32[Array, "*batch 2"]
     path: Int16[Array, "*batch L 2"]
@@ -105,7 +105,7 @@ class Setup:
 
 @partial(jax.jit, static_argnames="setup")
 def begin(
-    world: World, arrays: TaskArrays, key: PRNGKeyArray, views: Views | None, *, setup: Setup
+    world: World, arrays: TaskArrays, key: PRNGKeyArray, views: PanoramaMemory | None, *, setup: Setup
 ) -> tuple[Scene, Progress]:
     """A trial before its first decision; what is visible from the start is known.
 
@@ -232,7 +232,7 @@ def _zeros(leaf: Any) -> Array:
 
 def _consider(
     setup: Setup, asked: Asked, progress: Progress, scene: Scene
-) -> tuple[Views | None, Situation, Estimates | None, PRNGKeyArray]:
+) -> tuple[PanoramaMemory | None, Situation, Estimates | None, PRNGKeyArray]:
     """What every policy is given: the situation, and estimates where it asks for them."""
     running = progress.tally.running
     views = None if setup.network is None else _take_panorama(setup, setup.network, asked, progress, scene)
@@ -258,7 +258,9 @@ def _consider(
     return views, situation, estimates, decision_key(scene.planning, progress.tally.decisions)
 
 
-def _take_panorama(setup: Setup, network: NetworkConfig, asked: Asked, progress: Progress, scene: Scene) -> Views:
+def _take_panorama(
+    setup: Setup, network: NetworkConfig, asked: Asked, progress: Progress, scene: Scene
+) -> PanoramaMemory:
     """What is remembered after a panorama from here."""
     config, running = setup.config, progress.tally.running
     # As ``SimulatedRobot.panorama``.
@@ -272,13 +274,13 @@ def _take_panorama(setup: Setup, network: NetworkConfig, asked: Asked, progress:
     return remember(views, features, progress.belief, progress.cell)
 
 
-def _estimator(setup: Setup, asked: Asked, views: Views | None, scene: Scene) -> Estimator | None:
+def _estimator(setup: Setup, asked: Asked, views: PanoramaMemory | None, scene: Scene) -> Estimator | None:
     """What the policy asks in one slot."""
     # Decided when tracing: each slot has its own map, its own panoramas, or shares what it asks.
     if setup.policy is Policy.ORACLE:
         return TrueMapEstimator(world=scene.world)
     if setup.network is not None and views is not None:
-        return NetworkEstimator(params=asked, views=views, config=setup.network)
+        return NetworkEstimator(params=asked, memory=views, config=setup.network)
     return asked
 
 

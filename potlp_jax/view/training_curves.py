@@ -15,7 +15,7 @@ PANELS: Mapping[str, str] = {
 """What is drawn, by the name in the journal's rows."""
 
 
-def draw_curves(rows: Sequence[Mapping[str, float]], path: Path) -> None:
+def draw_curves(rows: Sequence[Mapping[str, int | float]], path: Path) -> None:
     """Draw each figure over the epochs: of the training batches (augmented) and of the validation data.
 
     Args:

@@ -1,10 +1,16 @@
-"""The memory of panoramas: against a list of all looks, and what happens when it is full."""
+"""The memory of panoramas: against a list of all observations, and what happens when it is full."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from potlp_jax.learning.memory import NO_LOOK, look_of_subgoals, no_views, places_of_looks, remember
+from potlp_jax.learning.memory import (
+    NO_OBSERVATION,
+    empty_memory,
+    observation_of_subgoals,
+    remember,
+    slots_of_observations,
+)
 from potlp_jax.types import Status
 from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy
@@ -36,37 +42,37 @@ def test_line_of_sight_runs_through_known_free_cells():
     rng = np.random.default_rng(0)
     belief = some_belief(rng)
     cell = free_cell(rng, belief)
-    views = remember_jit(no_views(4, FEATURES, 12, 16), jnp.zeros(FEATURES), belief, jnp.asarray(cell))
+    memory = remember_jit(empty_memory(4, FEATURES, 12, 16), jnp.zeros(FEATURES), belief, jnp.asarray(cell))
     opaque = ~np.asarray(belief.free)
     seen = np.zeros(opaque.shape, bool)
     for at in reference_visible(opaque.tolist(), (int(cell[0]), int(cell[1])), 28.0):
         seen[at] = True
-    np.testing.assert_array_equal(np.asarray(views.look_of_cell) == 0, seen & ~opaque)
+    np.testing.assert_array_equal(np.asarray(memory.observation_of_cell) == 0, seen & ~opaque)
 
 
 def test_every_subgoal_is_shown_by_the_last_look_at_its_frontier():
     """Against a list that forgets nothing."""
     rng = np.random.default_rng(1)
-    views, looks = no_views(32, FEATURES, 12, 16), []
+    memory, observations = empty_memory(32, FEATURES, 12, 16), []
     belief = some_belief(rng)
     for number in range(12):
         cell = free_cell(rng, belief)
         features = jnp.full(FEATURES, number, jnp.float32)
-        views = remember_jit(views, features, belief, jnp.asarray(cell))
+        memory = remember_jit(memory, features, belief, jnp.asarray(cell))
         seen = visible_jit(~belief.free, jnp.asarray(cell), config=SensorConfig(range_cells=28.0))
-        looks.append((cell, np.asarray(seen)))
+        observations.append((cell, np.asarray(seen)))
         subgoals = subgoals_of(belief)
-        found = look_of_subgoals(views, subgoals)
+        found = observation_of_subgoals(memory, subgoals)
         for s in range(int(subgoals.mask.sum())):
             component = np.asarray(subgoals.component) == s
-            showing = [n for n, (_, sight) in enumerate(looks) if np.any(sight & component)]
+            showing = [n for n, (_, sight) in enumerate(observations) if np.any(sight & component)]
             expected = showing[-1] if showing else number
             assert int(found[s]) == expected
-            place = int(places_of_looks(views, found)[s])
-            np.testing.assert_array_equal(views.cells[place], looks[expected][0])
-            assert float(views.features[place].min()) == float(views.features[place].max()) == expected
-        assert np.all(np.asarray(found)[~np.asarray(subgoals.mask)] == NO_LOOK)
-    assert int(views.status) == 0
+            place = int(slots_of_observations(memory, found)[s])
+            np.testing.assert_array_equal(memory.cells[place], observations[expected][0])
+            assert float(memory.features[place].min()) == float(memory.features[place].max()) == expected
+        assert np.all(np.asarray(found)[~np.asarray(subgoals.mask)] == NO_OBSERVATION)
+    assert int(memory.status) == 0
 
 
 def corridor(known: int) -> BeliefMap:
@@ -78,15 +84,15 @@ def corridor(known: int) -> BeliefMap:
 
 
 def test_what_no_frontier_refers_to_makes_room():
-    """Three places, eight looks along a corridor whose end was seen from each: only the last is needed."""
-    views = no_views(3, FEATURES, 3, 14)
+    """Three places, eight observations along a corridor whose end was seen from each: only the last is needed."""
+    memory = empty_memory(3, FEATURES, 3, 14)
     for number in range(8):
         belief = corridor(number + 2)
-        views = remember_jit(views, jnp.full(FEATURES, number, jnp.float32), belief, jnp.array([1, number + 1]))
+        memory = remember_jit(memory, jnp.full(FEATURES, number, jnp.float32), belief, jnp.array([1, number + 1]))
         subgoals = subgoals_of(belief)
-        assert int(look_of_subgoals(views, subgoals)[0]) == number
-    assert int(views.status) == 0
-    assert sorted(np.asarray(views.look).tolist()) == [5, 6, 7]
+        assert int(observation_of_subgoals(memory, subgoals)[0]) == number
+    assert int(memory.status) == 0
+    assert sorted(np.asarray(memory.observation).tolist()) == [5, 6, 7]
 
 
 def test_a_full_memory_is_flagged():
@@ -96,14 +102,14 @@ def test_a_full_memory_is_flagged():
     for column in niches:
         cells[1, column], cells[2, column] = BeliefMap.UNKNOWN, BeliefMap.FREE
     belief = belief_from_numpy(cells, np.zeros(cells.shape, np.int32))
-    views = no_views(2, FEATURES, 5, 13)
+    memory = empty_memory(2, FEATURES, 5, 13)
     flags = []
     for column in niches:
-        views = remember_jit(views, jnp.zeros(FEATURES), belief, jnp.array([2, column]))
-        flags.append(int(views.status))
+        memory = remember_jit(memory, jnp.zeros(FEATURES), belief, jnp.array([2, column]))
+        flags.append(int(memory.status))
     assert flags == [0, 0, Status.VIEW_OVERFLOW]
     # The subgoal whose panorama is gone is estimated from the last one.
     subgoals = subgoals_of(belief)
     order = np.asarray(subgoals.cells)[:3, 1]
-    found = np.asarray(look_of_subgoals(views, subgoals))[:3]
+    found = np.asarray(observation_of_subgoals(memory, subgoals))[:3]
     assert {int(c): int(n) for c, n in zip(order, found, strict=True)} == {1: 2, 6: 1, 11: 2}
