@@ -133,6 +133,7 @@ class PolicyFunction(Protocol):
 
 def policy_function(policy: Policy | PolicyFunction) -> PolicyFunction:
     """The function of a policy: that of the name, or the function itself."""
+    # A user's function is called like the library's own: there is one signature.
     if not isinstance(policy, Policy):
         return policy
     if policy.searches:

@@ -186,6 +186,7 @@ def _subgoal_travel(
     travel = jnp.where(subgoals.mask[None, :, None], travel, jnp.inf).reshape(count, states, count, states)
     finish = finish.reshape(count, states)
     subgoal = jnp.arange(count)[:, None]
+    # Where the letter of the subgoal's cell violates the task in a state, there is no path back in that state.
     exists = reentered != NO_STATE
     # An accepting re-entry satisfies the task at once: nothing remains to be paid.
     accepted = exists & task.accepting[reentered]

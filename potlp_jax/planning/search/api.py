@@ -21,7 +21,7 @@ from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.best_first import BEST_FIRST
 from potlp_jax.planning.search.config import SearchConfig, UctConfig
 from potlp_jax.planning.search.graph import Tree
-from potlp_jax.planning.search.lockstep import Search, run_search
+from potlp_jax.planning.search.lockstep import SearchMethod, run_search
 from potlp_jax.planning.search.plan import Plan
 from potlp_jax.planning.search.uct import UCT, UctTree
 
@@ -133,7 +133,7 @@ def _timed(function: Any, *arguments: Any, config: SearchConfig | UctConfig) -> 
     return time.perf_counter() - began, plan, tree
 
 
-def _search_for(config: SearchConfig | UctConfig) -> Search:
+def _search_for(config: SearchConfig | UctConfig) -> SearchMethod:
     return UCT if isinstance(config, UctConfig) else BEST_FIRST
 
 

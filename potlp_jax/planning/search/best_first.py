@@ -33,7 +33,7 @@ from potlp_jax.planning.search.arrays import first_of_least, least_of_each, stat
 from potlp_jax.planning.search.config import SearchConfig
 from potlp_jax.planning.search.graph import NewNode, NodeValues, Tree, add_node, find, plant_tree
 from potlp_jax.planning.search.guess import Rule, guess_outcomes, make_rule
-from potlp_jax.planning.search.lockstep import Search
+from potlp_jax.planning.search.lockstep import SearchMethod
 from potlp_jax.planning.search.model import FAILURE, SUCCESS, Model, make_model
 from potlp_jax.planning.search.plan import Plan, plan_of_least_score
 from potlp_jax.task.relations import transitive_closure
@@ -74,10 +74,10 @@ class Context:
 
 @struct.dataclass(kw_only=True)
 class Path:
-    """Records of a descent by level, for the way up. Levels that a row did not reach hold the spare node.
+    """Records of a descent by level, for the backup. Levels that a row did not reach hold the spare node.
 
     The value of a node depends on the action taken there by ``Q = base + weight * v``, where ``v`` is the value of the
-    outcome that was followed, and on the others by ``rival``; likewise its bound. So the way up needs no lookup.
+    outcome that was followed, and on the others by ``rival``; likewise its bound. So the backup needs no lookup.
 
     Attributes:
       nodes: node left at each level.
@@ -144,7 +144,7 @@ class Descent:
       success: its outcome that was followed.
       expands: True where the row left the graph: the outcome has no node yet.
       accepted: True where the outcome satisfies the task.
-      path: records for the way up.
+      path: records for the backup.
     """
 
     level: Int32[Array, ""]
@@ -245,7 +245,7 @@ def choose(context: Context, tree: Tree) -> Plan:
     return plan_of_least_score(context.model, q_values, q_values, tree.root_visits, bound, tree.status)
 
 
-BEST_FIRST = Search(tree=Tree, prepare=prepare, plant=plant, is_open=is_open, simulate=simulate, choose=choose)
+BEST_FIRST = SearchMethod(tree=Tree, prepare=prepare, plant=plant, is_open=is_open, simulate=simulate, choose=choose)
 
 
 def _root_value(context: Context, tree: Tree) -> tuple[Float32[Array, "B"], Float32[Array, "B"]]:
@@ -294,7 +294,7 @@ def _descend_once(context: Context, tree: Tree, descent: Descent) -> Descent:
     deeper = moves & ~accepted & ~expands
     path = descent.path.record(
         descent.level,
-        # Rows that have ended write to the spare node on the way up.
+        # Rows that have ended write to the spare node during the backup.
         nodes=jnp.where(moves, node, tree.capacity),
         actions=action,
         inside=selection.inside,
@@ -354,7 +354,7 @@ def _select_action(model: Model, tree: Tree, descent: Descent) -> _Selection:
     action, least = first_of_least(score)
     goes_inside = inside[rows, action]
     chosen = jnp.arange(score.shape[1], dtype=jnp.int32)[None, :] == action[:, None]
-    # On the way up the chosen action's Q changes. With the least of the others of its kind, the new minimum is known
+    # During the backup the chosen action's Q changes. With the least of the others of its kind, the new minimum is known
     # without reading the row again.
     rivals = (inside == goes_inside[:, None]) & ~chosen
     rival, rival_bound = (
@@ -440,7 +440,7 @@ def _follow_gap(
     success = chance * (success_value - success_bound) >= (1.0 - chance) * (failure_value - failure_bound)
     # Nothing is to be learnt from satisfying the task, and a certain success cannot fail.
     success = (success & ~accepts) | (chance >= 1.0)
-    # Eq. 3 without the part that the followed outcome contributes: that is added on the way up.
+    # Eq. 3 without the part that the followed outcome contributes: that is added during the backup.
     known = attempt.path_cost + chance * attempt.success_cost + (1.0 - chance) * attempt.failure_cost
     weight, rest = jnp.where(success, chance, 1.0 - chance), jnp.where(success, 1.0 - chance, chance)
     return _Step(

@@ -1,6 +1,6 @@
 """How a search runs: in lockstep on all rows of a batch, to which ``jax.vmap`` is routed.
 
-A search is four verbs on a batch of problems (``Search``). The functions here know nothing of what the verbs do, so
+A search is four verbs on a batch of problems (``SearchMethod``). The functions here know nothing of what the verbs do, so
 that a test can run them on a search of its own.
 """
 
@@ -18,7 +18,7 @@ from potlp_jax.planning.search.plan import Plan
 
 
 @dataclasses.dataclass(frozen=True)
-class Search:
+class SearchMethod:
     """A search as verbs. All arrays have a leading batch axis; every verb is pure.
 
     Attributes:
@@ -39,7 +39,7 @@ class Search:
 
 
 def run_search(
-    search: Search, config: Any, problems: PlanningProblem, seeds: UInt32[Array, "B 2"], trees: Any
+    search: SearchMethod, config: Any, problems: PlanningProblem, seeds: UInt32[Array, "B 2"], trees: Any
 ) -> tuple[Plan, Any]:
     """Search a batch of problems; ``jax.vmap`` of this adds its axis to the batch.
 
@@ -61,7 +61,7 @@ def run_search(
 
 
 @functools.lru_cache(maxsize=64)
-def _routed_kernel(search: Search, config: Any, structure: Any, leaf_count: int) -> Callable[..., Any]:
+def _routed_kernel(search: SearchMethod, config: Any, structure: Any, leaf_count: int) -> Callable[..., Any]:
     """The search on flat lists of arrays with a leading batch axis; vmap merges its own axis into that one.
 
     Flat lists, because the rule of a ``custom_vmap`` receives and returns flags in the structure of its arguments, and
@@ -95,7 +95,7 @@ def _routed_kernel(search: Search, config: Any, structure: Any, leaf_count: int)
 
 @functools.partial(jax.jit, static_argnames=("search", "config"))
 def _search_batch(
-    problems: PlanningProblem, seeds: UInt32[Array, "B 2"], tree: Any, *, search: Search, config: Any
+    problems: PlanningProblem, seeds: UInt32[Array, "B 2"], tree: Any, *, search: SearchMethod, config: Any
 ) -> tuple[Plan, Any]:
     """Simulate until no row is open or the simulations are spent, then choose."""
     # Not part of the tree: a search that goes on prepares again, which costs a fraction of a search.

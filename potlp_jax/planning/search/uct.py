@@ -30,7 +30,7 @@ from potlp_jax.planning.history import ActionTerms, History, terms_of_all
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.arrays import first_of_least, status_of_rows, uniform
 from potlp_jax.planning.search.config import UctConfig
-from potlp_jax.planning.search.lockstep import Search
+from potlp_jax.planning.search.lockstep import SearchMethod
 from potlp_jax.planning.search.model import Model, make_model
 from potlp_jax.planning.search.plan import Plan, plan_of_least_score
 from potlp_jax.types import Status
@@ -134,7 +134,7 @@ class Rollout:
       nodes: node left at each level; the spare node where the row had ended.
       actions: action taken at each level.
       costs: sampled cost of each action, ``D + R_S`` or ``D + R_F``.
-      means: Q of each action before the rollout. Recorded on the way down, so that the way up only writes: XLA then
+      means: Q of each action before the rollout. Recorded on the way down, so that the backup only writes: XLA then
         updates the tree in place.
       visits: rollouts that had taken each action before.
     """
@@ -241,7 +241,7 @@ def choose(context: Context, tree: UctTree) -> Plan:
     return plan_of_least_score(context.model, score, q_values, tree.root_visits, no_bound, tree.status)
 
 
-UCT = Search(tree=UctTree, prepare=prepare, plant=plant, is_open=is_open, simulate=simulate, choose=choose)
+UCT = SearchMethod(tree=UctTree, prepare=prepare, plant=plant, is_open=is_open, simulate=simulate, choose=choose)
 
 
 def _new_q_values(terms: ActionTerms) -> Float32[Array, "B A"]:
