@@ -354,7 +354,7 @@ def _select_action(model: Model, tree: Tree, descent: Descent) -> _Selection:
     action, least = first_of_least(score)
     goes_inside = inside[rows, action]
     chosen = jnp.arange(score.shape[1], dtype=jnp.int32)[None, :] == action[:, None]
-    # During the backup the chosen action's Q changes. With the least of the others of its kind, the new minimum is known
+    # The backup changes the chosen action's Q. With the least of the others of its kind, the new minimum is known
     # without reading the row again.
     rivals = (inside == goes_inside[:, None]) & ~chosen
     rival, rival_bound = (

@@ -1,7 +1,7 @@
 """How a search runs: in lockstep on all rows of a batch, to which ``jax.vmap`` is routed.
 
-A search is four verbs on a batch of problems (``SearchMethod``). The functions here know nothing of what the verbs do, so
-that a test can run them on a search of its own.
+A search is five verbs on a batch of problems (``SearchMethod``). The functions here know nothing of what the verbs do,
+so that a test can run them on a search of its own.
 """
 
 import dataclasses
