@@ -76,7 +76,8 @@ class Counts:
         arguments = [argument for argument in arguments if argument.arg not in ("self", "cls")]
         self.arguments += len(arguments)
         self.annotated += sum(argument.annotation is not None for argument in arguments)
-        if public and len(arguments) >= LONG:
+        # Commands of the command line document each option where it is declared, in its help.
+        if public and len(arguments) >= LONG and not _is_command(node):
             text = ast.get_docstring(node) or ""
             self.long += 1
             self.with_args += "Args:" in text
@@ -92,6 +93,11 @@ class Counts:
             f"{self.long:4} {_share(self.with_args, self.long):>6} {_share(self.with_returns, self.long):>6}   "
             f"{100 * self.comments / max(self.code_lines, 1):5.1f}   {self.code_lines:6}"
         )
+
+
+def _is_command(node: Function) -> bool:
+    calls = [entry.func for entry in node.decorator_list if isinstance(entry, ast.Call)]
+    return any(isinstance(call, ast.Attribute) and call.attr in ("command", "callback") for call in calls)
 
 
 def _returns_nothing(node: Function) -> bool:

@@ -12,7 +12,8 @@ from jaxtyping import PRNGKeyArray
 
 import potlp_jax
 from potlp_jax.planning.commitment import Intention
-from potlp_jax.planning.policies import Move, MoveKind, Situation, move_to
+from potlp_jax.planning.move import Move, MoveKind, move_to
+from potlp_jax.planning.situation import Situation
 
 
 def largest_frontier(

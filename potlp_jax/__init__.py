@@ -26,17 +26,17 @@ if TYPE_CHECKING:
     from potlp_jax.planning.exact.api import Bounds as Bounds
     from potlp_jax.planning.exact.api import bound_exact as bound_exact
     from potlp_jax.planning.exact.api import solve_exact as solve_exact
-    from potlp_jax.planning.policies import DecisionConfig as DecisionConfig
+    from potlp_jax.planning.move import move_to as move_to
     from potlp_jax.planning.policies import Policy as Policy
     from potlp_jax.planning.policies import PolicyFunction as PolicyFunction
     from potlp_jax.planning.policies import decide as decide
-    from potlp_jax.planning.policies import move_to as move_to
     from potlp_jax.planning.problem import PlanningProblem as PlanningProblem
     from potlp_jax.planning.problem import enumerate_actions as enumerate_actions
     from potlp_jax.planning.search.api import Plan as Plan
     from potlp_jax.planning.search.api import plan_actions as plan_actions
     from potlp_jax.planning.search.config import SearchConfig as SearchConfig
     from potlp_jax.planning.search.config import UctConfig as UctConfig
+    from potlp_jax.planning.situation import DecisionConfig as DecisionConfig
     from potlp_jax.rl.episodes import TaskEnv as TaskEnv
     from potlp_jax.task.task import Task as Task
     from potlp_jax.task.task import TaskArrays as TaskArrays
@@ -149,8 +149,10 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "planning.distances.product": ("product_distances", "product_transitions"),
     "planning.estimates": ("Estimates",),
     "planning.exact.api": ("Bounds", "bound_exact", "solve_exact"),
-    "planning.policies": ("DecisionConfig", "Policy", "PolicyFunction", "decide", "move_to"),
+    "planning.move": ("move_to",),
+    "planning.policies": ("Policy", "PolicyFunction", "decide"),
     "planning.problem": ("PlanningProblem", "enumerate_actions"),
+    "planning.situation": ("DecisionConfig",),
     "planning.search.api": ("Plan", "plan_actions"),
     "planning.search.config": ("SearchConfig", "UctConfig"),
     "rl.episodes": ("TaskEnv",),

@@ -31,10 +31,11 @@ from jaxtyping import Array, UInt32
 
 from potlp_jax.planning.decision import decide_from_estimates, frontier_subgoals, subgoals_at
 from potlp_jax.planning.estimates import Estimates
-from potlp_jax.planning.policies import DecisionConfig, Move, MoveKind
+from potlp_jax.planning.move import Move, MoveKind
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions
 from potlp_jax.planning.search.config import SearchConfig, UctConfig
+from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task
 from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL, Status
 from potlp_jax.world.grid import BeliefMap

@@ -11,8 +11,9 @@ from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import BatchError
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
-from potlp_jax.planning.policies import DecisionConfig, Policy
+from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.search.config import SearchConfig
+from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task
 from potlp_jax.trials import batch
 from potlp_jax.trials.batch import Start, run_batch

@@ -18,15 +18,15 @@ from potlp_jax.bench.perception import measure_perception
 from potlp_jax.bench.planner import as_dict, make_scene, mean_depth, measure_distances
 from potlp_jax.bench.problems import family_problem
 from potlp_jax.bench.timing import Timing, compile_call, environment, measure, timed_runs
-from potlp_jax.cache import SWITCH, cache_folder, enable_compilation_cache, machine_fingerprint
+from potlp_jax.cache import LOG_LEVEL, SWITCH, cache_folder, enable_compilation_cache, machine_fingerprint
 from potlp_jax.cli import app
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.environments.toy import Toy
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
-from potlp_jax.planning.policies import DecisionConfig
 from potlp_jax.planning.search.api import search_tree
 from potlp_jax.planning.search.config import SearchConfig
+from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task
 from potlp_jax.world.frontiers import FrontierConfig
 
@@ -39,8 +39,10 @@ def _potlp(*arguments):
 
 def _run(program, **variables):
     """A fresh process on one core's worth of imports; returns what it printed as JSON."""
+    # Importing jax, as this process has, sets a log level of its own for all processes below.
+    inherited = {name: value for name, value in os.environ.items() if name != LOG_LEVEL}
     done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, env={**os.environ, **variables}
+        [sys.executable, "-c", program], capture_output=True, text=True, env={**inherited, **variables}
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout), done.stderr

@@ -1,6 +1,7 @@
 """The command line: what it prints and writes, exit codes, and where its output goes."""
 
 import csv
+import dataclasses
 import gzip
 import json
 import subprocess
@@ -19,7 +20,9 @@ from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.environments.toy import Toy
 from potlp_jax.errors import PotlpError, WorldError
+from potlp_jax.planning import policies
 from potlp_jax.planning.policies import Policy
+from potlp_jax.planning.search.config import SearchConfig, UctConfig
 from potlp_jax.task.task import Task
 from potlp_jax.trials.record import Outcome, load_trial
 from potlp_jax.trials.run import run
@@ -111,6 +114,7 @@ def test_max_positive_literals_reaches_the_task():
         (("run", "toy", "--task", "F dragon"), "dragon"),
         (("run", "toy", "--policy", "clever"), "known-map, baseline"),
         (("run", "toy", "--split", "holiday"), "validation"),
+        (("run", "toy", "--search", "breadth-first"), "best-first, uct"),
         (("run", "toy", "--world", "999999999999"), "--world"),
         (("compare", "toy", "--policies", "oracle,clever"), "clever"),
         (("run", "toy", "--policy", "potlp"), "no estimator is shipped for the propositions goal"),
@@ -183,6 +187,17 @@ def test_environments_and_policies_of_others_are_run_by_their_names():
     data = _json(_potlp("run", *names, "--camera", "examples.own_camera:thermal", "--json"))
     assert (data["environment"], data["policy"]) == (f"{names[0]}/validation", names[2])
     assert data["outcome"] == "satisfied"
+
+
+def test_the_search_is_chosen_by_name_alone_and_in_comparisons(tmp_path):
+    chosen = ("toy", "-t", "2", "--search", "uct", "--simulations", "30", "--out", tmp_path)
+    assert _potlp("run", *chosen, "--policy", "oracle", "--no-animation").exit_code == 0
+    trial = load_trial(tmp_path / "trial.json")
+    assert trial.config["decision"]["search"] == dataclasses.asdict(UctConfig(simulations=30))
+    compared = _json(_potlp("compare", *chosen, "--policies", "oracle", "--trials", "1", "--json"))
+    assert compared["specification"]["settings"]["decision"]["search"]["kind"] == "uct"
+    # The same trial, whether it runs alone or in a sweep.
+    assert compared["cells"][0]["charged"]["rows"][2]["mean_cost"] == pytest.approx(trial.cost)
 
 
 def test_without_an_estimator_the_default_policy_is_the_baseline():
@@ -426,6 +441,7 @@ def test_importing_the_commands_loads_nothing_of_the_library():
         ("potlp run toy --split t", ["training", "test"]),
         ("potlp compare toy --policies oracle,p", ["oracle,potlp"]),
         ("potlp bench --environment del", ["delivery"]),
+        ("potlp run toy --search u", ["uct"]),
         ("potlp sweep ex", ["export"]),
     ],
 )
@@ -457,6 +473,8 @@ def test_completion_loads_nothing_of_the_library():
 def test_completed_names_are_those_of_the_library():
     assert tuple(Policy) == completion.POLICIES
     assert tuple(Split) == completion.SPLITS
+    assert (SearchConfig.kind, UctConfig.kind) == completion.SEARCHES
+    assert policies.GROUP == completion.POLICY_GROUP
     assert {name: tuple(make(name).tasks) for name in NAMED} == dict(completion.TASKS)
 
 

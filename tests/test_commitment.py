@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from potlp_jax.planning.commitment import SAME_WITHIN, Intention, apply_commitment, intention_of
-from potlp_jax.planning.policies import DecisionConfig
 from potlp_jax.planning.search.api import Plan
+from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task
 from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL
 from potlp_jax.world.frontiers import Subgoals

@@ -15,10 +15,12 @@ from potlp_jax.environments.toy import Toy
 from potlp_jax.export import ANY_BATCH, MANIFEST, ExportConfig, export_planner, load_program
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.decision import frontier_subgoals
-from potlp_jax.planning.policies import DecisionConfig, MoveKind, Policy, decide_jit
+from potlp_jax.planning.move import MoveKind
+from potlp_jax.planning.policies import Policy, decide_jit
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import Plan, plan_actions
 from potlp_jax.planning.search.config import SearchConfig
+from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task
 from potlp_jax.types import Status
 from potlp_jax.world.frontiers import FrontierConfig

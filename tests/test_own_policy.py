@@ -10,8 +10,10 @@ from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import PotlpError, RecordError
 from potlp_jax.planning.estimates import Estimates
-from potlp_jax.planning.policies import DecisionConfig, MoveKind, Policy, move_to, search_move
+from potlp_jax.planning.move import MoveKind, move_to
+from potlp_jax.planning.policies import Policy, search_move
 from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task
 from potlp_jax.trials.batch import Start, run_batch
 from potlp_jax.trials.config import TrialConfig

@@ -17,8 +17,10 @@ from potlp_jax.learning.estimator import TrainedEstimator, observe_panorama
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning import policies
-from potlp_jax.planning.policies import DecisionConfig, MoveKind, Policy, decide
+from potlp_jax.planning.move import MoveKind
+from potlp_jax.planning.policies import Policy, decide
 from potlp_jax.planning.search.config import SearchConfig
+from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task, TaskSizes
 from potlp_jax.trials import loop as trial_module
 from potlp_jax.trials import robot

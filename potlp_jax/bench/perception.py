@@ -8,7 +8,8 @@ from potlp_jax.bench.planner import PhaseRow, Phases, Scene, measure_decision, w
 from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator
 from potlp_jax.learning.memory import remember
 from potlp_jax.learning.network import EstimatorNetwork
-from potlp_jax.planning.policies import DecisionConfig, Policy, assess
+from potlp_jax.planning.policies import Policy
+from potlp_jax.planning.situation import DecisionConfig, assess
 from potlp_jax.trials.robot import photograph
 from potlp_jax.world.camera import CameraConfig, Disturbance
 

@@ -20,10 +20,12 @@ from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.distances.paths import shortest_path
 from potlp_jax.planning.distances.product import grid_distances, product_distances, product_transitions
 from potlp_jax.planning.estimates import Estimator, ask
-from potlp_jax.planning.policies import DecisionConfig, Move, Policy, Situation, assess, decide, planning_problem
+from potlp_jax.planning.move import Move
+from potlp_jax.planning.policies import Policy, decide
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions, search
 from potlp_jax.planning.search.config import SearchConfig
+from potlp_jax.planning.situation import DecisionConfig, Situation, assess, planning_problem
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.types import NO_STATE
 from potlp_jax.world.grid import BeliefMap, World

@@ -13,6 +13,7 @@ import typer
 from potlp_jax.cli.group import CommandGroup
 from potlp_jax.cli.output import package_version, set_verbosity
 
+# Warnings are what --quiet silences: what ends a command is no log message but an error of its own.
 _QUIET, _NORMAL, _VERBOSE = logging.ERROR, logging.INFO, logging.DEBUG
 
 app = typer.Typer(
@@ -20,6 +21,7 @@ app = typer.Typer(
     cls=CommandGroup,
     no_args_is_help=True,
     rich_markup_mode="rich",
+    # A traceback is for whoever mends the program, and is easier to send as Python prints it.
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -79,6 +81,7 @@ def potlp(
 
 
 def _keep_compiled_programs() -> None:
+    # Imports jax.
     from potlp_jax.cache import enable_compilation_cache
 
     enable_compilation_cache()

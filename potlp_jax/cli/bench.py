@@ -15,8 +15,9 @@ from potlp_jax.cli.output import console, fail, package_version, print_json, pro
 if TYPE_CHECKING:
     from potlp_jax.bench.planner import DistanceRow, PhaseRow, Scene, SearchRow
     from potlp_jax.learning.estimator import TrainedEstimator
-    from potlp_jax.planning.policies import DecisionConfig
+    from potlp_jax.planning.situation import DecisionConfig
 
+# In the order in which they are measured and shown.
 PARTS = ("search", "distances", "decision", "perception")
 
 app = command_app()
@@ -65,16 +66,18 @@ def run_bench(
     from potlp_jax.bench.planner import make_scene, make_world, measure_search
     from potlp_jax.bench.problems import FAMILIES
     from potlp_jax.bench.timing import environment as describe_environment
-    from potlp_jax.cli.inputs import trial_config
+    from potlp_jax.cli.inputs import setting_changes, trial_config
     from potlp_jax.environments.registry import make
     from potlp_jax.learning.estimator import estimator_for
 
     chosen = _read_parts(parts)
+    # All words are read before anything is measured: measuring takes minutes.
     counts = _read_batches(batches)
     if family not in FAMILIES:
         fail(f"unknown family {family!r}; choose from: {', '.join(FAMILIES)}")
+    # Before anything starts XLA, which counts the cores once and makes a thread for each.
     _pin(core)
-    decision = trial_config(simulations).decision
+    decision = trial_config(setting_changes(simulations=simulations)).decision
     rows: dict[str, list[Any]] = {}
     with progress_bar() as progress:
         bar = progress.add_task("compiling and measuring", total=None)
@@ -141,6 +144,7 @@ def _pin(core: int | None) -> None:
     """Keep the process on one core; XLA, which has not started yet, then uses a single thread."""
     if core is None:
         return
+    # macOS has no such call.
     if not hasattr(os, "sched_setaffinity"):
         fail("--core needs Linux")
     try:
@@ -214,6 +218,7 @@ def _distance_table(rows: "list[DistanceRow]") -> Table:
 def _phase_table(title: str, rows: "list[PhaseRow]") -> Table:
     table = _table(title, "phase", "run", "per second", "working memory", "trace", "compile")
     for row in rows:
+        # None where the backend does not report what memory a program takes.
         memory = row.timing.memory
         table.add_row(
             row.phase,

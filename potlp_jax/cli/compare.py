@@ -15,6 +15,7 @@ from potlp_jax.cli.options import (
     Environment,
     EstimatorName,
     Json,
+    SearchName,
     Simulations,
     SplitName,
     TaskName,
@@ -64,6 +65,7 @@ def compare_policies(
         typer.Option("--out", "-o", help="Folder for the sweep, compare.json, trials.csv, scatter.png and table.txt."),
     ] = None,
     simulations: Simulations = None,
+    search: SearchName = None,
     estimator: EstimatorName = None,
     camera: CameraName = None,
     processes: Annotated[int, typer.Option(min=1, help="Workers, each on a core of its own.")] = 1,
@@ -74,13 +76,15 @@ def compare_policies(
     json: Json = False,
 ) -> None:
     """Compare policies in the same worlds, with the share of attainable savings and its uncertainty."""
-    from potlp_jax.cli.inputs import default_policy, read_names, read_split
+    from potlp_jax.cli.inputs import default_policy, read_names, read_split, setting_changes
     from potlp_jax.environments.registry import make
     from potlp_jax.sweep.specification import specification_from_dict
 
+    # Before any trial runs: minutes later the complaint would cost those minutes.
     if picture is not None and out is None:
         fail("--picture needs --out, the folder in which the picture is written")
     generator = make(environment)
+    # The same entries as in a sweep's file, checked by the same code.
     entries: dict[str, Any] = {
         "environments": [environment],
         "tasks": [task],
@@ -88,7 +92,7 @@ def compare_policies(
         "worlds": trials,
         "split": read_split(split, generator).value,
         "first_world": world,
-        "settings": _settings(simulations, camera),
+        "settings": setting_changes(simulations=simulations, search=search, camera=camera),
     }
     if estimator is not None:
         entries["estimator"] = estimator
@@ -98,6 +102,7 @@ def compare_policies(
         files = _write(results, out)
         if picture is not None:
             files.append(_draw(specification, results, out, picture))
+    # Without a folder the store is needed only until the results are read from it.
     else:
         files = []
         with tempfile.TemporaryDirectory(prefix="potlp-compare-") as folder:
@@ -110,12 +115,6 @@ def compare_policies(
     if out is not None:
         console().print(f"wrote {', '.join(file.name for file in files)} in {out}", markup=False)
         console().print(f"next: potlp report {out}", markup=False, style="dim")
-
-
-def _settings(simulations: int | None, camera: str | None) -> dict[str, Any]:
-    """What the options change of the settings that the environment calls for."""
-    search = {} if simulations is None else {"decision": {"search": {"simulations": simulations}}}
-    return search if camera is None else {**search, "camera": {"renderer": camera}}
 
 
 def _run(specification: "Specification", folder: Path, processes: int) -> "Results":
@@ -157,6 +156,7 @@ def _draw(specification: "Specification", results: "Results", folder: Path, worl
     numbers = [world_of(pair) for pair in cell.pairs]
     if world not in numbers:
         fail(f"--picture {world}: the worlds compared are {', '.join(map(str, numbers))}")
+    # Rows keep no maps. The trials are made again from world and key, and are the same (tests/test_sweep.py).
     sweep, pair = Sweep(specification, folder), cell.pairs[numbers.index(world)]
     # The known map's path shows no exploration, which is what the picture is to compare.
     trials = [sweep.trial(row.item) for policy, row in pair.items() if policy != Policy.KNOWN_MAP]

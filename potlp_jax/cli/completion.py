@@ -25,7 +25,13 @@ TASKS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 """Numbers of the tasks of the environments that need no file."""
 
 POLICIES = ("known-map", "baseline", "optimistic", "oracle", "potlp")
+SEARCHES = ("best-first", "uct")
 SPLITS = ("calibration", "training", "validation", "test")
+
+
+# Of `planning.policies`, where importing it would load jax.
+POLICY_GROUP = "potlp_jax.policies"
+"""Entry points of this group add policies from other packages."""
 
 
 def complete_environment(incomplete: str) -> list[str]:
@@ -42,20 +48,26 @@ def complete_task(ctx: Any, incomplete: str) -> list[str]:
 
 
 def complete_policy(incomplete: str) -> list[str]:
-    """Names of policies."""
-    return _starting(POLICIES, incomplete)
+    """Names of policies, those that other installed packages declare among them."""
+    return _starting([*POLICIES, *entry_points(POLICY_GROUP)], incomplete)
 
 
 def complete_policies(incomplete: str) -> list[str]:
     """Names of policies after those that are there already, joined by commas."""
     *before, last = incomplete.split(",")
-    return [",".join([*before, name]) for name in _starting(POLICIES, last) if name not in before]
+    # The shell replaces the whole word, so that what stands before the last comma is part of every proposal.
+    return [",".join([*before, name]) for name in complete_policy(last) if name not in before]
 
 
 def complete_recipe(incomplete: str) -> list[str]:
     """Shipped recipes."""
     folder = Path(str(resources.files("potlp_jax.recipes"))) / "data"
     return _starting([path.stem for path in sorted(folder.glob("*.yaml"))], incomplete)
+
+
+def complete_search(incomplete: str) -> list[str]:
+    """Names of the searches of policies that search."""
+    return _starting(SEARCHES, incomplete)
 
 
 def complete_split(incomplete: str) -> list[str]:

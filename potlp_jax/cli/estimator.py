@@ -60,6 +60,7 @@ def evaluate_estimator(
     json: Json = False,
 ) -> None:
     """Measure an estimator on worlds it has not seen: skill, calibration, errors of costs."""
+    # Asked before the long imports; without pyarrow the error would name a module instead of what to install.
     if importlib.util.find_spec("pyarrow") is None:
         fail("data sets are Parquet files, and pyarrow is not installed: pip install 'potlp-jax[train]'", FAILED)
     from potlp_jax.codec import finite_or_null
@@ -75,6 +76,7 @@ def evaluate_estimator(
     _warn(metadata, samples)
     folder = None if out is None else make_folder(out)
     predictions = _predict(EstimatorNetwork(config), params, samples, variants)
+    # Skill is measured against this constant; the training data's is honest, since the samples' own would be fitted.
     prior = prior_of(metadata, samples)
     reports = {name: evaluate(samples, entry, prior) for name, entry in predictions.items()}
     found = finite_or_null(
@@ -140,6 +142,7 @@ def _predict(
                 network,
                 params,
                 ablated(samples, name),
+                # Bound now: a closure would show the last bar's progress for all.
                 lambda done, bar=bar: progress.update(bar, completed=done),
             )
     return predictions
@@ -221,6 +224,7 @@ def show_estimator(checkpoint: EstimatorArgument, json: Json = False) -> None:
 
 
 def _fovea(reach: int) -> str:
+    # Estimators without a fovea see the panorama at one resolution.
     if not reach:
         return "nothing"
     from potlp_jax.learning.fovea import ABOVE, BAND, BELOW
@@ -230,12 +234,13 @@ def _fovea(reach: int) -> str:
 
 def _rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     """Names and values for people; what the file does not say is left out."""
+    # Estimators of others may lack any entry of the metadata; those of the network are always there.
     network, metadata = description["network"], description["metadata"]
     data = metadata.get("data", {})
     rows = [
         ("propositions", ", ".join(network["propositions"])),
         ("panorama", " × ".join(map(str, network["image_shape"])) + " pixels"),
-        ("looked at closely", _fovea(network["fovea"])),
+        ("fovea", _fovea(network["fovea"])),
         ("file", f"{description['bytes'] / 1e6:.2f} MB, {description['parameters']:,} parameters"),
         (
             "arithmetic",

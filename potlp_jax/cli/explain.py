@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+# More would not fit: every node at the first depth has as many below it.
 BREADTH: int = 4
 """Actions per node in the picture of a tree."""
 
@@ -75,11 +76,13 @@ def _read_decision(name: str) -> "tuple[Trial, Decision]":
     from potlp_jax.cli.inputs import record_file
     from potlp_jax.trials.record import load_trial
 
+    # The last colon separates: a path may hold others.
     match = re.fullmatch(r"(.+):(\d+)", name)
     if match is None:
         fail(f"{name!r} names no decision; write FOLDER:INDEX or FILE:INDEX, such as out/trial.json:0")
     path, index = Path(match[1]), int(match[2])
     trial = load_trial(record_file(path))
+    # Indices are those of the record, from 0, as on the page and in the animation.
     if index >= len(trial.decisions):
         count = len(trial.decisions)
         known = f"decisions 0 to {count - 1}" if count else "no decisions"
@@ -102,6 +105,7 @@ def _draw(
 
     if not decision.actions:
         fail(f"decision {decision.index} of policy {trial.policy} did not search: there is no tree to draw")
+    # A record keeps the actions of a decision but not the tree. Searching again with its key grows the same tree.
     problem, plan, tree = replay_decision(trial, decision.index, estimator)
     # Where commitment overrode the search, the record holds what the search itself preferred apart.
     if int(plan.action) != (decision.choice if decision.preferred is None else decision.preferred):

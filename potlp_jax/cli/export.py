@@ -12,6 +12,7 @@ from potlp_jax.cli.group import Command, command_app
 from potlp_jax.cli.options import Formula, Json, Propositions, Simulations
 from potlp_jax.cli.output import FAILED, console, fail, make_folder, print_json, progress_bar
 
+# What `jax.export` lowers for; an unknown name would fail deep within it.
 KNOWN_PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 
 app = command_app()
@@ -45,16 +46,17 @@ def export_task(
     json: Json = False,
 ) -> None:
     """Export the planner as programs of plain arrays that run with jax alone."""
-    from potlp_jax.cli.inputs import read_names, trial_config
+    from potlp_jax.cli.inputs import read_names, setting_changes, trial_config
     from potlp_jax.export import MANIFEST, ExportConfig, export_planner
     from potlp_jax.task.reading import read_task
 
+    # A map has both sides or none: with one the other would have to be guessed.
     if (height is None) != (width is None):
         fail("--height and --width go together: the whole decision needs both, the search alone neither")
     config = ExportConfig(
         grid=None if height is None or width is None else (height, width),
         subgoals=subgoals,
-        decision=trial_config(simulations).decision,
+        decision=trial_config(setting_changes(simulations=simulations)).decision,
         batch=_read_batch(batch),
         platforms=_read_platforms(platforms),
     )
@@ -62,10 +64,12 @@ def export_task(
     folder = make_folder(out)
     with progress_bar() as progress:
         progress.add_task("lowering the planner", total=None)
+        # Serialising needs flatbuffers, which only the extra brings; the message names it.
         try:
             files = export_planner(task, folder, config)
         except ModuleNotFoundError as error:
             fail(str(error), FAILED)
+    # Shown from the file rather than from memory: it is what callers of the programs read.
     manifest = json_format.loads((folder / MANIFEST).read_text("utf-8"))
     if json:
         print_json({"files": [str(file) for file in files], "manifest": manifest})

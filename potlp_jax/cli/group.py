@@ -40,6 +40,7 @@ class CommandGroup(TyperGroup):
         """Names in the order of the help."""
         return list(COMMANDS)
 
+    # Contexts and commands are `Any` here: typer brings its own copy of click, or uses an installed one, by version.
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """The command of this name; None where there is none."""
         if cmd_name not in self.commands and cmd_name in COMMANDS:
@@ -62,7 +63,7 @@ class Command(TyperCommand):
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""
         with clear_errors():
-            # Not before here: help and completion get this far only with a command that runs, so jax is needed.
+            # Not earlier: help and completion end before a command is invoked, and must not import jax.
             if ctx.obj is not None and not ctx.find_root().params["no_cache"]:
                 ctx.obj()
             return super().invoke(ctx)
@@ -75,7 +76,11 @@ def command_app(name: str | None = None, about: str | None = None, cls: type[Typ
         name: name of a group of subcommands; None for a single command.
         about: what the subcommands of a group have in common, for its help.
         cls: class of a group.
+
+    Returns:
+        An application for ``COMMANDS``, still without commands.
     """
+    # A group without arguments shows its help; a single command may need none. `potlp` alone installs completion.
     return typer.Typer(
         name=name, cls=cls, help=about, no_args_is_help=name is not None, rich_markup_mode="rich", add_completion=False
     )

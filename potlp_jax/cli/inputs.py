@@ -3,13 +3,15 @@
 Imports the library, so commands import this module inside of their functions.
 """
 
-import dataclasses
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+from potlp_jax.cli.completion import SEARCHES
 from potlp_jax.cli.output import fail
+from potlp_jax.codec import with_settings
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split, default_split, world_key
 from potlp_jax.learning.estimator import TrainedEstimator, named_estimator
@@ -29,6 +31,7 @@ RECORD: str = "trial.json"
 
 def read_names(text: str | None) -> list[str] | None:
     """Names joined by commas; None stays None."""
+    # `a,,b` and `a, b,` are slips of the finger and mean what they seem to mean.
     return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
 
 
@@ -70,35 +73,55 @@ def warn_of_test_worlds() -> None:
 
 
 def make_world(generator: Generator, split: Split, number: int) -> World:
-    """World ``number`` of a split. Raises WorldError where none can be made."""
+    """One world.
+
+    Args:
+        generator: its family.
+        split: from which split.
+        number: within the split, from 0.
+
+    Returns:
+        The world, the same on every machine.
+
+    Raises:
+        WorldError: none can be made.
+    """
+    # Checked here as well as in `world_key`, to name the option that was wrong.
     if number > MAX_INDEX:
         fail(f"--world {number} is too large; the last world is number {MAX_INDEX}")
     return generator.generate(world_key(split, number, generator.name))
 
 
-def trial_config(simulations: int | None, generator: Generator | None = None, camera: str | None = None) -> TrialConfig:
-    """What the options change of the settings of a trial.
+def setting_changes(
+    *, simulations: int | None = None, search: str | None = None, camera: str | None = None
+) -> dict[str, Any]:
+    """What the options change of the settings of a trial, as a sweep's file would say it.
 
     Args:
-        simulations: per decision; None: the default.
-        generator: its worlds say what the other settings are; None: the defaults.
+        simulations: per decision; None: as the search has by default.
+        search: ``best-first`` or ``uct``; None: the first.
         camera: name of a renderer; None: the shipped one.
 
     Returns:
-        The settings.
+        Nested settings for ``trial_config``, or for a sweep's ``settings``.
     """
+    if search is not None and search not in SEARCHES:
+        fail(f"unknown search {search!r}; choose from: {', '.join(SEARCHES)}")
+    searching = {name: value for name, value in (("kind", search), ("simulations", simulations)) if value is not None}
+    changes: dict[str, Any] = {"decision": {"search": searching}} if searching else {}
+    return changes if camera is None else {**changes, "camera": {"renderer": camera}}
+
+
+def trial_config(changes: Mapping[str, Any], generator: Generator | None = None) -> TrialConfig:
+    """Settings of a trial: what the generator's worlds call for (None: the defaults), with some of them changed."""
     config = TrialConfig() if generator is None else trial_config_for(generator)
-    if camera is not None:
-        config = dataclasses.replace(config, camera=dataclasses.replace(config.camera, renderer=camera))
-    if simulations is None:
-        return config
-    search = dataclasses.replace(config.decision.search, simulations=simulations)
-    return dataclasses.replace(config, decision=dataclasses.replace(config.decision, search=search))
+    return with_settings(config, changes)
 
 
 @contextmanager
 def open_store(folder: Path) -> Iterator[Store]:
     """The store of a sweep that has been begun, closed at the end."""
+    # Asked first, because opening a store makes one where there is none.
     if not (folder / RESULTS).is_file():
         fail(
             f"{folder}: there is no sweep in here (no {RESULTS}); begin one with `potlp sweep FILE.yaml --out {folder}`"

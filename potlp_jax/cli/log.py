@@ -11,7 +11,7 @@ from rich.table import Table
 
 from potlp_jax.cli.completion import complete_policy
 from potlp_jax.cli.group import Command, command_app
-from potlp_jax.cli.options import EstimatorName, Json, OpenPage, Simulations, TrialFile
+from potlp_jax.cli.options import EstimatorName, Json, OpenPage, SearchName, Simulations, TrialFile
 from potlp_jax.cli.output import FAILED, console, fail, make_folder, open_page, print_json, progress_bar
 from potlp_jax.cli.view import PAGE
 
@@ -28,6 +28,7 @@ app = command_app(
     "log", "Use what a robot recorded: ROS 1 bags, ROS 2 bags and MCAP. Needs the extra [cyan]logs[/cyan], no ROS."
 )
 
+# How a log is read. Robots differ in topics, frames and cameras, so that every command that reads one has these.
 _BAG_HELP = "A .bag, .mcap or .db3 file, or the folder of a ROS 2 bag."
 BagFile = Annotated[Path, typer.Argument(metavar="BAG", help=_BAG_HELP)]
 BagFiles = Annotated[list[Path], typer.Argument(metavar="BAG...", help=f"{_BAG_HELP} All with one map frame.")]
@@ -41,12 +42,14 @@ ImageTopic = Annotated[
 BaseFrame = Annotated[
     str | None, typer.Option("--base-frame", help="The robot's frame; default: the odometry's child, or base_link.")
 ]
+# Thresholds of nav_msgs/OccupancyGrid, with the defaults of nav2_map_server: between them a cell is unknown.
 Free = Annotated[int, typer.Option("--free", help="Occupancy, in percent, up to which a cell is free.")]
 Occupied = Annotated[int, typer.Option("--occupied", help="Occupancy, in percent, from which it is an obstacle.")]
 Resolution = Annotated[
     float | None, typer.Option("--resolution", help="Metres a cell of the planner; default: 0.2, or the map's.")
 ]
 Radius = Annotated[float, typer.Option("--radius", help="The robot's radius in metres, by which obstacles grow.")]
+# What a bag may not say: where the camera looks, and how much of the sphere a picture covers.
 CameraYaw = Annotated[
     float | None,
     typer.Option(
@@ -102,6 +105,7 @@ def inspect_log(
         print_json(found)
     else:
         _print_inspection(found)
+    # For scripts: a log that is of no use is a failure, whatever there is to print about it.
     if log.bag.damaged or not any(use.startswith("yes") for use in found["uses"].values()):
         raise typer.Exit(FAILED)
 
@@ -154,6 +158,7 @@ def logs_to_dataset(
     from potlp_jax.logs.log import LogConfig
     from potlp_jax.logs.working_grid import GridConfig
 
+    # `office.places.yaml` are the places of office.
     name = labels.name.split(".")[0] if environment is None else environment
     collecting = LogCollectConfig(views_per_world=views, seed=seed, held_out=HELD_OUT.get(name, ()))
     config = LogConfig(
@@ -170,6 +175,7 @@ def logs_to_dataset(
         drives = [_read_drive(bag, labels, config, GridConfig(resolution, radius)) for bag in bags]
         counts = collect_drives(drives, load_places(labels), out, name, split, collecting)
     samples = read_dataset(out)
+    # Read back rather than counted on the way: what is reported is what a training would read.
     holds = samples.success > 0
     summary = {
         "dataset": str(out),
@@ -225,6 +231,7 @@ def replay_log(
         ),
     ] = None,
     simulations: Simulations = None,
+    search: SearchName = None,
     estimator: EstimatorName = None,
     map_topic: MapTopic = None,
     image_topic: ImageTopic = None,
@@ -242,7 +249,7 @@ def replay_log(
     _check_rosbags()
     import jax
 
-    from potlp_jax.cli.inputs import RECORD, read_estimator, trial_config
+    from potlp_jax.cli.inputs import RECORD, read_estimator, setting_changes, trial_config
     from potlp_jax.logs.log import LogConfig
     from potlp_jax.logs.replaying import replay
     from potlp_jax.logs.working_grid import GridConfig
@@ -261,6 +268,7 @@ def replay_log(
         camera_yaw=camera_yaw,
         vertical_field=vertical_field,
     )
+    trial_settings = trial_config(setting_changes(simulations=simulations, search=search))
     drive = _read_drive(bag, labels, config, GridConfig(resolution, radius))
     asked = read_task(drive.tasks.get(task, task), drive.propositions)
     trained = read_estimator(estimator)
@@ -268,7 +276,8 @@ def replay_log(
     folder = make_folder(out)
     with progress_bar() as progress:
         progress.add_task("deciding along the drive (the first decision compiles)", total=None)
-        trial, panoramas = replay(drive, asked, chosen, jax.random.key(0), trial_config(simulations), trained)
+        # The key matters to the search uct alone, and is fixed so that a log gives the same decisions every time.
+        trial, panoramas = replay(drive, asked, chosen, jax.random.key(0), trial_settings, trained)
     files = [folder / RECORD, folder / "trial.png", folder / PAGE]
     trial.save(files[0])
     save_figure(draw_trial(trial), files[1])
@@ -315,10 +324,12 @@ def write_log(
 
     if kind is not None and kind not in list(BagFormat):
         fail(f"unknown format {kind!r}; choose from: {', '.join(BagFormat)}")
+    # ROS 1 bags are files and ROS 2 bags folders, so that the name decides unless --format does.
     by_name = BagFormat.ROS1 if out.suffix == ".bag" else BagFormat.ROS2
     chosen = by_name if kind is None else BagFormat(kind)
     if (chosen is BagFormat.ROS1) != (out.suffix == ".bag"):
         fail(f"--out {out}: a ROS 1 bag is a file that ends in .bag, and a ROS 2 bag a folder that does not")
+    # A bag has no propositions; without the labels beside it, it could not be read back as the same trial.
     labels = out.with_suffix(".labels.yaml")
     count = write_trial(load_trial(record_file(trial)), out, chosen, labels, height)
     console().print(f"wrote {out}: {count} messages", markup=False)
@@ -336,6 +347,7 @@ def _print_inspection(found: dict[str, Any]) -> None:
     for name in ("messages", "a second", "gaps", "longest"):
         table.add_column(name, justify="right")
     for topic in found["topics"]:
+        # A latched map has one message, and so neither rate nor gaps: empty cells, not zeros.
         rate, gaps = topic["rate"], topic["gaps"]
         table.add_row(
             topic["name"],
@@ -404,6 +416,7 @@ def _default_policy(drive: "Drive", trained: "TrainedEstimator | None") -> "Poli
     if trained is None and shipped_estimator(drive.propositions) is None:
         logger.warning(f"no estimator is shipped for {', '.join(drive.propositions)}: the policy is {Policy.BASELINE}")
         return Policy.BASELINE
+    # The network sees nothing without pictures; the baseline needs the map alone.
     if not drive.pictures:
         logger.warning(f"the log has no panorama: the policy is {Policy.BASELINE}")
         return Policy.BASELINE

@@ -27,12 +27,14 @@ if TYPE_CHECKING:
 PLACE_RADIUS: float = 0.5
 """Metres around a point where its proposition is true, unless a radius is given."""
 
+# What fits on a screen beside the rest; passages come narrowest first.
 SHOWN: int = 8
 """Passages, and parts that are cut off, that are printed; JSON has all."""
 
 app = command_app(
     "map", "From a ROS map to a world: inspect, clean, label and look at it. docs/maps.md goes through it."
 )
+# Resolution and radius have the defaults of `map:FILE.yaml` worlds, so that what is inspected is what a trial gets.
 MapFile = Annotated[Path, typer.Argument(metavar="FILE.yaml", help="A map of ROS map_server or nav2_map_server.")]
 Resolution = Annotated[float, typer.Option("--resolution", help="Size of a cell of the working grid, in metres.")]
 Radius = Annotated[float, typer.Option("--radius", help="The robot's radius in metres, by which obstacles grow.")]
@@ -65,6 +67,7 @@ def inspect_map(
     from potlp_jax.environments.ros.map_files import load_map
     from potlp_jax.environments.ros.survey import survey_map
 
+    # What is odd about the file is listed with the map's other defects rather than as notes on stderr.
     with _caught_warnings() as remarks:
         image_map = load_map(file)
     clean = clean_map(image_map, resolution, radius, _read_start(start), "--start")
@@ -95,7 +98,7 @@ def inspect_map(
 
 [cyan]potlp map clean office.yaml --resolution 0.05 --radius 0 --start 1.5,2 --out out/clean.yaml[/cyan]
 
-[dim]map:office.yaml cleans a map in the same way by itself; this is to see, mend or share the result.[/dim]
+[dim]map:office.yaml cleans a map in the same way by itself; this is to see, correct or share the result.[/dim]
 """,
 )
 def write_clean_map(
@@ -112,12 +115,14 @@ def write_clean_map(
     from potlp_jax.environments.ros.map_writer import save_map
 
     image_map = load_map(file)
+    # A cleaned map has lost what was cleaned away, so that it must not replace its source by accident.
     own = {path.resolve() for path in (image_map.settings.file, image_map.settings.image)}
     if own & {out.resolve(), out.with_suffix(".pgm").resolve()}:
         fail(f"--out {out} would overwrite the map itself; give another name")
     clean = clean_map(image_map, resolution, radius, _read_start(start), "--start")
     out.parent.mkdir(parents=True, exist_ok=True)
     image = save_map(out, clean.free, clean.frame)
+    # The map is written with obstacles grown already: growing them again would close passages.
     world = _environment(out, None, resolution, 0.0)
     if json:
         print_json({**_clean_facts(clean, radius), "files": [str(out), str(image)], "world": world})
@@ -177,15 +182,18 @@ def label_map(
     from potlp_jax.environments.ros.places import Places, check_points, load_places, place_letters, save_places
 
     target = file.with_suffix(".places.yaml") if out is None else out
+    # Labels are typed by hand; overwriting them by a repeated command would lose work.
     if target.exists() and not add:
         fail(f"{target} exists: --add adds to it, --out writes another file")
     old = load_places(target) if add else Places(())
     labels = _joined(old, places=place or [], rooms=room or [], tasks=task or [], start=start)
     clean = clean_map(load_map(file), resolution, radius, labels.start, labels.source)
+    # Before anything is written: labels that no robot reaches would make every task impossible.
     check_points(labels, clean.free, clean.frame)
     letters = place_letters(labels, clean.free, clean.frame)
     target.parent.mkdir(parents=True, exist_ok=True)
     save_places(labels, target)
+    # Bit i of a cell's letter is proposition i.
     cells = {name: int((letters >> bit & 1).sum()) for bit, name in enumerate(labels.names)}
     side = clean.frame.resolution
     if json:
@@ -231,6 +239,7 @@ def preview_map(
     from potlp_jax.view.map_preview import draw_map, draw_places
     from potlp_jax.view.style import save_figure
 
+    # Where `map:FILE.yaml` looks for labels too.
     beside = file.with_suffix(".places.yaml")
     found = labels or (beside if beside.is_file() else None)
     if found is None:
@@ -238,6 +247,7 @@ def preview_map(
         clean = clean_map(image_map, resolution, radius)
         figure = draw_map(image_map, clean, _title(file, clean))
     else:
+        # A start that the labels leave open is drawn by the key; any shows where trials may begin.
         family = RosMap(RosMapConfig(file, str(found), resolution, radius))
         figure = draw_places(family, family.generate(jax.random.key(0)), _title(file, family.clean))
     save_figure(figure, out)
@@ -245,7 +255,7 @@ def preview_map(
 
 
 def _environment(file: Path, places: Path | None, resolution: float, radius: float) -> str:
-    """How the command line names the worlds on a map; what is as by default is left out."""
+    """How the command line names the worlds on a map, without options that have their default."""
     from potlp_jax.environments.ros.ros_map import RosMapConfig
 
     chosen = {"resolution": resolution, "radius": radius}
@@ -258,6 +268,7 @@ def _caught_warnings() -> Iterator[list[str]]:
     """The texts of the map's warnings, once the block is done."""
     texts: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
+        # By default Python shows a warning once for each place in the program, however many maps are read.
         warnings.simplefilter("always", MapWarning)
         yield texts
     texts += [str(warning.message) for warning in caught]
@@ -274,6 +285,7 @@ def _map_facts(image_map: "OccupancyMap") -> dict[str, Any]:
         "image": str(settings.image),
         "pixels": [frame.height, frame.width],
         "resolution": frame.resolution,
+        # Products of a resolution such as 0.05 have digits that mean nothing.
         "metres": [round(frame.height * frame.resolution, 6), round(frame.width * frame.resolution, 6)],
         "origin": [frame.x, frame.y],
         "yaw": frame.yaw,
@@ -324,6 +336,7 @@ def _clean_lines(clean: "CleanMap", radius: float) -> Iterator[tuple[str, str]]:
 
 
 def _passage_table(passages: "Sequence[Passage]") -> Table:
+    # The caption says how many are not shown, so that nobody takes the table for all.
     rest = len(passages) - SHOWN
     table = Table(
         title="narrowest passages",
@@ -360,6 +373,7 @@ def _cut_off_lines(clean: "CleanMap") -> Iterator[str]:
     why = "cut off by the size of the cells: use smaller ones"
     for part in clean.cut_off[:SHOWN]:
         yield f"{part.area:.1f} m2 at [{part.at[0]:.2f}, {part.at[1]:.2f}] are {why}"
+    # Parts come largest first, so that those that are only counted are the small ones.
     rest = clean.cut_off[SHOWN:]
     if rest:
         yield f"{len(rest)} smaller parts, {sum(part.area for part in rest):.1f} m2 in all, are {why}"
@@ -373,6 +387,7 @@ def _joined(
     from potlp_jax.task.formula import check_propositions
     from potlp_jax.task.task import Task
 
+    # A name that is given again gets another place: the proposition holds in each of them.
     regions: dict[str, list[Region]] = {name: list(found) for name, found in old.propositions}
     for option in places:
         name, text = _named("--place", option, "NAME=X,Y[,RADIUS]")
@@ -384,6 +399,7 @@ def _joined(
         fail("there is nothing to label: give a --place or a --room")
     names = check_propositions(list(regions))
     formulas = dict(old.tasks) | dict(_named("--task", option, "NAME=FORMULA") for option in tasks)
+    # Compiled only to be checked; labels keep the text.
     for formula in formulas.values():
         Task.of_formula(formula, names)
     return Places(
@@ -433,6 +449,7 @@ def _read_start(text: str | None) -> "Point | None":
 
 def _read_numbers(what: str, text: str) -> list[float]:
     parts = [part.strip() for part in text.split(",")]
+    # `float` would also take "nan", "inf" and "1_0".
     if not all(re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)", part) for part in parts):
         fail(f"{what}: {text!r} are no numbers joined by commas")
     return [float(part) for part in parts]

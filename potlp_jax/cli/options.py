@@ -9,6 +9,7 @@ from potlp_jax.cli.completion import (
     complete_environment,
     complete_policy,
     complete_recipe,
+    complete_search,
     complete_split,
     complete_task,
 )
@@ -16,7 +17,7 @@ from potlp_jax.cli.completion import (
 Json = Annotated[bool, typer.Option("--json", help="Write JSON, and nothing else, to stdout.")]
 OpenPage = Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")]
 
-# What runs.
+# Which trial: environment, task, policy and world. Commands that have these give them the same short names.
 Environment = Annotated[
     str,
     typer.Argument(
@@ -57,9 +58,19 @@ SplitName = Annotated[
         autocompletion=complete_split,
     ),
 ]
+# Not called a seed: worlds of a split are numbered, and seeds are of what a trial draws.
 WorldNumber = Annotated[int, typer.Option("--world", "-w", min=0, help="Number of the world in the split.")]
 Simulations = Annotated[
     int | None, typer.Option("--simulations", min=1, help="Simulations per decision of policies that search.")
+]
+SearchName = Annotated[
+    str | None,
+    typer.Option(
+        "--search",
+        help="best-first (the default) or uct, the search as published; of policies that search.",
+        show_default=False,
+        autocompletion=complete_search,
+    ),
 ]
 EstimatorName = Annotated[
     str | None,
@@ -75,7 +86,7 @@ CameraName = Annotated[
     typer.Option("--camera", metavar="NAME", help="module:attribute of a camera of your own.", show_default=False),
 ]
 
-# Tasks without an environment.
+# A task on its own, without an environment that names its propositions.
 Formula = Annotated[
     str,
     typer.Argument(

@@ -21,12 +21,15 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+# Exit codes, as the help of `potlp` lists them. 130 is what the shell reports after an interrupt.
 FAILED = 1
 BAD_INPUT = 2
 
 
 def console() -> Console:
     """Where results go; what is no terminal gets lines as long as they need to be."""
+    # Rich colours numbers and paths wherever it sees them; here colour has a meaning. In a pipe Rich would wrap tables
+    # at 80 columns, where whoever reads them next wants whole lines.
     output = Console(highlight=False)
     return output if output.is_terminal else Console(highlight=False, width=160)
 
@@ -45,11 +48,13 @@ def package_version() -> str:
 
 def to_json(data: Any) -> str:
     """A JSON document; infinities and NaN are refused."""
+    # NaN and Infinity are no JSON: a parser other than Python's would refuse the document.
     return json.dumps(data, indent=2, allow_nan=False)
 
 
 def print_json(data: Any) -> None:
     """One JSON document on stdout."""
+    # Not through Rich, which would wrap long lines within strings.
     typer.echo(to_json(data))
 
 
@@ -66,6 +71,7 @@ def set_verbosity(level: int) -> None:
     """Show the package's log messages from this level on; progress is shown from ``logging.INFO`` on."""
     package = logging.getLogger("potlp_jax")
     package.setLevel(level)
+    # The handler stays for the process; commands that run one after another must not each add one.
     if not any(isinstance(handler, _Messages) for handler in package.handlers):
         package.addHandler(_Messages())
 
@@ -88,10 +94,12 @@ def clear_errors() -> Iterator[None]:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             yield
+    # All errors that the library raises about what it was given derive from this one; any other is a fault of the
+    # program and keeps its traceback.
     except PotlpError as error:
         fail(str(error))
     except OSError as error:
-        # An error of the system that is about no file is a fault of the program: its traceback is needed.
+        # An error of the system that is about no file is such a fault too.
         if error.filename is None:
             raise
         fail(f"{error.filename}: {error.strerror}", FAILED)
@@ -103,6 +111,7 @@ def _show_warning(
     """A warning about the user's input as a note, without the place in the program; any other as Python shows it."""
     if issubclass(category, PotlpWarning):
         logger.warning(message)
+    # Warnings of other libraries keep file and line, without which they say little.
     else:
         logger.warning(warnings.formatwarning(message, category, filename, lineno))
 
@@ -111,6 +120,7 @@ def progress_bar() -> "Progress":
     """A progress display on stderr that leaves nothing behind; silent with --quiet and where stderr is no terminal."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+    # On stderr, so that stdout holds results alone and can go to a file or a pipe.
     terminal = error_console()
     return Progress(
         SpinnerColumn(),

@@ -48,11 +48,13 @@ def write_report(
 
     with open_store(folder) as store:
         facts = store.facts()
+    # A browser goes by the name: a page called .htm or .txt would be shown as text, or not at all.
     page = out or folder / PAGE
     if page.suffix != ".html":
         fail(f"--out {page}: give a name that ends in .html")
+    # The sweep of the store itself, whatever the file that began it says by now.
     sweep = Sweep(specification_from_store(facts["specification"]), folder)
-    policies = [policy.value for policy in sweep.specification.policies]
+    policies = list(sweep.specification.policies)
     cells: list[Cell] = []
     rows: list[Row] = []
     with progress_bar() as progress:
@@ -72,6 +74,7 @@ def write_report(
 
 def _subject(policies: Sequence[str]) -> str:
     """The policy whose trials are looked at: PO-TLP where it took part, otherwise the last."""
+    # Savings need another policy than the two they are measured between; of several the last named is on trial.
     return "potlp" if "potlp" in policies else policies[-1]
 
 

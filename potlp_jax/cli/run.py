@@ -13,6 +13,7 @@ from potlp_jax.cli.options import (
     EstimatorName,
     Json,
     PolicyName,
+    SearchName,
     Simulations,
     SplitName,
     TaskName,
@@ -32,15 +33,8 @@ logger = logging.getLogger(__name__)
 WORLDS_TRIED: int = 20
 """Worlds in which to look for one where the task is possible, after one where it is not."""
 
-_SHOWN = {
-    "task": "task",
-    "environment": "environment",
-    "world": "seed",  # the record's word for a world's number
-    "policy": "policy",
-    "steps": "steps",
-    "decisions": "decisions",
-    "fallbacks": "fallbacks",
-}
+# In this order, below the outcome.
+_SHOWN = ("task", "environment", "world", "policy", "steps", "decisions", "fallbacks")
 
 app = command_app()
 
@@ -71,6 +65,7 @@ def run_one(
     ] = None,
     animation: Annotated[bool, typer.Option(help="Make the animation, the slowest of the three files.")] = True,
     simulations: Simulations = None,
+    search: SearchName = None,
     estimator: EstimatorName = None,
     camera: CameraName = None,
     json: Json = False,
@@ -81,6 +76,7 @@ def run_one(
         make_world,
         read_estimator,
         read_split,
+        setting_changes,
         trial_config,
     )
     from potlp_jax.environments.registry import make
@@ -95,7 +91,7 @@ def run_one(
     trained = read_estimator(estimator)
     asked = generator.task(task)
     made = make_world(generator, chosen_split, world)
-    config = trial_config(simulations, generator, camera)
+    config = trial_config(setting_changes(simulations=simulations, search=search, camera=camera), generator)
     folder = None if out is None else make_folder(out)
     with progress_bar() as progress:
         progress.add_task("running the trial (the first decision compiles the planner)", total=None)
@@ -109,11 +105,13 @@ def run_one(
             seed=world,
             estimator=trained,
         )
+    # The record first: should drawing fail, the trial is not lost.
     files = [] if folder is None else _write(trial, folder, animation)
     if json:
         print_json({**trial.summary(), "files": [str(file) for file in files]})
     else:
         _print(trial, files)
+    # After the result, because finding out may take a while: each world that is tried is made first.
     if trial.outcome is Outcome.INFEASIBLE:
         logger.warning(_why_infeasible(generator, chosen_split, asked, config, world=world))
     if trial.outcome is not Outcome.SATISFIED:
@@ -136,6 +134,7 @@ def _why_infeasible(generator: "Generator", split: "Split", task: "Task", config
 
     if is_possible(world):
         return "with the whole map the task is possible in this world: the policy went where it cannot be satisfied"
+    # As many as tell a task that is impossible everywhere from a few unlucky worlds.
     following = range(world + 1, min(world + WORLDS_TRIED, MAX_INDEX) + 1)
     other = next((number for number in following if is_possible(number)), None)
     if other is None:
@@ -170,8 +169,8 @@ def _print(trial: "Trial", files: list[Path]) -> None:
     colour = "green" if trial.outcome is Outcome.SATISFIED else "red"
     out.print(f"[bold {colour}]{trial.outcome.value}[/]  cost {trial.cost:.2f}")
     summary = trial.summary()
-    for label, name in _SHOWN.items():
-        out.print(f"{label:12} {summary[name]}", markup=False)
+    for name in _SHOWN:
+        out.print(f"{name:12} {summary[name]}", markup=False)
     if trial.status:
         flags = ", ".join(status_names(trial.status)).replace("_", " ")
         out.print(f"{'status':12} {flags}", markup=False)

@@ -33,6 +33,7 @@ class _RunByDefault(TyperGroup):
     """A group whose first command runs where none is named: `potlp sweep FILE.yaml`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        # A file called `show` would have to be written ./show.
         if args and not args[0].startswith("-") and args[0] not in self.commands:
             args = [next(iter(self.commands)), *args]
         return super().parse_args(ctx, args)
@@ -76,6 +77,7 @@ def run(
     if specification.split is Split.TEST:
         warn_of_test_worlds()
     run_reported(specification, make_folder(out), processes)
+    # From the store, so that a sweep shows the same tables whether it has just ended or is shown again.
     show(out, json)
 
 
@@ -95,9 +97,16 @@ def show(folder: SweepFolder, json: Json = False) -> None:
 
 
 def run_reported(specification: "Specification", folder: Path, processes: int | None) -> None:
-    """Run what is missing of a sweep, with progress on stderr; ``processes`` None: one per core."""
+    """Run what is missing of a sweep, with progress on stderr.
+
+    Args:
+        specification: what to run.
+        folder: of the store.
+        processes: workers; None: one per core.
+    """
     from potlp_jax.sweep.runner import run_sweep
 
+    # The cores that this process may use, which on a cluster are fewer than the machine has.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     run_sweep(specification, folder, processes or cores, _Reporter().report)
 
@@ -106,6 +115,7 @@ class _Reporter:
     """Progress on stderr: a bar on a terminal, otherwise a line now and then; with the rate and the time remaining."""
 
     def __init__(self) -> None:
+        # Of the monotonic clock: a clock that is set while a sweep runs must not change the rate.
         self._start, self._done_before, self._last_line = time.monotonic(), -1, 0.0
         self._bar = progress_bar()
         self._task: Any = None
@@ -123,6 +133,7 @@ class _Reporter:
         if self._bar.disable and (finished or now - self._last_line >= SECONDS_BETWEEN_LINES):
             self._last_line = now
             logger.info(f"{progress.done} of {progress.total} trials{text}")
+        # A bar that is left running would keep the terminal's cursor hidden.
         if finished:
             self._bar.stop()
 
@@ -140,7 +151,13 @@ def _duration(seconds: float) -> str:
 
 
 def print_cell(out: Console, cell: "CellResults", split: str) -> None:
-    """The results of one environment and task: a heading, one table, and what qualifies it."""
+    """Print the results of one environment and task: a heading, one table, and what qualifies it.
+
+    Args:
+        out: a terminal, or a file.
+        cell: the results.
+        split: from which the worlds are, for the heading.
+    """
     from potlp_jax.view.comparisons import comparison_table, remark_lines
 
     redrawn = f", {cell.redrawn} impossible ones left out" if cell.redrawn else ""
@@ -173,6 +190,7 @@ def export(
 
 def _flat(row: "Row") -> dict[str, Any]:
     """One level of plain values."""
+    # Keys and versions as text: CSV has no lists, and Parquet's would differ from row to row.
     values = dataclasses.asdict(row)
     item = values.pop("item")
     values |= {"key": " ".join(map(str, row.key)), "versions": json_module.dumps(values["versions"], sort_keys=True)}
@@ -180,6 +198,7 @@ def _flat(row: "Row") -> dict[str, Any]:
 
 
 def _write_csv(rows: list[dict[str, Any]], file: Path) -> None:
+    # A sweep without a finished trial is an empty table, not an error.
     names = list(rows[0]) if rows else ["environment", "task", "policy", "world"]
     with file.open("w", encoding="utf-8", newline="") as opened:
         writer = csv.DictWriter(opened, names)

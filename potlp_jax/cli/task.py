@@ -67,6 +67,7 @@ def _states(description: dict[str, Any]) -> Table:
     table.add_column("role")
     table.add_column("to", justify="right")
     table.add_column("when")
+    # State and role on the first line of each state alone, so that a state reads as one block.
     for state in range(description["states"]):
         moves = [move for move in description["transitions"] if move["from"] == state]
         for line, move in enumerate(moves):

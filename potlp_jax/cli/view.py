@@ -41,6 +41,7 @@ def view_trial(
     from potlp_jax.trials.replay import panoramas_of
     from potlp_jax.view.replay_page import replay_page
 
+    # Panoramas are not in the record: they are rendered again from its world.
     file = record_file(trial)
     recorded = load_trial(file)
     page = out or file.with_name(PAGE)

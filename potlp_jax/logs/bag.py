@@ -28,6 +28,7 @@ from potlp_jax.errors import LogError
 FORMATS = {".bag": "ROS 1 bag", ".db3": "ROS 2 bag (sqlite3)", ".mcap": "MCAP"}
 """Formats by the ending of their files."""
 
+# First and last bytes of an MCAP file.
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x03, 0x04, 0x05, 0x06
 """Records of an MCAP file that lead to messages."""
@@ -68,6 +69,7 @@ class Bag:
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Messages of some topics, by time in a whole bag, as they stand in the file in a damaged one."""
+        # The library sorts by time; a scan gives what it finds where it finds it.
         source = _scan(self.path) if self.damaged else _read(self.path)
         return (message for message in source if message.topic in topics)
 
@@ -81,17 +83,21 @@ def open_bag(path: Path) -> Bag:
     files = _files(path)
     ending = files[0].suffix
     damaged, problems = False, []
+    # The whole bag is read once in any case, to know its topics and times: damage shows on the way.
     topics, times, error = _count(lambda: _read(path))
     if error is not None:
         damaged = True
+        # The file says how much there was; the scan says how much there is.
         expected = _expected_count(path)
         topics, times, scan_error = _count(lambda: _scan(path))
         found = sum(map(len, times.values()))
+        # The scan often fails for the same reason as the library: said once.
         why = "; ".join(dict.fromkeys(filter(None, (error, scan_error))))
         problems.append(f"damaged or cut short ({why}): {found} messages could be read, {_lost(found, expected)}")
     if not any(times.values()):
         why = f" ({problems[0]})" if problems else ""
         raise LogError(f"{path}: holds no message{why}; record it again")
+    # A folder is a ROS 2 bag whatever its storage; a lone .mcap file may come from anywhere.
     is_folder = path.is_dir() or len(files) > 1
     name = f"ROS 2 bag ({'MCAP' if ending == '.mcap' else 'sqlite3'})" if is_folder else FORMATS[ending]
     return Bag(path, name, ending == ".bag", topics, times, tuple(problems), damaged)
@@ -111,6 +117,7 @@ def _files(path: Path) -> list[Path]:
         if path.suffix not in FORMATS:
             raise LogError(f"{path}: {path.suffix or 'no ending'} is no format of logs; known are {', '.join(FORMATS)}")
         return [path]
+    # Sorted by name: recordings that were split are numbered.
     files = [file for ending in (".db3", ".mcap") for file in sorted(path.glob(f"*{ending}"))]
     if not files:
         raise LogError(f"{path}: is no ROS 2 bag, for there is no .db3 or .mcap file in it")
@@ -139,6 +146,7 @@ def _count(
 
 def _read(path: Path) -> Iterator[RawMessage]:
     """All messages of a whole bag, by time."""
+    # ROS 1 has a file format of its own; both kinds of ROS 2 storage share a reader.
     with Rosbag1Reader(path) if path.suffix == ".bag" else Rosbag2Reader(path) as reader:
         for connection, time, data in reader.messages():
             yield RawMessage(connection.topic, connection.msgtype, time, bytes(data))
@@ -170,6 +178,7 @@ def _scan_rosbag1(file: Path) -> Iterator[RawMessage]:
     with file.open("rb") as stream:
         if stream.readline() != b"#ROSBAG V2.0\n":
             raise LogError(f"{file}: is no ROS 1 bag of version 2.0")
+        # Messages stand in chunks. Records outside of them are indices, which a killed recording does not have.
         for header, data in _rosbag1_records(stream):
             if header.get_uint8("op") != RecordType.CHUNK:
                 continue
@@ -183,6 +192,7 @@ def _messages_of_chunk(content: bytes, connections: dict[int, tuple[str, str]]) 
     for header, data in _rosbag1_records(BytesIO(content)):
         kind, number = header.get_uint8("op"), header.get_uint32("conn")
         if kind == RecordType.CONNECTION:
+            # A connection's data is itself a header, without its length in front.
             fields = Header.read(BytesIO(struct.pack("<L", len(data)) + data))
             connections[number] = header.get_string("topic"), normalize_msgtype(fields.get_string("type"))
         elif kind == RecordType.MSGDATA and number in connections:
@@ -197,12 +207,14 @@ def _rosbag1_records(stream: BufferedReader | BytesIO) -> Iterator[tuple[Header,
             header = Header.read(stream)
             size = read_uint32(stream)
             position = stream.tell()
+        # Never raises: what was found so far is worth more than what is wrong with the rest.
         # The end, or nothing that can be made sense of.
         except Exception:
             return
         try:
             yield header, read_bytes(stream, size)
         except Exception:
+            # A chunk that is cut short is handed on as far as it goes: it may hold whole messages.
             stream.seek(position)
             if header.get("op") == bytes([RecordType.CHUNK]):
                 yield header, stream.read()
@@ -219,6 +231,7 @@ def _scan_mcap(file: Path) -> Iterator[RawMessage]:
 def _messages_of_mcap(
     stream: BufferedReader | BytesIO, schemas: dict[int, str], channels: dict[int, tuple[str, str]]
 ) -> Iterator[RawMessage]:
+    # Schemas and channels come before the messages that need them, within chunks too: both are carried along.
     for kind, record in _mcap_records(stream):
         content = BytesIO(record)
         if kind == _SCHEMA:
@@ -242,6 +255,7 @@ def _chunk_of_mcap(content: BytesIO) -> bytes:
     _, _, size, crc = struct.unpack("<QQQI", read_exact(content, 28))
     compression = read_string(content)
     (stored,) = struct.unpack("<Q", read_exact(content, 8))
+    # Compressed data that is cut short cannot be unpacked, uncompressed data can be used as far as it goes.
     data = content.read(stored)
     return data if len(data) < stored and not compression else decompress(data, compression, size, crc)
 
@@ -249,6 +263,7 @@ def _chunk_of_mcap(content: BytesIO) -> bytes:
 def _mcap_records(stream: BufferedReader | BytesIO) -> Iterator[tuple[int, bytes]]:
     """Kind and content of the records until the stream ends; of a chunk that is cut short what there is."""
     while True:
+        # One byte of kind, eight of length.
         head = stream.read(9)
         if len(head) < 9:
             return
@@ -270,6 +285,7 @@ def _scan_sqlite(file: Path) -> Iterator[RawMessage]:
             number: (name, kind) for number, name, kind in connection.execute("SELECT id, name, type FROM topics")
         }
         rows = "SELECT id, topic_id, timestamp, data FROM messages NOT INDEXED"
+        # Rowids grow with time, and reading by id needs no index, which may be what is damaged.
         last = -1
         with contextlib.suppress(sqlite3.DatabaseError):
             for number, topic, time, data in connection.execute(f"{rows} ORDER BY id"):

@@ -35,14 +35,27 @@ def poses_of(drive: Drive) -> Iterator[recording.Pose]:
 def collect_drives(
     drives: Sequence[Drive], places: Places, folder: Path, environment: str, split: str, config: LogCollectConfig
 ) -> list[int]:
-    """Write a dataset with a shard for each drive; returns the number of views of each.
+    """Write a dataset with a shard for each drive.
+
+    Args:
+        drives: with cells of one size.
+        places: where the propositions are.
+        folder: without a dataset.
+        environment: name of the dataset's environment.
+        split: name of the dataset's split.
+        config: what is recorded.
+
+    Returns:
+        The number of views of each drive.
 
     Raises:
         LogError: no drive, the drives have cells of different sizes, or not one has a picture.
         DatasetError: there is a dataset in the folder already.
     """
+    # Shards are numbered by log: adding to a dataset would mix numbers and draws.
     if finished_shards(folder):
         raise DatasetError(f"{folder} holds a dataset: choose an empty folder, and give all bags at once")
+    # The network counts in metres, but labels of one dataset share one size of cells.
     resolutions = sorted({float(drive.world.resolution) for drive in drives})
     if len(resolutions) != 1:
         raise LogError(f"the logs have cells of {resolutions} m: give one --resolution for all")
@@ -54,6 +67,7 @@ def collect_drives(
     tasks = TaskDistribution(places.names, config.held_out)
     metadata = _metadata(drives, places, environment, split, config)
     counts = []
+    # A shard per drive, with draws of its own: the order of the others does not matter.
     for number, drive in enumerate(drives):
         recorder = recording.Recorder(number, config, WeightBounds(**metadata.weights))
         rng, pool = recording.draws_of_world(config, split, number, tasks)
@@ -77,6 +91,7 @@ def _metadata(
     drives: Sequence[Drive], places: Places, environment: str, split: str, config: LogCollectConfig
 ) -> DatasetMetadata:
     resolution = float(drives[0].world.resolution)
+    # Weights are bounded by the largest map, so that all shards share them.
     height, width = (max(drive.world.shape[axis] for drive in drives) for axis in (0, 1))
     return recording.recording_metadata(
         config,

@@ -69,7 +69,8 @@ class Drive:
         return belief_seen_by(self.world, self.first_seen, step)
 
     def unexplored(self) -> Bool[np.ndarray, "H W"]:
-        """Free cells beside what was never seen, in components that are large enough to be a way on."""
+        """Free cells beside what was never seen, in components that are large enough to lead on."""
+        # As a frontier of a robot that knows all that the final map does.
         truth = BeliefMap.revealed(self.world)
         cells = jnp.where(jnp.asarray(self.seen), truth.cells, jnp.int8(BeliefMap.UNKNOWN))
         edge = np.asarray(frontier_cells(replace(truth, cells=cells), ~self.world.occupied))
@@ -96,10 +97,12 @@ class PanoramaReader:
         image = None if picture is None else self._read(picture.index)
         if image is None:
             return None
+        # The picture's own size, for a topic may change it.
         field = vertical_field(image.shape[1], image.shape[0], self._drive.log)
         return from_equirectangular(image, self._camera, self._drive.bearings[step], field)
 
     def _read(self, index: int) -> UInt8[np.ndarray, "h w 3"] | None:
+        # Bags are read forward only. A step backward, rare in a drive, begins again.
         if index < self._index:
             self._stream, self._index = self._drive.log.read_pictures(), -1
         while self._index < index:
@@ -108,18 +111,28 @@ class PanoramaReader:
 
 
 def read_drive(log: Log, places: Places, config: GridConfig = GridConfig()) -> Drive:
-    """The drive of a log, with the propositions where ``places`` puts them.
+    """The drive of a log.
+
+    Args:
+        log: with a map and poses.
+        places: where the propositions are.
+        config: size of the planner's cells and radius of the robot.
+
+    Returns:
+        The drive, with notes on what is doubtful.
 
     Raises:
         LogError: there is no map, or no pose in its frame, or the robot was never on it.
         MapError: a region lies where the log shows no free cell.
     """
+    # Everything doubtful is collected and handed on with the drive: a log is seldom perfect and often good enough.
     notes = list(log.problems)
     grid = WorkingGrid(_final_map(log), log, config)
     poses = read_poses(log, notes)
     path, entered = drive_path(poses, grid, log, config.radius, notes)
     letters = _letters(places, grid, notes)
     first_seen, start = _first_seen(log, grid, path, poses.times[entered], notes)
+    # Before the first map nothing was known, and no policy could have decided.
     path, times = path[start:], poses.times[entered][start:]
     pictures, bearings = match_pictures(log, poses, path, times, grid.frame, notes)
     return Drive(
@@ -148,6 +161,7 @@ def _final_map(log: Log) -> MapMessage:
             else f"{log.path}: has no map: record a topic of type nav_msgs/OccupancyGrid, such as /map; it has: "
             + ", ".join(f"{topic} ({kind})" for topic, kind in sorted(log.bag.topics.items()))
         )
+    # A map without free cells or without obstacles is nearly always one with other thresholds.
     for kind, pixels, option in (
         ("nothing free", final.free(log.config), "--free"),
         ("no obstacle", final.obstacles(log.config), "--occupied"),
@@ -165,6 +179,7 @@ def _first_seen(
     log: Log, grid: WorkingGrid, path: list[Cell], times: Int64[np.ndarray, "N"], notes: list[str]
 ) -> tuple[Int32[np.ndarray, "H W"], int]:
     """Index into the path from its ``start`` on, the second value, at which each cell was first known."""
+    # Maps come with the time at which they were received: that is when the robot knew.
     number, heads, corrected = grid.first_known(log.read_maps())
     if corrected > CORRECTED_SHARE:
         notes.append(
@@ -172,7 +187,9 @@ def _first_seen(
             "for what was seen from the start"
         )
     received = np.array([head.time for head in heads])
+    # The last cell entered before the first map is where the drive begins.
     start = max(int(np.searchsorted(times, received.min(), side="right")) - 1, 0)
+    # From times of maps to indices into the path: a map belongs to the cell in which it was received.
     steps = np.clip(np.searchsorted(times[start:], received, side="right") - 1, 0, None).astype(np.int32)
     if len(np.unique(steps)) == 1:
         notes.append(
@@ -189,6 +206,7 @@ def _first_seen(
 def _letters(places: Places, grid: WorkingGrid, notes: list[str]) -> Int32[np.ndarray, "H W"]:
     """Letters of free cells; regions in what the log never saw are left out, with a note."""
     kept = []
+    # A region that was never seen is no error: the drive may have ended before.
     for name, regions in places.propositions:
         seen = tuple(region for region in regions if region.covers(grid.seen, grid.frame).any())
         if len(seen) < len(regions):

@@ -28,12 +28,14 @@ _NOT_READ = {
 
 def inspect(log: Log) -> dict[str, Any]:
     """A description of a log, JSON-able: topics, span, map, pose, pictures, uses and problems."""
+    # All topics, also those that nothing here reads: the span is the recording's.
     times = [time for received in log.bag.times.values() for time in received]
     pose = _pose_problem(log)
     picture = _picture_problem(log)
     missing_map = None if log.last_map is not None else f"no map: record a topic of type {MAP_TYPE}"
+    # What is missing is named in full, so that the report alone tells what to record.
     replay = "; ".join(filter(None, (missing_map, pose)))
-    looking = "; ".join(filter(None, (missing_map, pose, picture)))
+    with_panoramas = "; ".join(filter(None, (missing_map, pose, picture)))
     return {
         "bag": str(log.path),
         "format": log.bag.format,
@@ -46,20 +48,23 @@ def inspect(log: Log) -> dict[str, Any]:
         "pictures": _pictures(log),
         "uses": {
             "replay without pictures (baseline, optimistic, oracle)": replay or "yes",
-            "replay of potlp": looking or "yes, where an estimator knows the propositions",
-            "to-dataset": looking or "yes",
+            "replay of potlp": with_panoramas or "yes, where an estimator knows the propositions",
+            "to-dataset": with_panoramas or "yes",
         },
         "problems": list(log.problems),
     }
 
 
 def _topic(log: Log, name: str) -> dict[str, Any]:
+    # Sorted: damaged bags are not in order.
     kind, received = log.bag.topics[name], np.sort(np.array(log.bag.times[name], np.int64))
     span = float(received[-1] - received[0]) / SECOND
     intervals = np.diff(received) / SECOND
+    # The median, which a few long pauses do not move.
     usual = float(np.median(intervals)) if len(intervals) else 0.0
     gaps = [
         {"after": float(received[index] - received[0]) / SECOND, "seconds": float(intervals[index])}
+        # Both conditions: a slow topic has long intervals, a fast one has jitter.
         for index in np.flatnonzero((intervals > GAP_SECONDS) & (intervals > GAP_FACTOR * usual))
     ]
     return {
@@ -73,6 +78,7 @@ def _topic(log: Log, name: str) -> dict[str, Any]:
 
 
 def _use(log: Log, name: str, kind: str) -> str:
+    # Each topic says what it is good for, so that nobody wonders why one is ignored.
     chosen = {log.map_topic: "map", log.image_topic: "panorama"}
     if name in chosen:
         return chosen[name]
@@ -87,6 +93,7 @@ def _map(log: Log) -> dict[str, Any] | None:
     last = log.last_map
     if last is None:
         return None
+    # By the thresholds in use: a map that is all unknown shows at once.
     free, obstacles = last.free(log.config).mean(), last.obstacles(log.config).mean()
     return {
         "count": log.map_count,

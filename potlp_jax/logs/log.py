@@ -144,6 +144,7 @@ class Log:
 
     def read_maps(self) -> Iterator[MapMessage]:
         """The maps, by the time at which they were received where the bag is whole."""
+        # Read again at each call: the maps of an hour may take gigabytes.
         topics = () if self.map_topic is None else (self.map_topic,)
         found = (self._map(message)[0] for message in self.bag.messages(topics))
         return (message for message in found if message is not None)
@@ -153,6 +154,7 @@ class Log:
         topics = () if self.image_topic is None else (self.image_topic,)
         for index, message in enumerate(self.bag.messages(topics)):
             fields = self._decode(message)
+            # Numbered with those that cannot be decoded: an index means the same message here and in ``pictures``.
             data = b"" if fields is None else bytes(fields.data)
             picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
             yield index, None if picture is None else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
@@ -160,8 +162,10 @@ class Log:
     @cached_property
     def base_frame(self) -> str | None:
         """The frame of the robot's body; None where none is known."""
+        # What the user says is right, even where the log has no such frame: the error then names it.
         if self.config.base_frame is not None:
             return self.config.base_frame
+        # Odometry says which frame it is of; without it, usual names that the transforms know.
         children = [child for _, child in self.odometry.values()]
         return next((name for name in (*children, *BASE_FRAMES) if name in self.transforms.frames), None)
 
@@ -173,6 +177,7 @@ class Log:
     def _choose(self, kind: str, wanted: str | None, usual: tuple[str, ...], option: str) -> str | None:
         """The topic of a type that is meant; None where there is none."""
         found = self.of_type(kind)
+        # A topic that was asked for and is not there is an error, not a reason to take another.
         if wanted is not None:
             if wanted not in found:
                 known = self.bag.topics.get(wanted)
@@ -181,6 +186,7 @@ class Log:
                     f"{self.path}: topic {wanted} {what}; topics of type {kind}: {', '.join(found) or 'none'}"
                 )
             return wanted
+        # One topic of the type needs no usual name; of several only a usual name is chosen without asking.
         chosen = found if len(found) == 1 else [name for name in usual if name in found][:1]
         if found and not chosen:
             raise LogError(
@@ -206,6 +212,7 @@ class Log:
                 self._keep_odometry(message, fields)
             else:
                 self._keep_transforms(message, fields)
+        # Odometry is the same transform as in /tf, by another topic: used where /tf does not have it.
         for edge, poses in self._odometry_poses.items():
             if not self.transforms.has(*edge):
                 for time, values in poses:
@@ -232,6 +239,7 @@ class Log:
 
     def _time(self, message: RawMessage, stamp: Any) -> int:
         """When a message was stamped, where its clock is that of the recording; else when it was recorded."""
+        # Stamps say when a measurement was made, which is better than when it was received - if the clocks agree.
         stamped = stamp.sec * SECOND + stamp.nanosec
         if abs(stamped - message.time) <= LONGEST_DELAY:
             return stamped
@@ -251,6 +259,7 @@ class Log:
             return None, f"empty, {height} x {width} cells of {resolution:g} m"
         if len(fields.data) != height * width:
             return None, f"{len(fields.data)} values for {height} x {width} cells"
+        # ROS counts rows from the bottom, this library from the top.
         occupancy = np.asarray(fields.data, np.int8).reshape(height, width)[::-1]
         if occupancy.min() < -1 or occupancy.max() > OCCUPIED:
             return None, f"values from {occupancy.min()} to {occupancy.max()}, beyond -1 to 100"
@@ -266,11 +275,13 @@ class Log:
             self._lose(message.topic, reason)
             return
         self.map_count += 1
+        # By time, not by place in the file: a damaged bag is not in order.
         if self.last_map is None or found.time >= self.last_map.time:
             self.last_map = found
 
     def _keep_picture(self, message: RawMessage, fields: Any, index: int) -> None:
         try:
+            # The header alone: sizes are wanted now, pixels later and not of all.
             with Image.open(io.BytesIO(bytes(fields.data))) as image:
                 width, height = image.size
         except (UnidentifiedImageError, OSError, ValueError):
@@ -288,6 +299,7 @@ class Log:
 
     def _keep_transforms(self, message: RawMessage, fields: Any) -> None:
         for transform in fields.transforms:
+            # Static transforms hold for ever, whenever they were published.
             time = None if message.topic == FIXED_TOPIC else self._time(message, transform.header.stamp)
             values = _values(transform.transform.translation, transform.transform.rotation)
             self.transforms.add(transform.header.frame_id, transform.child_frame_id, time, values)
@@ -297,6 +309,7 @@ def typestore(is_ros1: bool) -> Typestore:
     """Definitions of the messages that logs are read from; they are the same in all versions of ROS 2."""
     if not is_ros1:
         return get_typestore(Stores.ROS2_HUMBLE)
+    # ROS 1 had two packages with the same transform message.
     store = get_typestore(Stores.ROS1_NOETIC)
     for name in TRANSFORM_TYPES:
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", name))

@@ -29,11 +29,19 @@ class Poses:
 def read_poses(log: Log, notes: list[str]) -> Poses:
     """The poses of the robot in the frame of the map; gaps in time are noted.
 
+    Args:
+        log: with a map.
+        notes: what is doubtful is added here, in words.
+
+    Returns:
+        One pose at each time at which the robot's frame was published.
+
     Raises:
         LogError: nothing says where the robot's frame lies in that of the map, at any time.
     """
     base, frame = log.base_frame, log.map_frame
     assert frame is not None
+    # Both errors list the frames: the usual cause is another name than the one expected.
     known = ", ".join(sorted(log.transforms.frames)) or "none"
     if base is None:
         raise LogError(
@@ -48,12 +56,13 @@ def read_poses(log: Log, notes: list[str]) -> Poses:
     times = log.transforms.times(frame, base)
     if not len(times):
         raise LogError(f"{log.path}: {base!r} never moves in {frame!r}: its transforms are all static; record /tf")
+    # A gap is no error: localisation may be lost for a while, and what lies between can be guessed and said.
     gaps = np.diff(times) / SECOND
     long = gaps[gaps > log.config.longest_gap]
     if len(long):
         notes.append(
             f"pose: {len(long)} gaps of more than {log.config.longest_gap:g} s, the longest of {long.max():.1f} s; the "
-            "way across is taken to be the shortest in the final map"
+            "path across is taken to be the shortest in the final map"
         )
     return Poses(times, log.transforms.poses(frame, base, times)[:, :2, 3])
 
@@ -61,7 +70,17 @@ def read_poses(log: Log, notes: list[str]) -> Poses:
 def drive_path(
     poses: Poses, grid: WorkingGrid, log: Log, radius: float, notes: list[str]
 ) -> tuple[list[Cell], Int64[np.ndarray, "N"]]:
-    """Cells entered, and for each the number of the pose by which it was; poses that are passed over are noted.
+    """Cells entered, and for each the number of the pose by which it was.
+
+    Args:
+        poses: in the frame of the map.
+        grid: the final map on working cells.
+        log: for messages.
+        radius: of the robot, in metres.
+        notes: poses that are passed over are noted here, in words.
+
+    Returns:
+        The cells, each a neighbour of the one before, and the index into ``poses`` at which each was entered.
 
     Raises:
         LogError: no pose is in free space.
@@ -70,6 +89,7 @@ def drive_path(
     across, up = frame.to_grid(poses.points).T
     inside = (across >= 0) & (across < frame.width) & (up >= 0) & (up < frame.height)
     rows, columns = frame.height - 1 - np.floor(up).astype(int), np.floor(across).astype(int)
+    # Noise puts poses into walls and outside. The component with most of them is where the robot was.
     labels = component_labels(grid.free)
     reached = labels[rows[inside], columns[inside]]
     on_free = reached[reached > 0]
@@ -79,10 +99,12 @@ def drive_path(
             f"{log.base_frame!r} the robot's frame?"
         )
     main = labels == np.bincount(on_free).argmax()
+    # The nearest cell of that component for every cell of the map, in one pass.
     found = ndimage.distance_transform_edt(~main, return_indices=True)
     assert found is not None
     distance, nearest = found
     numbers = np.flatnonzero(inside)
+    # Poses beside free space are snapped to it; those far away are errors of localisation.
     near = distance[rows[numbers], columns[numbers]] <= FARTHEST_SNAP + radius / frame.resolution
     numbers = numbers[near]
     if len(numbers) < len(inside):
@@ -94,16 +116,18 @@ def drive_path(
     path: list[Cell] = []
     entered: list[int] = []
     for number, cell in zip(numbers.tolist(), map(tuple, snapped.tolist()), strict=True):
+        # Cells entered, not time spent in them.
         if path and cell == path[-1]:
             continue
-        way = [cell] if not path else _way(main, path[-1], cell)
-        path += way
-        entered += [number] * len(way)
+        between = [cell] if not path else _shortest(main, path[-1], cell)
+        path += between
+        entered += [number] * len(between)
     return path, np.array(entered)
 
 
-def _way(free: Bool[np.ndarray, "H W"], start: Cell, goal: Cell) -> list[Cell]:
-    """Cells of a shortest way, the start left out: 8-connected, corners not cut. Both are in one component."""
+def _shortest(free: Bool[np.ndarray, "H W"], start: Cell, goal: Cell) -> list[Cell]:
+    """Cells of a shortest path, the start left out. Both ends are in one component, so that there is one."""
+    # A* with the straight distance, which never exceeds the length of a path.
     best, came_from = {start: 0.0}, {}
     queue = [(0.0, start)]
     while queue:
@@ -115,7 +139,7 @@ def _way(free: Bool[np.ndarray, "H W"], start: Cell, goal: Cell) -> list[Cell]:
             if cost < best.get(there, math.inf):
                 best[there], came_from[there] = cost, cell
                 heapq.heappush(queue, (cost + math.dist(there, goal), there))
-    way = [goal]
-    while way[-1] != start:
-        way.append(came_from[way[-1]])
-    return way[-2::-1]
+    path = [goal]
+    while path[-1] != start:
+        path.append(came_from[path[-1]])
+    return path[-2::-1]

@@ -29,11 +29,18 @@ class Transforms:
         self._fixed: dict[Edge, tuple[float, ...]] = {}
 
     def add(self, parent: str, child: str, time: int | None, values: tuple[float, ...]) -> None:
-        """Where ``child`` lies in ``parent`` at a time in nanoseconds (None: always)."""
+        """Record where one frame lies in another.
+
+        Args:
+            parent, child: names of the frames.
+            time: in nanoseconds; None: always.
+            values: x, y, z, and the quaternion x, y, z, w.
+        """
         edge = _name(parent), _name(child)
         if time is None:
             self._fixed[edge] = values
         else:
+            # In the order of the file; sorted when it is asked, for messages may come late.
             track = self._moving.setdefault(edge, _Track())
             track.times.append(time)
             track.values.append(values)
@@ -55,6 +62,7 @@ class Transforms:
         while queue:
             frame = queue.popleft()
             for edge in (*self._moving, *self._fixed):
+                # Transforms are published from parent to child; a chain may go either way.
                 for here, there, down in ((edge[0], edge[1], True), (edge[1], edge[0], False)):
                     if here == frame and there not in came_from:
                         came_from[there] = (edge, down)
@@ -62,6 +70,7 @@ class Transforms:
         if goal not in came_from:
             return None
         steps: list[tuple[Edge, bool]] = []
+        # Walked back from the goal, hence reversed at the end.
         while (step := came_from[goal]) is not None:
             steps.append(step)
             goal = step[0][0] if step[1] else step[0][1]
@@ -70,11 +79,19 @@ class Transforms:
     def times(self, parent: str, child: str) -> Int64[np.ndarray, "N"]:
         """When the edge between two frames that was recorded most often was recorded, in order; empty if none moves."""
         tracks = [self._moving[edge] for edge, _ in self.chain(parent, child) or () if edge in self._moving]
+        # Odometry is published faster than localisation corrects it: the fastest edge has the finest times.
         longest = max(tracks, key=lambda track: len(track.times), default=_Track())
         return np.unique(np.array(longest.times, np.int64))
 
     def poses(self, parent: str, child: str, times: Int64[np.ndarray, "N"]) -> Float64[np.ndarray, "N 4 4"]:
-        """Where ``child`` lies in ``parent`` at some times: matrices from the child's coordinates to the parent's.
+        """Where one frame lies in another at some times.
+
+        Args:
+            parent, child: names of the frames.
+            times: in nanoseconds.
+
+        Returns:
+            Matrices from the child's coordinates to the parent's.
 
         Raises:
             KeyError: nothing connects the frames.
@@ -88,15 +105,19 @@ class Transforms:
             matrices = np.tile(np.eye(4), (len(times), 1, 1))
             matrices[:, :3, :3] = Rotation.from_quat(values[:, 3:]).as_matrix()
             matrices[:, :3, 3] = values[:, :3]
+            # A transform maps the child's coordinates to the parent's; upwards it is inverted.
             result = result @ (matrices if down else np.linalg.inv(matrices))
         return result
 
     def _at(self, edge: Edge, times: Int64[np.ndarray, "N"]) -> Float64[np.ndarray, "N 7"]:
+        # A transform that was published both ways moves: the static one is an initial value.
         if edge in self._fixed and edge not in self._moving:
             return np.tile(np.array(self._fixed[edge], np.float64), (len(times), 1))
         track = self._moving[edge]
+        # Some nodes publish a transform twice with one stamp; interpolation needs distinct times.
         recorded, first = np.unique(np.array(track.times, np.int64), return_index=True)
         values = np.array(track.values, np.float64)[first]
+        # Linear, then normalised by ``Rotation``: between two close turns that is as good as on the sphere.
         values[:, 3:] = _aligned(values[:, 3:])
         # Relative to the first time, so that nanoseconds are not lost in floating point.
         since, wanted = (recorded - recorded[0]).astype(np.float64), (times - recorded[0]).astype(np.float64)
@@ -126,6 +147,7 @@ def yaw_of(quaternion: Quaternion) -> float:
 
 def _aligned(quaternions: Float64[np.ndarray, "N 4"]) -> Float64[np.ndarray, "N 4"]:
     """The same turns, with signs such that neighbours are near each other and may be interpolated."""
+    # A quaternion and its negative are the same turn, and the mean of both is none.
     flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
     signs = np.where(np.concatenate([[0], np.cumsum(flips)]) % 2 == 1, -1.0, 1.0)
     return quaternions * signs[:, None]

@@ -48,6 +48,7 @@ class WorkingGrid:
 
     def __init__(self, final: MapMessage, log: Log, config: GridConfig) -> None:
         self._final, self._log = final, log
+        # Fractions, so that 0.2 m are four pixels of 0.05 m and not 3.9999.
         pixel = Fraction(str(final.frame.resolution))
         wanted = (
             max(Fraction(str(RESOLUTION)), pixel) if config.resolution is None else Fraction(str(config.resolution))
@@ -61,12 +62,14 @@ class WorkingGrid:
         # As many pixels as whole cells take, and enough that nothing from beyond the map grows into it.
         self._margin = self._ratio.numerator * math.ceil((self._radius + 1) / self._ratio.numerator)
         self._free_pixels, self._obstacle_pixels = final.free(log.config), final.obstacles(log.config)
+        # Free is free in all pixels, an obstacle is one in any: in doubt a robot stays away.
         free = ~self._cells(self._grown(~self._free_pixels, beyond=True), np.logical_or, beyond=True)
         obstacle = self._cells(self._grown(self._obstacle_pixels, beyond=False), np.logical_or, beyond=False)
         height, width = free.shape
         frame = GridFrame(height, width, float(wanted), final.frame.x, final.frame.y, final.frame.yaw)
         # Outside of a grid is unobserved: its edge would be a frontier for ever.
         self._ring = bool(free[0].any() or free[-1].any() or free[:, 0].any() or free[:, -1].any())
+        # The ring is put on only where free cells touch the edge: most maps have a margin of their own.
         self.frame = frame.window(-1, -1, frame.height + 2, frame.width + 2) if self._ring else frame
         self.free, self.obstacle = self._ringed(free, False), self._ringed(obstacle & ~free, False)
         if not self.free.any():
@@ -91,12 +94,17 @@ class WorkingGrid:
         for number, earlier in enumerate(maps):
             free = self._on_final(earlier.free(self._log.config), earlier)
             obstacles = self._on_final(earlier.obstacles(self._log.config), earlier)
+            # The first map that shows a pixel counts, whatever it says: the value is the final map's.
             known = free | obstacles
             first[known & (first == NEVER)] = number
             changed = (free & self._obstacle_pixels) | (obstacles & self._free_pixels)
             most = max(most, float(changed.sum() / max(known.sum(), 1)))
+            # Without pixels, which nobody needs any more: there may be thousands of maps.
             heads.append(replace(earlier, occupancy=earlier.occupancy[:0]))
+        # A free cell is known once all its pixels are, an obstacle once one of its own is: hence the latest map and the
+        # earliest one.
         as_free = self._cells(np.pad(first, self._margin, constant_values=NEVER), np.maximum, beyond=NEVER)
+        # Obstacles are grown by the robot's radius, so a cell may be blocked by a pixel beside it.
         walls = np.where(self._obstacle_pixels, first, NEVER)
         near = ndimage.minimum_filter(
             np.pad(walls, self._margin, constant_values=NEVER), footprint=self._disc(), mode="nearest"
@@ -107,6 +115,7 @@ class WorkingGrid:
 
     def _disc(self) -> Bool[np.ndarray, "side side"]:
         """The pixels within the robot's radius of a pixel."""
+        # In whole pixels, as ``inflate`` grows obstacles.
         reach = int(self._radius)
         offset = np.arange(-reach, reach + 1)
         return offset[:, None] ** 2 + offset[None, :] ** 2 <= int(self._radius * self._radius)
@@ -119,6 +128,7 @@ class WorkingGrid:
         self, pixels: Shaped[np.ndarray, "h2 w2"], reduce: np.ufunc, beyond: bool | int
     ) -> Shaped[np.ndarray, "H W"]:
         """Working cells of the map, from pixels with its margin."""
+        # Cells are counted from the lower left corner of the map, where its origin is: hence from the end of the rows.
         coarse = resample(pixels, self._ratio, reduce, beyond)
         margin = int(self._margin / self._ratio)
         height, width = (int(-(-size // self._ratio)) for size in self._free_pixels.shape)
@@ -127,6 +137,7 @@ class WorkingGrid:
     def _on_final(self, pixels: Bool[np.ndarray, "h w"], earlier: MapMessage) -> Bool[np.ndarray, "H W"]:
         """Pixels of an earlier map, at the centres of the final map's pixels."""
         mine, its = self._final.frame, earlier.frame
+        # Mapping moves the origin of a growing map, but never turns it.
         if abs(math.remainder(mine.yaw - its.yaw, 2 * math.pi)) > 1e-6:
             raise LogError(
                 f"{self._log.path}: {self._log.map_topic}: the maps are turned against each other, by {its.yaw:g} and "
@@ -139,6 +150,7 @@ class WorkingGrid:
             )
         across, up = its.to_grid(np.array([mine.cell_to_metres(mine.height - 1, 0)]))[0]
         scale = mine.resolution / its.resolution
+        # Rounded first: a centre that falls on a boundary by construction must not fall beside it by float.
         columns = np.floor(np.round(across + scale * np.arange(mine.width), BOUNDARY_DECIMALS)).astype(int)
         from_below = np.floor(np.round(up + scale * np.arange(mine.height), BOUNDARY_DECIMALS)).astype(int)
         rows = its.height - 1 - from_below[::-1]

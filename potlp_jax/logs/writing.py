@@ -53,21 +53,29 @@ class BagFormat(StrEnum):
 
 
 def write_trial(trial: Trial, out: Path, kind: BagFormat, labels: Path, height: int = 1024) -> int:
-    """Write a simulated trial as a bag, and where its propositions are; returns the number of messages.
+    """Write a simulated trial as a bag, and where its propositions are.
 
-    ``height`` is that of the pictures, whose width is twice as large.
+    Args:
+        trial: from ``run_trial`` or ``load_trial``.
+        out: file or folder that does not exist yet.
+        kind: what the bag is written as.
+        labels: file for where the propositions are.
+        height: of the pictures in pixels; their width is twice as large.
+
+    Returns:
+        The number of messages.
 
     Raises:
         LogError: there is something at ``out`` already, or the world has no place for a proposition.
     """
     config = config_from_dict(TrialConfig, trial.config, "trial record")
 
-    def look(step: int) -> UInt8[np.ndarray, "rows columns 3"]:
+    def panorama(step: int) -> UInt8[np.ndarray, "rows columns 3"]:
         cell = jax.numpy.asarray(trial.path[step], jax.numpy.int32)
         return np.asarray(photograph(trial.world, cell, jax.random.key(step), config.camera, config.disturbance))
 
     labels.write_text(labels_text(trial.world, trial.propositions), "utf-8")
-    return write_drive(out, kind, trial.world, trial.path, trial.first_seen, look, config.camera, height)
+    return write_drive(out, kind, trial.world, trial.path, trial.first_seen, panorama, config.camera, height)
 
 
 def write_drive(
@@ -76,23 +84,37 @@ def write_drive(
     world: World,
     path: Sequence[tuple[int, int]],
     first_seen: Int32[np.ndarray, "H W"],
-    look: Callable[[int], UInt8[np.ndarray, "rows columns 3"]],
+    panorama: Callable[[int], UInt8[np.ndarray, "rows columns 3"]],
     camera: CameraConfig = CameraConfig(),
     height: int = 1024,
 ) -> int:
-    """Write a way through a world as a bag; returns the number of messages.
+    """Write a path through a world as a bag.
 
     At every cell entered: the map of what was seen so far, cut to where anything was seen, as mapping publishes it;
-    the transforms map -> odom -> base_link, and the second as odometry too; and a PNG. ``first_seen`` and ``path`` are
-    as in ``Trial``; ``look`` gives the panorama of a step.
+    the transforms map -> odom -> base_link, and the second as odometry too; and a PNG.
+
+    Args:
+        out: file or folder that does not exist yet.
+        kind: what the bag is written as.
+        world: the true map.
+        path: cells in order, the start first.
+        first_seen: index into the path at which each cell was first observed, ``NEVER_SEEN`` where it was not.
+        panorama: gives what the camera sees at an index into the path.
+        camera: of the panoramas.
+        height: of the pictures in pixels; their width is twice as large.
+
+    Returns:
+        The number of messages.
 
     Raises:
         LogError: there is something at ``out`` already.
     """
+    # A bag is a folder of its own in ROS 2: nothing is overwritten.
     if out.exists():
         raise LogError(f"{out} exists already: choose another name")
     out.parent.mkdir(parents=True, exist_ok=True)
     frame, turns = frame_of(world), _headings(path)
+    # Time goes with the distance: diagonal moves take longer.
     travelled = np.cumsum([0.0, *step_lengths(path)])
     count = 0
     with _Recorder(out, kind) as recorder:
@@ -110,7 +132,7 @@ def write_drive(
                 [("map", "odom", (0.0, 0.0, 0.0), quaternion_of(turns[0])), ("odom", "base_link", *odometry)],
             )
             recorder.odometry(time, *odometry)
-            recorder.picture(time, to_equirectangular(look(step), camera, height, 2 * height, -turns[step]))
+            recorder.picture(time, to_equirectangular(panorama(step), camera, height, 2 * height, -turns[step]))
             count = recorder.count
     return count
 
@@ -119,6 +141,7 @@ def frame_of(world: World) -> GridFrame:
     """Where a world lies in metres: the robot starts at the origin, as with mapping."""
     height, width = world.shape
     resolution = float(str(np.float32(world.resolution)))
+    # The centre of the start cell is at (0, 0); the frame's origin is its lower left corner.
     row, column = (int(entry) for entry in world.start)
     return GridFrame(height, width, resolution, -(column + 0.5) * resolution, -(height - row - 0.5) * resolution)
 
@@ -126,6 +149,7 @@ def frame_of(world: World) -> GridFrame:
 def labels_text(world: World, propositions: Sequence[str]) -> str:
     """YAML of where the propositions of a world are, as rectangles."""
     frame, letters = frame_of(world), np.asarray(world.letters)
+    # From centre to edge: rectangles of cells reach to the outer edges of the outermost ones.
     half = frame.resolution / 2
     regions: dict[str, list[dict[str, Any]]] = {}
     for bit, name in enumerate(propositions):
@@ -133,6 +157,7 @@ def labels_text(world: World, propositions: Sequence[str]) -> str:
             (x0, y1), (x1, y0) = frame.cell_to_metres(top, left), frame.cell_to_metres(bottom, right)
             corners = [(x0 - half, y0 - half), (x1 + half, y0 - half), (x1 + half, y1 + half), (x0 - half, y1 + half)]
             regions.setdefault(name, []).append({"polygon": [[round(x, 4), round(y, 4)] for x, y in corners]})
+    # A label file without a proposition would be refused when it is read: better here.
     missing = [name for name in propositions if name not in regions]
     if missing:
         raise LogError(f"the world has no place for {', '.join(missing)}: labels name every proposition's")
@@ -141,12 +166,14 @@ def labels_text(world: World, propositions: Sequence[str]) -> str:
 
 def _rectangles(cells: Bool[np.ndarray, "H W"]) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     """First and last cells of rectangles that cover the True cells: equal runs in rows below each other are one."""
+    # +1 where a run of cells begins, -1 behind its end.
     edges = np.diff(np.pad(cells.astype(np.int8), ((0, 0), (1, 1))), axis=1)
     starts, ends = np.argwhere(edges == 1).tolist(), np.argwhere(edges == -1).tolist()
     last_row: dict[tuple[int, int], tuple[int, int]] = {}
     done = []
     for (row, left), (_, end) in zip(starts, ends, strict=True):
         top, bottom = last_row.get((left, end - 1), (row, row - 1))
+        # The run above was not in the row before: its rectangle is finished.
         if bottom < row - 1:
             done.append(((top, left), (bottom, end - 1)))
             top = row
@@ -158,6 +185,7 @@ def _headings(path: Sequence[tuple[int, int]]) -> list[float]:
     """Toward the next cell, counter-clockwise from x with y upward; the last as the one before."""
     cells = np.array(path)
     steps = np.diff(cells, axis=0)
+    # Rows grow downward, y upward.
     turns = np.arctan2(-steps[:, 0], steps[:, 1]).tolist() or [0.0]
     return [*turns, turns[-1]][: len(cells)]
 
@@ -189,6 +217,7 @@ class _Recorder:
 
     def map(self, time: int, frame: GridFrame, belief: BeliefMap) -> None:
         """Publish what was seen so far, cut to where anything was."""
+        # Mapping publishes the part that it knows, with a moving origin: readers must cope, and are tested with it.
         known = ~np.asarray(belief.unknown)
         rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
         top, left, height, width = rows[0], columns[0], rows[-1] - rows[0] + 1, columns[-1] - columns[0] + 1
@@ -228,6 +257,7 @@ class _Recorder:
         still = self._make(
             "geometry_msgs/msg/Twist", linear=self._vector((0.0, 0.0, 0.0)), angular=self._vector((0.0, 0.0, 0.0))
         )
+        # By convention a covariance of zeros is not known.
         unknown = np.zeros(36)
         self._write(
             "/odom",
@@ -261,6 +291,7 @@ class _Recorder:
         return self._make("builtin_interfaces/msg/Time", sec=time // SECOND, nanosec=time % SECOND)
 
     def _header(self, time: int, frame_id: str) -> Any:
+        # ROS 1 counts messages in their headers, ROS 2 does not.
         number = {"seq": self.count} if self._is_ros1 else {}
         return self._make("std_msgs/msg/Header", stamp=self._stamp(time), frame_id=frame_id, **number)
 

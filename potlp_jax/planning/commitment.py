@@ -1,8 +1,9 @@
-"""Keeping on: a robot on its way to a subgoal turns to another only where that is cheaper by more than a fraction.
+"""Commitment: hysteresis in the choice of the subgoal.
 
-Expected costs change with every look, by errors that have nothing to do with the world, most of all where a frontier
-falls into two. A search that begins anew at every decision pays for each such change with the way back. Errors grow
-with what is still to be paid, so the advantage that is believed is a fraction of it.
+A robot that goes to a subgoal switches to another only if that is cheaper by more than a fraction. Expected costs
+change with every observation, by errors that have nothing to do with the world, most of all where a frontier falls into
+two. A search that begins anew at every decision pays for each such change with the path back. Errors grow with the cost
+that remains to be paid, so the margin is a fraction of it.
 """
 
 import dataclasses
@@ -11,21 +12,24 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float32, Int32
 
-from potlp_jax.planning.search.api import Plan
+from potlp_jax.planning.search.plan import Plan
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_ACTION, NO_STATE
 from potlp_jax.world.frontiers import Subgoals
 
 SAME_WITHIN: int = 8
 """Cells, in rows and in columns, within which a subgoal may be the one of the decision before: frontiers recede as the
-robot nears them, and it decides again after 4 cells."""
+robot nears them, and it decides again after 4 cells. Twice that distance; not tuned."""
 
 
 @struct.dataclass(kw_only=True)
 class Intention:
-    """What the robot is on its way to: the subgoal at ``cell``, to try for the transition ``edge`` beyond it.
+    """What the robot is committed to.
 
-    ``state`` is the automaton's state when that was decided, ``NO_STATE`` where the robot is on its way to none.
+    Attributes:
+      cell: the subgoal that it goes to.
+      edge: the transition of the automaton that it will try for beyond it.
+      state: the automaton's state when that was decided; ``NO_STATE`` where the robot is committed to nothing.
     """
 
     cell: Int32[Array, "*batch 2"]
@@ -46,19 +50,33 @@ def apply_commitment(
     task: TaskArrays,
     commitment: Float32[Array, ""],
 ) -> Plan:
-    """The plan, with the intended action in place of the chosen one where that costs no more than by ``commitment``.
+    """The plan, with the intended action in place of the chosen one where that costs little more.
 
     The intended action tries for the same transition at the subgoal that is nearest to the former one, within
-    ``SAME_WITHIN`` cells. Nothing is kept once the automaton's ``state`` has changed, nor where the plan is to finish.
-    ``commitment`` is a fraction of the expected cost of the chosen action.
+    ``SAME_WITHIN`` cells. The robot is free again once the automaton's state has changed, and where the plan is to
+    finish.
+
+    Args:
+      plan: found by the search.
+      intention: of the decision before.
+      state: the automaton's state now.
+      subgoals: of the current belief.
+      task: arrays of the task.
+      commitment: fraction of the chosen action's expected cost that the intended action may cost more.
+
+    Returns:
+      The plan with ``action`` and what belongs to it replaced, or unchanged.
     """
     count, edges = subgoals.mask.shape[0], task.edge_mask.shape[0]
+    # Subgoals have no identity from one decision to the next: the nearest one with the same action counts as the same.
     q_values = plan.q_values[: count * edges].reshape(count, edges)[:, intention.edge]
     away = jnp.max(jnp.abs(subgoals.cells - intention.cell[None]), axis=1)
     same = subgoals.mask & jnp.isfinite(q_values) & (away <= SAME_WITHIN)
     subgoal = jnp.argmin(jnp.where(same, away, SAME_WITHIN + 1)).astype(jnp.int32)
+    # To finish is never put off: its cost is known and nothing is gained by looking further.
     acts = (plan.action != NO_ACTION) & (plan.action != count * edges)
-    keeps = acts & (intention.state == state) & jnp.any(same) & (q_values[subgoal] <= (1.0 + commitment) * plan.value)
+    cheap_enough = q_values[subgoal] <= (1.0 + commitment) * plan.value
+    keeps = acts & (intention.state == state) & jnp.any(same) & cheap_enough
     chosen = dataclasses.replace(
         plan,
         action=subgoal * edges + intention.edge,
@@ -67,6 +85,7 @@ def apply_commitment(
         to_state=task.edges[intention.edge, 1],
         value=q_values[subgoal],
     )
+    # What the search found about all actions stays as it is.
     names = ("action", "subgoal", "from_state", "to_state", "value")
     return dataclasses.replace(
         plan, **{name: jnp.where(keeps, getattr(chosen, name), getattr(plan, name)) for name in names}
@@ -74,10 +93,21 @@ def apply_commitment(
 
 
 def intention_of(plan: Plan, state: Int32[Array, ""], subgoals: Subgoals, task: TaskArrays) -> Intention:
-    """What a robot is on its way to that carries out this plan in the automaton's ``state``."""
+    """What a robot that carries out this plan is committed to.
+
+    Args:
+      plan: that is carried out.
+      state: the automaton's state.
+      subgoals: of the current belief.
+      task: arrays of the task.
+
+    Returns:
+      The intention for the next decision.
+    """
     edges = task.edge_mask.shape[0]
     acts = (plan.action != NO_ACTION) & (plan.action != subgoals.mask.shape[0] * edges)
     return Intention(
+        # A cell, not an index: the next decision numbers its subgoals anew.
         cell=subgoals.cells[jnp.maximum(plan.subgoal, 0)],
         edge=jnp.where(acts, plan.action % edges, 0),
         state=jnp.where(acts, state, NO_STATE),

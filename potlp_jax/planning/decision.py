@@ -13,7 +13,9 @@ from jaxtyping import Array, Bool, Int32, PRNGKeyArray
 
 from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimates
-from potlp_jax.planning.policies import DecisionConfig, Move, assess, search_move
+from potlp_jax.planning.move import Move
+from potlp_jax.planning.policies import search_move
+from potlp_jax.planning.situation import DecisionConfig, assess
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_SUBGOAL, UNREACHABLE, status_array
 from potlp_jax.world.frontiers import Subgoals

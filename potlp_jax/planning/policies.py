@@ -1,4 +1,6 @@
-"""Policies: from what the robot knows to where it goes next. One jitted function, ``decide``, serves them all.
+"""Policies: from what the robot knows (``situation``) to where it goes next (``move``).
+
+One jitted function, ``decide``, serves them all.
 
 * ``known_map`` and ``baseline`` finish in known space where they can; otherwise they go to the nearest frontier that
   violates nothing (after Ayala et al. 2013). ``known_map`` is the same rule on a map that is revealed from the start.
@@ -17,30 +19,32 @@ from typing import Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from flax import struct
-from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
+from jaxtyping import Array, Int32, PRNGKeyArray
 
 from potlp_jax import plugins
 from potlp_jax.errors import PluginError
 from potlp_jax.planning.commitment import Intention, apply_commitment, intention_of
 from potlp_jax.planning.distances.paths import KnownPath, shortest_path
 from potlp_jax.planning.distances.product import (
-    distance_table,
     one_letter_successors,
     product_distances,
-    product_transitions,
-    reachable_cells,
-    reachable_states,
 )
 from potlp_jax.planning.distances.sweeping import Wildcard
 from potlp_jax.planning.estimates import Estimates, Estimator, ask
-from potlp_jax.planning.history import ActionTerms, action_terms, initial_history
+from potlp_jax.planning.history import action_terms, initial_history
+from potlp_jax.planning.move import Move, MoveKind, Search, move_to
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import Plan, plan_actions
-from potlp_jax.planning.search.config import SearchConfig, UctConfig
+from potlp_jax.planning.situation import (
+    DecisionConfig,
+    Situation,
+    assess,
+    cell_and_state,
+    nearest_frontier,
+    planning_problem,
+)
 from potlp_jax.task.task import TaskArrays
-from potlp_jax.types import NO_ACTION, NO_STATE, Status, status_array, status_if
-from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
+from potlp_jax.types import NO_ACTION, Status, status_if
 from potlp_jax.world.grid import BeliefMap
 
 GROUP: str = "potlp_jax.policies"
@@ -60,118 +64,6 @@ class Policy(StrEnum):
     def searches(self) -> bool:
         """Whether it weighs high-level actions, and needs an estimator."""
         return self in (Policy.ORACLE, Policy.POTLP)
-
-
-class MoveKind:
-    """What a move is for; values of ``Move.kind``."""
-
-    NONE = 0
-    FINISH = 1
-    ACTION = 2
-    FRONTIER = 3
-    FALLBACK = 4
-    OPTIMISTIC = 5
-
-
-@dataclasses.dataclass(frozen=True)
-class DecisionConfig:
-    """Settings of a decision. ``path_horizon`` is the number of moves that a decision hands out at most; None means
-    ``4 (H + W)``. ``dead_end_factor`` times ``(H + W)`` times the resolution is the cost of a dead end (docs/model.md).
-    ``commitment`` is by how much, as a fraction of its expected cost, another action must be cheaper before a robot on
-    its way turns to it; 0: at once, as published."""
-
-    frontiers: FrontierConfig = FrontierConfig()
-    search: SearchConfig | UctConfig = SearchConfig()
-    dead_end_factor: float = 4.0
-    commitment: float = 0.15
-    path_horizon: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.commitment < 0.0:
-            raise ValueError(f"commitment is {self.commitment}, must be at least 0")
-
-    def horizon(self, height: int, width: int) -> int:
-        """Moves in the path of one decision on a map of this size."""
-        return self.path_horizon if self.path_horizon is not None else 4 * (height + width)
-
-
-@struct.dataclass(kw_only=True)
-class Search:
-    """What a searching policy considered: the problem's root, its plan and the terms of every action."""
-
-    problem: PlanningProblem
-    plan: Plan
-    terms: ActionTerms
-
-
-@struct.dataclass(kw_only=True)
-class Move:
-    """Where to go next.
-
-    ``kind`` is one of ``MoveKind``; ``target_cell`` and ``target_state`` say where the path leads in the product of
-    known space; ``action`` is the planner's choice (``NO_ACTION`` for policies that do not search): that of
-    ``search.plan``, or the one that the robot keeps to. ``value`` is the expected cost to go (for policies that do not
-    search: the cost of the path, or ``inf`` for NONE). ``subgoals`` are those of the current belief; ``search`` is None
-    for policies that do not search. ``intention`` is for the next decision.
-    """
-
-    kind: Int32[Array, "*batch"]
-    target_cell: Int32[Array, "*batch 2"]
-    target_state: Int32[Array, "*batch"]
-    action: Int32[Array, "*batch"]
-    value: Float32[Array, "*batch"]
-    path: KnownPath
-    subgoals: Subgoals
-    search: Search | None
-    intention: Intention
-    status: UInt32[Array, "*batch"]
-
-
-@struct.dataclass(kw_only=True)
-class Situation:
-    """Known space as the planner sees it from the robot's product state.
-
-    ``distances[cell, z]`` is the cost from the robot to the cell in state z; ``finish_cell`` and ``finish_state`` the
-    nearest accepting product state at cost ``finish_cost`` (``inf`` where acceptance is out of reach).
-    """
-
-    belief: BeliefMap
-    task: TaskArrays
-    cell: Int32[Array, "*batch 2"]
-    state: Int32[Array, "*batch"]
-    transitions: Int32[Array, "*batch H W Z"]
-    distances: Float32[Array, "*batch H W Z"]
-    subgoals: Subgoals
-    finish_cell: Int32[Array, "*batch 2"]
-    finish_state: Int32[Array, "*batch"]
-    finish_cost: Float32[Array, "*batch"]
-
-
-def assess(
-    belief: BeliefMap, cell: Int32[Array, "2"], state: Int32[Array, ""], task: TaskArrays, config: FrontierConfig
-) -> Situation:
-    """Distances, subgoals and the way to acceptance from the robot's product state."""
-    # Nothing is left to do after acceptance: without moves of their own, accepting states need no sweep.
-    moves = product_transitions(task, belief.letters, belief.free)
-    transitions = jnp.where(task.accepting[None, None, :], NO_STATE, moves)
-    distances = product_distances(transitions, belief.free, cell[None], state[None], belief.resolution)[0]
-    nearest = jnp.min(distances, axis=2)
-    reachable = reachable_cells(belief.free, cell, jnp.isfinite(nearest))
-    subgoals = find_subgoals(belief, reachable, nearest, config)
-    finish = jnp.where(task.accepting[None, None, :], distances, jnp.inf)
-    finish_cell, finish_state = _unravel(jnp.argmin(finish.reshape(-1)), finish.shape)
-    return Situation(
-        belief=belief,
-        task=task,
-        cell=cell,
-        state=state,
-        transitions=transitions,
-        distances=distances,
-        subgoals=subgoals,
-        finish_cell=finish_cell,
-        finish_state=finish_state,
-        finish_cost=jnp.min(finish),
-    )
 
 
 def decide(
@@ -288,65 +180,10 @@ def policy_name(policy: Policy | PolicyFunction) -> str:
     return plugins.reference_of(policy)
 
 
-def planning_problem(situation: Situation, estimates: Estimates, config: DecisionConfig) -> PlanningProblem:
-    """The dense problem of a situation: travel through known space, and what lies beyond each subgoal."""
-    task, subgoals = situation.task, situation.subgoals
-    travel, finish = _subgoal_travel(situation, estimates)
-    at_subgoals = situation.distances[subgoals.cells[:, 0], subgoals.cells[:, 1]]
-    at_robot = jnp.arange(task.transitions.shape[0])[:, None, None] == situation.state
-    robot_travel = jnp.where(at_robot & subgoals.mask[None, :, None], at_subgoals[None], jnp.inf)
-    robot_finish = jnp.where(at_robot[:, 0, 0], situation.finish_cost, jnp.inf)
-    belief = situation.belief
-    size = jnp.sum(belief.extent).astype(jnp.float32)
-    return PlanningProblem.from_arrays(
-        task,
-        travel=jnp.concatenate([travel, robot_travel[None]]),
-        finish=jnp.concatenate([finish, robot_finish[None]]),
-        success_probability=estimates.success_probability,
-        success_cost=estimates.success_cost,
-        failure_cost=estimates.failure_cost,
-        dfa_state=situation.state,
-        subgoal_mask=subgoals.mask,
-        dead_end_cost=config.dead_end_factor * size * belief.resolution,
-    )
-
-
-def _subgoal_travel(
-    situation: Situation, estimates: Estimates
-) -> tuple[Float32[Array, "S Z S Z"], Float32[Array, "S Z"]]:
-    """Costs from each subgoal in each state, after re-entering the subgoal's cell (docs/model.md section 5)."""
-    task, subgoals = situation.task, situation.subgoals
-    count, states = subgoals.mask.shape[0], task.transitions.shape[0]
-    reentered = situation.transitions[subgoals.cells[:, 0], subgoals.cells[:, 1]]
-    # Rollouts leave a subgoal only after an action there, so one where nothing can succeed needs no table; nor does
-    # a state that no re-entry leads to from where the automaton can still get, or an accepting one.
-    promising = subgoals.mask & jnp.any(estimates.success_probability > 0.0, axis=1)
-    own = jnp.arange(states, dtype=jnp.int32)
-    ahead = jnp.where(reachable_states(task, situation.state)[None], reentered, NO_STATE)
-    needed = jnp.any(ahead[:, :, None] == own[None, None, :], axis=1) & promising[:, None] & ~task.accepting[None]
-    sources = jnp.where(needed, own[None, :], NO_STATE)
-    travel, finish = distance_table(
-        situation.transitions,
-        situation.belief.free,
-        task.accepting,
-        jnp.repeat(subgoals.cells, states, axis=0),
-        sources.reshape(-1),
-        subgoals.cells,
-        situation.belief.resolution,
-    )
-    travel = jnp.where(subgoals.mask[None, :, None], travel, jnp.inf).reshape(count, states, count, states)
-    finish = finish.reshape(count, states)
-    subgoal = jnp.arange(count)[:, None]
-    exists = reentered != NO_STATE
-    # An accepting re-entry satisfies the task at once: nothing is left to pay.
-    accepted = exists & task.accepting[reentered]
-    finish = jnp.where(exists, jnp.where(accepted, 0.0, finish[subgoal, reentered]), jnp.inf)
-    return jnp.where(exists[:, :, None, None], travel[subgoal, reentered], jnp.inf), finish
-
-
 def _finish_or_frontier(situation: Situation, config: DecisionConfig) -> Move:
-    """The baseline: finish in known space where possible, else the nearest frontier that violates nothing."""
-    frontier_cell, frontier_state, frontier_cost = _nearest_frontier(situation)
+    """The baseline: finish in known space where possible, otherwise the nearest frontier that violates nothing."""
+    # Distances are those of the product, in which no path violates the task: traps are left out of it.
+    frontier_cell, frontier_state, frontier_cost = nearest_frontier(situation)
     finishes = jnp.isfinite(situation.finish_cost)
     value = jnp.where(finishes, situation.finish_cost, frontier_cost)
     kind = jnp.where(finishes, MoveKind.FINISH, jnp.where(jnp.isfinite(value), MoveKind.FRONTIER, MoveKind.NONE))
@@ -364,7 +201,18 @@ def search_move(
 ) -> Move:
     """PO-TLP (Bradley et al. 2021, Algorithm 1): search, and go toward the chosen action's subgoal.
 
-    ``estimates`` are those of the situation's subgoals. Where no action is available: the nearest frontier.
+    Args:
+        situation: known space, assessed from the robot's product state.
+        estimates: P_S, R_S and R_F of the situation's subgoals.
+        key: drives the search where it samples (``UctConfig``).
+        config: settings.
+        intention: that of the decision before; None without one.
+
+    Returns:
+        The move; toward the nearest frontier where no action is available.
+
+    Raises:
+        ValueError: there are no estimates.
     """
     if estimates is None:
         raise ValueError("a policy that searches needs an estimator")
@@ -376,12 +224,25 @@ def search_move(
 def planned_move(
     situation: Situation, problem: PlanningProblem, plan: Plan, intention: Intention, config: DecisionConfig
 ) -> Move:
-    """The move that carries out the plan of a situation's problem, or keeps to what the robot is on its way to."""
+    """The move that carries out the plan of a situation's problem, or the action that the robot is committed to.
+
+    Args:
+        situation: known space, assessed from the robot's product state.
+        problem: posed by the situation.
+        plan: found for the problem.
+        intention: that of the decision before.
+        config: ``commitment`` and ``path_horizon`` matter.
+
+    Returns:
+        The move.
+    """
     task, subgoals = situation.task, situation.subgoals
     search = Search(problem=problem, plan=plan, terms=action_terms(problem, initial_history(problem)))
     plan = apply_commitment(plan, intention, situation.state, subgoals, task, jnp.float32(config.commitment))
 
-    frontier_cell, frontier_state, frontier_cost = _nearest_frontier(situation)
+    # Without an available action the estimates say that the task is impossible. They may be wrong, so the robot
+    # explores as the baseline would, and the move is flagged.
+    frontier_cell, frontier_state, frontier_cost = nearest_frontier(situation)
     finishes = plan.action == subgoals.mask.shape[0] * task.edge_mask.shape[0]
     acts = (plan.action != NO_ACTION) & ~finishes
     falls_back = (plan.action == NO_ACTION) & jnp.isfinite(frontier_cost)
@@ -409,13 +270,14 @@ def planned_move(
 def _optimistic(situation: Situation, config: DecisionConfig) -> Move:
     """Shortest path to acceptance if unobserved cells were free and carried any letter that violates nothing."""
     belief, task = situation.belief, situation.task
+    # One letter per unobserved cell, whichever helps most; letters that lead to a trap do not exist for the path.
     wildcard = Wildcard(cells=belief.unknown, successors=one_letter_successors(task))
     free = belief.free | belief.unknown
     distances = product_distances(
         situation.transitions, free, situation.cell[None], situation.state[None], belief.resolution, wildcard
     )[0]
     accepted = jnp.where(task.accepting[None, None, :], distances, jnp.inf)
-    target_cell, target_state = _unravel(jnp.argmin(accepted.reshape(-1)), accepted.shape)
+    target_cell, target_state = cell_and_state(jnp.argmin(accepted.reshape(-1)), accepted.shape)
     path = shortest_path(
         distances,
         situation.transitions,
@@ -428,8 +290,10 @@ def _optimistic(situation: Situation, config: DecisionConfig) -> Move:
         resolution=belief.resolution,
         wildcard=wildcard,
     )
+    # The robot follows the path while its cells are known, and decides again with what it sees from there.
     known = _cut_before_unobserved(path, belief)
     kind = jnp.where(jnp.isfinite(path.cost), MoveKind.OPTIMISTIC, MoveKind.NONE)
+    # A path that needs nothing unobserved ends the task.
     kind = jnp.where(jnp.isfinite(situation.finish_cost) & (known.length == path.length), MoveKind.FINISH, kind)
     return Move(
         kind=kind.astype(jnp.int32),
@@ -453,84 +317,6 @@ def _cut_before_unobserved(path: KnownPath, belief: BeliefMap) -> KnownPath:
     length = jnp.minimum(path.length, first_hidden - 1)
     kept = jnp.minimum(index, length)
     return dataclasses.replace(path, cells=path.cells[kept], states=path.states[kept], length=length)
-
-
-def _nearest_frontier(situation: Situation) -> tuple[Int32[Array, "2"], Int32[Array, ""], Float32[Array, ""]]:
-    """Nearest subgoal by product distance; where none can be reached, nearest frontier cell of any component."""
-    cells, kept = situation.subgoals.cells, situation.subgoals.mask
-    by_subgoal = jnp.full(situation.distances.shape, jnp.inf, jnp.float32)
-    rows, columns = cells[:, 0], cells[:, 1]
-    at_subgoals = jnp.where(kept[:, None], situation.distances[rows, columns], jnp.inf)
-    by_subgoal = by_subgoal.at[rows, columns].min(at_subgoals)
-    by_cell = jnp.where(situation.subgoals.frontier[:, :, None], situation.distances, jnp.inf)
-    cost = jnp.where(jnp.isfinite(jnp.min(by_subgoal)), by_subgoal, by_cell)
-    cell, state = _unravel(jnp.argmin(cost.reshape(-1)), cost.shape)
-    return cell, state, jnp.min(cost)
-
-
-def move_to(
-    situation: Situation,
-    config: DecisionConfig,
-    kind: Int32[Array, ""],
-    target_cell: Int32[Array, "2"],
-    target_state: Int32[Array, ""],
-    value: Float32[Array, ""],
-    action: Int32[Array, ""] | None = None,
-    search: Search | None = None,
-    intention: Intention | None = None,
-    status: UInt32[Array, ""] | None = None,
-) -> Move:
-    """The move to a product state in known space: the shortest path there, and what goes into the record.
-
-    Args:
-        situation: of the decision.
-        config: settings; ``config.path_horizon`` limits the path.
-        kind: one of ``MoveKind``; NONE stays where the robot is.
-        target_cell: where to go; a known free cell.
-        target_state: the automaton's state in which to arrive there, such that ``situation.distances`` is finite.
-        value: what the policy expects the task to cost from here; for the record.
-        action: index of the chosen action, where the policy searches.
-        search: what it considered, where it searches.
-        intention: for the next decision.
-        status: bits to report beside those of the subgoals.
-
-    Returns:
-        The move; its path has length 0 where the target is out of reach.
-    """
-    goes = kind != MoveKind.NONE
-    cell = jnp.where(goes, target_cell, situation.cell).astype(jnp.int32)
-    state = jnp.where(goes, target_state, situation.state).astype(jnp.int32)
-    path = shortest_path(
-        situation.distances,
-        situation.transitions,
-        situation.belief.free,
-        situation.cell,
-        situation.state,
-        cell,
-        state,
-        horizon=config.horizon(*situation.belief.cells.shape),
-        resolution=situation.belief.resolution,
-    )
-    bits = status_array() if status is None else status
-    return Move(
-        kind=kind.astype(jnp.int32),
-        target_cell=cell,
-        target_state=state,
-        action=jnp.int32(NO_ACTION) if action is None else action,
-        value=value,
-        path=path,
-        subgoals=situation.subgoals,
-        search=search,
-        intention=Intention.none() if intention is None else intention,
-        status=bits | situation.subgoals.status | status_if(~goes, Status.NO_FRONTIER),
-    )
-
-
-def _unravel(index: Int32[Array, ""], shape: tuple[int, ...]) -> tuple[Int32[Array, "2"], Int32[Array, ""]]:
-    """Cell and state of an index into a flattened [H, W, Z] array."""
-    _, width, states = shape
-    index = index.astype(jnp.int32)
-    return jnp.stack([index // (width * states), (index // states) % width]), index % states
 
 
 decide_jit = jax.jit(decide, static_argnames=("policy", "config"))

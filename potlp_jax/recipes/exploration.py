@@ -18,7 +18,7 @@ from jaxtyping import Array, Int32
 from potlp_jax.learning.questions import LARGEST
 from potlp_jax.learning.recording import Pose
 from potlp_jax.planning.distances.paths import KnownPath, shortest_path
-from potlp_jax.planning.policies import Situation, assess
+from potlp_jax.planning.situation import Situation, assess
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.robot import SimulatedRobot

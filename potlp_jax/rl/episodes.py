@@ -24,7 +24,9 @@ from jaxtyping import Array, Bool, Float32, Int8, Int32, PRNGKeyArray
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import Split
 from potlp_jax.planning.commitment import Intention
-from potlp_jax.planning.policies import Move, MoveKind, Policy, Situation, assess, move_to, policy_function
+from potlp_jax.planning.move import Move, MoveKind, move_to
+from potlp_jax.planning.policies import Policy, policy_function
+from potlp_jax.planning.situation import Situation, assess
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 from potlp_jax.trials.record import Outcome

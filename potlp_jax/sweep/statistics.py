@@ -35,7 +35,7 @@ UNRELIABLE: Status = Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW
 subgoals are kept is part of the model, docs/model.md section 6.)"""
 
 CONFIDENCE: float = 0.95
-# With 9,999 resamples the 2.5 % tails hold 250 values each. 10,000 less one, so that the quantiles are resamples.
+# 10,000 less one: the ends of the interval are then the 250th resample from either side.
 RESAMPLES: int = 9_999
 
 # Numbers that SciPy draws at once: three float64 arrays of this many entries take 48 MB.

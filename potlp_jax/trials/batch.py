@@ -124,6 +124,7 @@ def _run(
         # Parameters are the same in all slots; what a robot has seen is its own.
         views, shared = asked.start(*first.world.shape).memory, asked.params
     slots: tuple[Scene, Progress] = _empty_slots(first, views, setup, count)
+    # Which trial is in which slot is the host's matter; the device knows slots alone.
     held: list[Start | None] = [None] * count
     seconds = np.zeros(count)
     while True:
@@ -135,9 +136,12 @@ def _run(
         occupied = [slot for slot, start in enumerate(held) if start is not None]
         if not occupied:
             return
+        # One call to the device runs all slots until one of them ends: as few round trips as there are trials.
         began = time.perf_counter()
         slots = _run_until_one_ends(slots, shared, setup=setup)
+        # The only thing read back in every round; the rest only of slots that have ended.
         ended = ~np.asarray(slots[1].tally.running)
+        # Slots run in one program: each is charged an equal share.
         seconds[occupied] += (time.perf_counter() - began) / len(occupied)
         for slot in occupied:
             start = held[slot]
@@ -152,6 +156,7 @@ def _check_shapes(start: Start, first: Start) -> None:
         # They are static parts of the arrays: JAX could not put both into one batch, and would say so obscurely.
         if mine != other:
             raise BatchError(f"trial {start.name!r}: its world has the {what} {mine}, the first of the batch {other}")
+    # Another shape would compile anew in the middle of the batch, without a word: refused instead.
     for what, mine, other in (("world", start.world, first.world), ("task", start.arrays, first.arrays)):
         found, expected = ([leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (mine, other))
         if found != expected:
@@ -182,6 +187,7 @@ def _finished(start: Start, progress: Progress, slot: int, seconds: float) -> Fi
 
 def _empty_slots(first: Start, views: PanoramaMemory | None, setup: Setup, count: int) -> tuple[Scene, Progress]:
     """Slots without trials, of the shape of ``first``."""
+    # Any trial gives the shapes; its values never run, for the slot is marked empty.
     scene, progress = begin(first.world, first.arrays, first.key, views, setup=setup)
     progress = dataclasses.replace(progress, tally=dataclasses.replace(progress.tally, outcome=jnp.int8(EMPTY)))
     return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], count, axis=0), (scene, progress))
@@ -198,6 +204,7 @@ def _fill(
     *,
     setup: Setup,
 ) -> tuple[Scene, Progress]:
+    # Donated: the arrays of all slots are changed in place instead of copied for each new trial.
     new = begin(world, arrays, key, views, setup=setup)
     return jax.tree.map(lambda leaf, entry: leaf.at[slot].set(entry), slots, new)
 
@@ -205,6 +212,7 @@ def _fill(
 @partial(jax.jit, static_argnames="setup", donate_argnums=0)
 def _run_until_one_ends(slots: tuple[Scene, Progress], asked: Asked, *, setup: Setup) -> tuple[Scene, Progress]:
     scene, progress = slots
+    # Until fewer run than at the beginning: then a slot is free, and the host gives it a trial.
     running = jnp.sum(progress.tally.running)
 
     def all_still_run(now: Progress) -> Bool[Array, ""]:

@@ -8,7 +8,7 @@ from typing import Any
 from potlp_jax.codec import with_settings
 from potlp_jax.environments.base import Generator
 from potlp_jax.errors import PotlpWarning
-from potlp_jax.planning.policies import DecisionConfig
+from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.world.camera import CameraConfig, Disturbance
 from potlp_jax.world.grid import World
 from potlp_jax.world.sensing import SensorConfig
@@ -18,14 +18,21 @@ from potlp_jax.world.sensing import SensorConfig
 class TrialConfig:
     """Settings of a trial (docs/model.md section 7).
 
-    ``replan_distance`` is in cells; ``budget_factor`` times the map's ``height + width`` cells may be travelled;
-    ``revealed`` starts from the whole map. ``camera`` and ``disturbance`` matter to policies that look.
+    Attributes:
+        decision: how a policy decides.
+        sensor: what a simulated robot observes.
+        camera: the panoramas of a simulated robot.
+        disturbance: of these panoramas.
+        replan_distance: cells travelled after which a changed map is worth a new decision.
+        budget_factor: times the map's ``height + width`` is the number of cells that may be travelled.
+        revealed: whether a simulated robot knows the whole map from the start.
     """
 
     decision: DecisionConfig = DecisionConfig()
     sensor: SensorConfig = SensorConfig()
     camera: CameraConfig = CameraConfig()
     disturbance: Disturbance = Disturbance()
+    # Both are part of the model (docs/model.md section 7): another value gives other trials.
     replan_distance: float = 4.0
     budget_factor: float = 20.0
     revealed: bool = False

@@ -16,7 +16,8 @@ from jaxtyping import Int32, PRNGKeyArray
 from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator, identity_of, observe_panorama
 from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimator
-from potlp_jax.planning.policies import Move, MoveKind, Policy, PolicyFunction, decide, named_policy, policy_name
+from potlp_jax.planning.move import Move, MoveKind
+from potlp_jax.planning.policies import Policy, PolicyFunction, decide, named_policy, policy_name
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials import rules
 from potlp_jax.trials.config import TrialConfig, config_in
@@ -28,6 +29,7 @@ from potlp_jax.world.moves import Cell, as_cell, path_length
 
 logger = logging.getLogger(__name__)
 
+# Compiled once per policy, configuration and array shapes: no trial after the first compiles anything.
 _decide = jax.jit(decide, static_argnames=("policy", "config"))
 _first_tally = jax.jit(rules.first_tally)
 _count_decision = jax.jit(rules.count_decision)
@@ -69,6 +71,7 @@ def run_trial(
     """
     policy = named_policy(policy)
     config = rules.config_of(policy, config_in(world, config))
+    # One key for everything, and a use of its own for each: disturbing the camera does not change the search.
     robot = SimulatedRobot(world, config, rules.sensing_key(key))
     asked = rules.estimator_of(policy, task.propositions, estimator)
     run = run_robot(robot, task, policy, key, config, arrays=arrays, estimator=asked, world=world)
@@ -146,6 +149,7 @@ class _Loop:
 
     def run(self) -> RunRecord:
         """Loop until the task is satisfied or cannot go on."""
+        # Algorithm 1 ends at acceptance; budget, repetition and a robot that ends are ours (docs/model.md section 7).
         gave_up, leg = False, Leg(cells=())
         while True:
             belief, cell = self._robot.observe()
@@ -153,15 +157,20 @@ class _Loop:
             self._tally = _arrive(self._tally, belief, at, self._arrays, jnp.asarray(gave_up), config=self._config)
             if not bool(self._tally.running):
                 return self._result(rules.OUTCOMES[int(self._tally.outcome)], belief)
+            # Asked only now: the last cells of a log may well decide the task.
             if leg.ended:
                 return self._result(Outcome.UNFINISHED, belief)
             move = self._decide(belief, cell)
             leg = self._advance(belief, move)
+            # Without a move a simulated robot stays, and the task is infeasible. A robot in a log goes on, and there
+            # may be a move again later.
             gave_up = int(move.kind) == MoveKind.NONE and not leg.cells and not leg.ended
 
     def _decide(self, belief: BeliefMap, cell: Cell) -> Move:
         index = len(self._decisions)
+        # By the number of the decision: the same whatever was drawn before it.
         at, key = jnp.asarray(cell, jnp.int32), rules.decision_key(self._key, index)
+        # Before the decision, so that its estimates know what can be seen from here.
         if isinstance(self._estimator, NetworkEstimator):
             self._estimator = observe_panorama(self._estimator, self._robot.panorama(), belief, at)
         move = _decide(
@@ -186,19 +195,21 @@ class _Loop:
         self._tally = _count_decision(self._tally, move)
         planned = np.asarray(move.path.cells)[1 : len(leg.cells) + 1]
         if leg.cells != tuple(as_cell(cell) for cell in planned):
-            # A robot that went elsewhere is not on its way to what was chosen.
+            # A robot that went elsewhere is not committed to what was chosen.
             self._tally = dataclasses.replace(self._tally, intention=Intention.none())
         self._enter(leg.cells)
         return leg
 
     def _enter(self, cells: tuple[Cell, ...]) -> None:
         """Read the letters of the cells entered, up to where they decide the task."""
+        # All at once after the leg: what was entered has been observed, and letters do not change.
         letters = np.asarray(self._robot.observe()[0].letters)
         straight, diagonal = int(self._tally.straight), int(self._tally.diagonal)
         for cell in cells:
             state = self._states[-1]
             if self._dfa.accepting[state] or self._dfa.trap[state]:
                 break
+            # Where the robot really went, which need not be where it was told to go.
             is_diagonal = cell[0] != self._path[-1][0] and cell[1] != self._path[-1][1]
             straight, diagonal = straight + (not is_diagonal), diagonal + is_diagonal
             letter = int(letters[cell])
@@ -266,5 +277,6 @@ def make_trial(
 
 def versions(estimator: TrainedEstimator | Estimator | None = None) -> dict[str, str]:
     """Versions of what a trial's figures depend on; with the estimator's identity where it asked one."""
+    # What can change a figure: the planner, its numerics, and NumPy's generators that draw worlds.
     libraries = {name: importlib.metadata.version(name) for name in ("potlp-jax", "jax", "numpy")}
     return libraries if estimator is None else libraries | {"estimator": identity_of(estimator)}

@@ -10,7 +10,7 @@ from potlp_jax.learning.estimator import NetworkEstimator
 from potlp_jax.learning.memory import observation_of_subgoals
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.history import ActionTerms
-from potlp_jax.planning.policies import Move, MoveKind
+from potlp_jax.planning.move import Move, MoveKind
 from potlp_jax.trials.record import ActionRecord, Decision
 from potlp_jax.types import NO_ACTION
 from potlp_jax.world.moves import Cell, as_cell
@@ -53,6 +53,7 @@ def decision_of(
     """
     kind = int(move.kind)
     goes = kind != MoveKind.NONE
+    # Paths have a fixed length on the device; behind ``length`` they repeat the target.
     path = np.asarray(move.path.cells)[: int(move.path.length) + 1]
     return Decision(
         index=index,
@@ -61,6 +62,7 @@ def decision_of(
         state=state,
         key=tuple(int(word) for word in jax.random.key_data(key)),
         kind=_KIND_NAMES[kind],
+        # The action that is carried out; ``preferred`` is the one that the search found.
         choice=_recorded_index(move, int(move.action)),
         target=as_cell(move.target_cell) if goes else None,
         target_state=int(move.target_state) if goes else None,
@@ -79,6 +81,7 @@ def _observations(estimator: Estimator | None, move: Move) -> tuple[int, ...]:
     """Per subgoal, the decision whose panorama its estimates come from; there is one panorama per decision."""
     if not isinstance(estimator, NetworkEstimator):
         return ()
+    # A subgoal may be out of sight from here and be known from an earlier panorama.
     numbers = np.asarray(_observation_numbers(estimator.memory, move.subgoals))
     return tuple(int(number) for number in numbers[np.asarray(move.subgoals.mask)])
 
@@ -87,6 +90,7 @@ def _recorded_index(move: Move, action: int) -> int | None:
     """Index of an action in the task's own arrays: records do not depend on how a trial padded its edges."""
     if action == NO_ACTION or move.search is None:
         return None
+    # Padded edges lengthen each subgoal's row of actions; finish, after the last row, is renumbered likewise.
     edge_mask = np.asarray(move.search.problem.task.edge_mask)
     subgoal, edge = divmod(action, len(edge_mask))
     return subgoal * int(np.sum(edge_mask)) + edge
@@ -103,6 +107,7 @@ def _action_records(move: Move) -> tuple[ActionRecord, ...]:
     }
     q_values, visits = np.asarray(move.search.plan.q_values), np.asarray(move.search.plan.visits)
     records = []
+    # Nothing is recorded of actions that cannot be taken: most of subgoals times edges.
     for index in np.flatnonzero(terms["available"]):
         subgoal, edge = divmod(int(index), len(edges))
         # The last action, beyond all pairs of subgoal and edge, is to finish in known space.

@@ -182,7 +182,7 @@ class Trial(RunRecord):
             "policy": self.policy,
             "task": self.task_text,
             "environment": self.environment,
-            "seed": self.seed,
+            "world": self.seed,
             "status": list(status_names(self.status)),
         }
 
@@ -194,6 +194,7 @@ class Trial(RunRecord):
             if field.name not in ("decisions", "first_seen", "world")
         }
         data["outcome"] = str(self.outcome)
+        # Arrays are packed; everything else is readable JSON.
         data["decisions"] = [dataclasses.asdict(decision) for decision in self.decisions]
         data["first_seen"] = pack_array(self.first_seen)
         data["world"] = world_to_dict(self.world)
@@ -206,10 +207,13 @@ class Trial(RunRecord):
 
 def belief_seen_by(world: World, first_seen: Int32[np.ndarray, "H W"], step: int) -> BeliefMap:
     """The belief of a robot that saw each cell first at step ``first_seen`` (or ``NEVER_SEEN``), after ``step``."""
+    # One number per cell stands for all beliefs of a trial: known space only grows.
     seen = (first_seen != NEVER_SEEN) & (first_seen <= step)
+    # What is observed is observed rightly: the sensor is exact (docs/model.md section 7).
     truth = np.where(np.asarray(world.occupied), BeliefMap.OCCUPIED, BeliefMap.FREE)
     cells = np.where(seen, truth, BeliefMap.UNKNOWN)
     letters = np.where(seen, np.asarray(world.letters), 0)
+    # The extent is known from the start, whatever the padding: budget and dead ends are counted by it.
     height, width = (int(size) for size in world.extent)
     return belief_from_numpy(cells, letters, float(world.resolution), (height, width))
 
@@ -220,6 +224,7 @@ def load_trial(path: Path) -> Trial:
         data = json.loads(path.read_text())
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise RecordError(f"{path}: cannot be read as a trial record: {error}") from error
+    # Another format is told apart from damage: the remedies differ.
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         found = data.get("format") if isinstance(data, dict) else type(data).__name__
         raise RecordError(f"{path}: not a trial record of format {FORMAT!r} (found {found!r}); run `potlp run` again")
@@ -239,6 +244,7 @@ def _trial_from_dict(data: Mapping[str, Any]) -> Trial:
     values["propositions"] = tuple(data["propositions"])
     values["decisions"] = tuple(_decision_from_dict(decision) for decision in data["decisions"])
     values["first_seen"] = unpack_array(data["first_seen"])
+    # Lists become tuples throughout: records are compared, and used as keys.
     values["world"] = world_from_dict(data["world"])
     return Trial(**values)
 
@@ -253,6 +259,7 @@ def _decision_from_dict(data: Mapping[str, Any]) -> Decision:
     values["path"] = _cells(data["path"])
     values["observations"] = tuple(data["observations"])
     values["actions"] = tuple(_action_from_dict(action) for action in data["actions"])
+    # An index that points nowhere would fail later, in a picture or a page, far from the file.
     listed = {action.index for action in values["actions"]}
     for name in ("choice", "preferred"):
         if values[name] is not None and values[name] not in listed:
@@ -263,6 +270,7 @@ def _decision_from_dict(data: Mapping[str, Any]) -> Decision:
 def _action_from_dict(data: Mapping[str, Any]) -> ActionRecord:
     values = dict(data)
     values["cell"] = None if data["cell"] is None else tuple(data["cell"])
+    # Infinite costs are written as text, which ``float`` reads back.
     for name in ("success_probability", "success_cost", "failure_cost", "distance", "q_value"):
         values[name] = float(data[name])
     return ActionRecord(**values)

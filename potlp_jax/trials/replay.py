@@ -12,11 +12,12 @@ from potlp_jax.errors import CheckpointError, RecordError
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, observe_panorama
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.estimates import Estimator, ask
-from potlp_jax.planning.policies import DecisionConfig, Policy, assess, planning_problem
+from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import Plan, search_tree
 from potlp_jax.planning.search.graph import Tree
 from potlp_jax.planning.search.uct import UctTree
+from potlp_jax.planning.situation import DecisionConfig, assess, planning_problem
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import LOG_PREFIX, Decision, Trial
@@ -48,6 +49,7 @@ def replay_decision(
     if trial.policy not in (Policy.ORACLE, Policy.POTLP):
         raise RecordError(f"policy {trial.policy!r} does not search: its decisions have no tree")
     decision = trial.decisions[index]
+    # From the automaton in the record: formulas need Spot, and a record is read without it.
     task = Task.from_hoa(trial.task_hoa, propositions=trial.propositions)
     config = config_from_dict(TrialConfig, trial.config, "trial record")
     problem = _replayed_problem(
@@ -58,6 +60,7 @@ def replay_decision(
         _replayed_estimator(trial, index, task, estimator, config),
         config.decision,
     )
+    # The decision's own key: no need to know how it came from the trial's.
     key = jax.random.wrap_key_data(jnp.asarray(decision.key, jnp.uint32))
     plan, tree = search_tree(problem, key, config.decision.search)
     return problem, plan, tree
@@ -70,12 +73,14 @@ def _replayed_estimator(
     if trial.policy != Policy.POTLP:
         return TrueMapEstimator(world=trial.world)
     trained = estimator_for(task.propositions, estimator)
+    # Another network would answer otherwise, and the replay would explain a decision that was never taken.
     if trial.versions.get("estimator") != trained.identity:
         raise CheckpointError(
             f"the trial was made with the estimator {trial.versions.get('estimator')}, not {trained.identity}: "
             "give that one"
         )
     asked = trained.start(*trial.world.shape)
+    # The decision's own panorama included: it is taken before the decision.
     for decision in trial.decisions[: index + 1]:
         cell = jnp.asarray(decision.cell, jnp.int32)
         asked = observe_panorama(asked, panorama_at(trial, decision, config), trial.belief_at(decision.step), cell)
@@ -102,6 +107,7 @@ def panorama_at(trial: Trial, decision: Decision, config: TrialConfig | None = N
             "are in the log, and in the page that `potlp log replay` wrote"
         )
     config = config_from_dict(TrialConfig, trial.config, "trial record") if config is None else config
+    # The record does not hold the sensors' key.
     if config.disturbance != Disturbance():
         raise RecordError("the trial's camera was disturbed: its panoramas cannot be made without the trial's key")
     cell = jnp.asarray(decision.cell, jnp.int32)
@@ -109,11 +115,13 @@ def panorama_at(trial: Trial, decision: Decision, config: TrialConfig | None = N
 
 
 def panoramas_of(trial: Trial) -> dict[int, UInt8[np.ndarray, "rows columns 3"]]:
-    """What the camera saw at the decisions whose panoramas were used, by number; none for policies that do not look."""
-    used = sorted({number for decision in trial.decisions for number in decision.observations})
-    return {number: np.asarray(panorama_at(trial, trial.decisions[number])) for number in used}
+    """What the camera saw at the decisions whose panoramas were used, by number; none where a policy takes none."""
+    # Several subgoals, and several decisions, share a panorama: each is rendered once.
+    numbers = sorted({number for decision in trial.decisions for number in decision.observations})
+    return {number: np.asarray(panorama_at(trial, trial.decisions[number])) for number in numbers}
 
 
+# Compiled like the decision itself, so that rounding is the same and equal plans stay equal.
 @partial(jax.jit, static_argnames=("config",))
 def _replayed_problem(
     belief: BeliefMap,

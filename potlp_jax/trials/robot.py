@@ -80,6 +80,7 @@ class SimulatedRobot:
         self._key = jax.random.key(0) if key is None else key
         self._cell = world.start
         self._steps = 0
+        # What can be seen from the start counts as seen at step 0.
         self._belief = _observe(initial_belief(world, config), world, world.start, config.sensor)
         self._first_seen = first_seen_at_start(self._belief)
 
@@ -94,6 +95,7 @@ class SimulatedRobot:
 
     def panorama(self) -> UInt8[Array, "rows columns 3"]:
         """What the camera sees from the robot's cell, disturbed anew after every step."""
+        # By the number of moves, as in a batch: a panorama depends on where it was taken, not on how many were.
         key = jax.random.fold_in(self._key, self._steps)
         return photograph(self._world, self._cell, key, self._config.camera, self._config.disturbance)
 
@@ -102,8 +104,10 @@ class SimulatedRobot:
         self._belief, self._first_seen, moved = follow(
             self._world, self._belief, self._first_seen, path, jnp.int32(self._steps), stop, self._config.sensor
         )
+        # The one number that the host needs of a leg; beliefs stay on the device.
         moved = int(moved)
         cells = np.asarray(path.cells)[1 : moved + 1]
+        # Kept on the device: the next photograph and observation need it there.
         self._cell = path.cells[moved]
         self._steps += moved
         return Leg(cells=tuple(as_cell(cell) for cell in cells))
@@ -139,6 +143,7 @@ def photograph(
         RGB, the columns by bearing in the frame of the map.
     """
     image = render(world, cell, camera)
+    # The disturbance is static: a camera without one compiles no random draws.
     return image if disturbance == Disturbance() else disturb(image, key, disturbance)
 
 
@@ -166,6 +171,7 @@ def follow(
     Returns:
         The belief, the step at which each cell was first observed, and the number of moves made.
     """
+    # At the decision, not at each cell: the leg stops for what is new since then.
     before = Knowledge.of(belief)
     target = path.cells[path.length]
 
@@ -181,6 +187,7 @@ def follow(
         # On a map that is wholly known there is nothing to observe.
         observed = partial(observe, world=world, cell=there, config=config)
         belief = jax.lax.cond(jnp.any(belief.unknown), observed, lambda belief: belief, belief)
+        # Steps count from the start of the trial; the cell just entered is number ``steps + moved + 1``.
         first_seen = jnp.where((first_seen == NEVER_SEEN) & ~belief.unknown, steps + moved + 1, first_seen)
         return belief, first_seen, moved + 1, travelled + step_length(here, there)
 

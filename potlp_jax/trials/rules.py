@@ -19,7 +19,8 @@ from potlp_jax.learning.estimator import TrainedEstimator, estimator_for
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimator
-from potlp_jax.planning.policies import Move, MoveKind, Policy, PolicyFunction
+from potlp_jax.planning.move import Move, MoveKind
+from potlp_jax.planning.policies import Policy, PolicyFunction
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import Outcome
@@ -34,6 +35,7 @@ decide once per change of the map, so that a second visit is already rare and a 
 OUTCOMES: tuple[Outcome, ...] = tuple(Outcome)
 """What ``Tally.outcome`` is an index into."""
 
+# Below every index, and an ``EMPTY`` slot below it: neither is mistaken for an outcome.
 RUNNING: int = -1
 """``Tally.outcome`` of a trial that goes on."""
 
@@ -90,6 +92,7 @@ def estimator_of(
     Raises:
         CheckpointError: a trained estimator knows other propositions, or none is shipped for these.
     """
+    # The shipped one is read late, so that policies which ask nothing need none.
     asked = asked_of(policy, given)
     if policy is Policy.POTLP and (asked is None or isinstance(asked, TrainedEstimator)):
         return estimator_for(propositions, asked)
@@ -126,6 +129,7 @@ def first_estimator(
     Raises:
         PotlpError: the policy is ``oracle`` and nobody knows the true map.
     """
+    # The oracle is PO-TLP with the answers that the map itself gives (docs/model.md section 8).
     if policy is Policy.ORACLE:
         if world is None:
             raise PotlpError("policy oracle asks the true map: give it as world, or choose another policy")
@@ -159,7 +163,7 @@ class Stop:
         target: Int32[Array, "2"],
         travelled: Float32[Array, ""],
     ) -> Bool[Array, ""]:
-        """Whether to stop here, on the way to ``target``. Pure, for host and device.
+        """Whether to stop here, before or at ``target``. Pure, for host and device.
 
         Args:
             before: what was known at the decision.
@@ -168,11 +172,14 @@ class Stop:
             travelled: cells since the decision.
 
         Returns:
-            True where a new decision is due. The end of the path is not looked at.
+            True where a new decision is due. That the path has ended is for the robot to know.
         """
+        # docs/model.md section 7, "Advance": each line below is one of its reasons to decide again.
         now = Knowledge.of(belief)
         replans = (now.cells > before.cells) & (travelled >= self.replan_distance)
+        # A proposition seen for the first time may be what the task is about: not to be passed by for four cells.
         surprised = (now.propositions & ~before.propositions) != 0
+        # Whatever was to be seen from the target has been seen from cells before it.
         pointless = self.is_frontier & ~is_beside(belief.unknown, target, beyond=True)
         return replans | surprised | pointless | (travelled >= self.budget)
 
@@ -218,6 +225,7 @@ def stop_of(move: Move, tally: "Tally", belief: BeliefMap, config: TrialConfig) 
     is_frontier = (move.kind == MoveKind.ACTION) | (move.kind == MoveKind.FRONTIER) | (move.kind == MoveKind.FALLBACK)
     return Stop(
         replan_distance=jnp.float32(config.replan_distance),
+        # In float32 on host and device alike, so that a leg ends on the same cell in a trial and in a batch.
         budget=budget(belief, config) - tally.travelled,
         is_frontier=is_frontier,
     )
@@ -225,6 +233,7 @@ def stop_of(move: Move, tally: "Tally", belief: BeliefMap, config: TrialConfig) 
 
 def budget(belief: BeliefMap, config: TrialConfig) -> Float32[Array, ""]:
     """Cells that may be travelled in a trial."""
+    # By the extent, not the array: padding a map gives nobody more to travel.
     return jnp.float32(config.budget_factor) * jnp.sum(belief.extent).astype(jnp.float32)
 
 
@@ -243,7 +252,7 @@ class Tally:
         decisions: number of decisions.
         fallbacks: decisions that fell back on the nearest frontier.
         status: bits of ``Status`` of all decisions.
-        intention: what the robot is on its way to.
+        intention: the target that the robot is committed to.
         outcome: index into ``OUTCOMES``, or ``RUNNING``.
     """
 
@@ -251,6 +260,7 @@ class Tally:
     straight: Int32[Array, "*batch"]
     diagonal: Int32[Array, "*batch"]
     known: Int32[Array, "*batch"]
+    # A table, not a list of places: fixed in shape, so that it lives on the device.
     visits: Int8[Array, "*batch H W Z"]
     decisions: Int32[Array, "*batch"]
     fallbacks: Int32[Array, "*batch"]
@@ -276,6 +286,7 @@ class Tally:
 
 def first_tally(belief: BeliefMap, cell: Int32[Array, "2"], task: TaskArrays) -> Tally:
     """Of a trial that has not begun: the letter of the robot's first cell is read."""
+    # The word begins with the letter of the first cell: a start may satisfy or violate the task.
     height, width = belief.cells.shape
     letter = belief.letters[cell[0], cell[1]]
     return Tally(
@@ -283,6 +294,7 @@ def first_tally(belief: BeliefMap, cell: Int32[Array, "2"], task: TaskArrays) ->
         straight=jnp.int32(0),
         diagonal=jnp.int32(0),
         known=jnp.int32(0),
+        # A byte will do: a trial is stuck after three.
         visits=jnp.zeros((height, width, task.transitions.shape[0]), jnp.int8),
         decisions=jnp.int32(0),
         fallbacks=jnp.int32(0),
@@ -325,6 +337,7 @@ def arrive(
     Returns:
         The tally with this visit counted and the outcome set.
     """
+    # Counted where decisions are taken, not along the path: a corridor may be passed as often as the task wants.
     here = (cell[0], cell[1], tally.state)
     known = count_known(belief)
     # A map that has changed is another situation: all visits begin anew.

@@ -22,18 +22,10 @@ from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.memory import PanoramaMemory, remember
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
 from potlp_jax.planning.estimates import Estimates, Estimator, ask
-from potlp_jax.planning.policies import (
-    Move,
-    MoveKind,
-    Policy,
-    PolicyFunction,
-    Situation,
-    assess,
-    planned_move,
-    planning_problem,
-    policy_function,
-)
+from potlp_jax.planning.move import Move, MoveKind
+from potlp_jax.planning.policies import Policy, PolicyFunction, planned_move, policy_function
 from potlp_jax.planning.search.api import plan_actions
+from potlp_jax.planning.situation import Situation, assess, planning_problem
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.robot import first_seen_at_start, follow, initial_belief, photograph
@@ -128,6 +120,7 @@ def begin(
         What stays and what changes. The trial may have ended already, where its first letter decides the task.
     """
     config = setup.config
+    # As ``SimulatedRobot`` does, in the same order.
     belief = observe(initial_belief(world, config), world, world.start, config.sensor)
     height, width = world.shape
     # The budget is checked between legs only, and a leg is no longer than the horizon; diagonal moves are fewer.
@@ -161,6 +154,7 @@ def step(scene: Scene, asked: Asked, setup: Setup, progress: Progress) -> Progre
     Returns:
         The progress; that of slots which are not running is unchanged.
     """
+    # The library's searches have a kernel that takes all slots at once; any other policy is asked slot by slot.
     if setup.searches:
         return _search_together(scene, asked, setup, progress)
     return _each(partial(_decide_alone, setup, asked), progress, scene)
@@ -177,6 +171,7 @@ def _search_together(scene: Scene, asked: Asked, setup: Setup, progress: Progres
         return views, situation, problem, key
 
     views, situation, problem, keys = _each(prepare, progress, scene)
+    # ``plan_actions`` turns this vmap into one kernel with a batch axis: its loop ends when the last slot is done.
     plans = jax.vmap(lambda problem, key: plan_actions(problem, key, decision.search))(problem, keys)
 
     def act(progress: Progress, scene: Scene, *considered: Any) -> Progress:
@@ -184,6 +179,7 @@ def _search_together(scene: Scene, asked: Asked, setup: Setup, progress: Progres
         move = _phase(tally.running, partial(planned_move, config=decision), *considered, tally.intention)
         return advance(setup, progress, scene, move)
 
+    # Intentions come from the progress, not from the search: commitment is applied when the plan is carried out.
     return _each(act, dataclasses.replace(progress, views=views), scene, situation, problem, plans)
 
 
@@ -248,6 +244,7 @@ def _consider(
         progress.tally.state,
         scene.task,
     )
+    # Known when tracing: a policy without an estimator has no such phase in its program.
     estimates = None
     if _estimator(setup, asked, views, scene) is not None:
 
@@ -257,6 +254,7 @@ def _consider(
             return ask(estimator, progress.belief, subgoals, scene.task, progress.tally.state)
 
         estimates = _phase(running, estimate, dataclasses.replace(progress, views=views), situation.subgoals, scene)
+    # As in the loop: by the number of the decision.
     return views, situation, estimates, decision_key(scene.planning, progress.tally.decisions)
 
 
@@ -265,6 +263,7 @@ def _take_panorama(
 ) -> PanoramaMemory:
     """What is remembered after a panorama from here."""
     config, running = setup.config, progress.tally.running
+    # As ``SimulatedRobot.panorama``.
     key = jax.random.fold_in(scene.sensing, progress.tally.steps)
     camera = partial(photograph, camera=config.camera, disturbance=config.disturbance)
     panorama = _phase(running, camera, scene.world, progress.cell, key)
@@ -277,6 +276,7 @@ def _take_panorama(
 
 def _estimator(setup: Setup, asked: Asked, views: PanoramaMemory | None, scene: Scene) -> Estimator | None:
     """What the policy asks in one slot."""
+    # Decided when tracing: each slot has its own map, its own panoramas, or shares what it asks.
     if setup.policy is Policy.ORACLE:
         return TrueMapEstimator(world=scene.world)
     if setup.network is not None and views is not None:
@@ -316,7 +316,9 @@ def _went(
     progress: Progress, move: Move, belief: BeliefMap, first_seen: Int32[Array, "H W"], moved: Int32[Array, ""]
 ) -> Progress:
     """After ``moved`` moves along the move's path."""
+    # The simulated robot goes where the path does, so that moves and states are read from it.
     cells, tally = move.path.cells, progress.tally
+    # Over the whole path at once; moves that were not made are masked.
     diagonal = (step_length(cells[:-1], cells[1:]) > 1.0) & (jnp.arange(cells.shape[0] - 1) < moved)
     diagonals = jnp.sum(diagonal, dtype=jnp.int32)
     # What is written beyond the moves made is overwritten by the next ones.

@@ -41,6 +41,8 @@ def problems_of(trial: Trial, task: Task) -> list[str]:
     if list(trial.word) != word:
         found.append("the word is not that of the path")
     found += _entered_before_observed(trial)
+    # Ends that are nobody's fault - the task cannot be done here, or a branch was a mistake that could not be known -
+    # are no problem. Where nothing can go wrong, not ending satisfied is a fault of the planner.
     if trial.outcome is not Outcome.SATISFIED and satisfaction_is_promised(trial, task):
         found.append(f"ended {trial.outcome} although acceptance stays within reach of every state")
     return found
@@ -104,6 +106,7 @@ def satisfaction_is_promised(trial: Trial, task: Task) -> bool:
     if dfa.trap[first[1]]:
         return False
     came_from = _explore(_free(trial.world), letters, task, first)
+    # Acceptance is never left again, so that reaching it once is winning.
     winning = {node for node in came_from if dfa.accepting[node[1]]}
     # Backwards from acceptance: whatever can get there.
     queue = deque(winning)
@@ -127,6 +130,7 @@ def _explore(free: Cells, letters: list[list[int]], task: Task, first: Node) -> 
             continue
         for cell, _ in _moves(free, node[0]):
             state = int(dfa.transitions[node[1], letters[cell[0]][cell[1]]])
+            # A move into a trap does not exist: no policy may make it.
             if dfa.trap[state]:
                 continue
             following = (cell, state)
@@ -164,6 +168,7 @@ def _word_of(world: World, path: Sequence[Cell]) -> list[int]:
 
 def _entered_before_observed(trial: Trial) -> list[str]:
     """The first step that enters a cell which had not been observed before that step."""
+    # The robot stands on a cell before it observes from there: what it enters must have been seen earlier.
     seen = trial.first_seen
     for step, cell in enumerate(trial.path[1:], start=1):
         if seen[cell] == NEVER_SEEN or seen[cell] >= step:

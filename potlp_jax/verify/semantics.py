@@ -27,6 +27,7 @@ Formula = tuple
 
 # Longer operators stand before their own beginnings, such as "<->" before "<>".
 _TOKEN = re.compile(r'\s*("(?:[^"\\]|\\.)*"|<->|<=>|->|=>|\[\]|<>|&&|\|\||[!&|^()01]|[A-Za-z_][A-Za-z0-9_.]*)')
+# Spot reads all of these spellings, and tasks are written for Spot.
 _ALIASES = {"&&": "&", "||": "|", "=>": "->", "<=>": "<->", "[]": "G", "<>": "F", "^": "xor", "V": "R"}
 _CONSTANTS = {"1": ("true",), "true": ("true",), "0": ("false",), "false": ("false",)}
 
@@ -48,6 +49,7 @@ def satisfies_lasso(formula: str, propositions: Sequence[str], prefix: Sequence[
     """
     if not loop:
         raise TaskError("the loop of an infinite word is empty: give at least one letter that repeats")
+    # The word as a finite graph: each position has one successor, the last one leads back to the start of the loop.
     letters = [*prefix, *loop]
     successor = [*range(1, len(letters)), len(prefix)]
     bit = {name: i for i, name in enumerate(propositions)}
@@ -125,6 +127,7 @@ class _Parser:
             return (operator, left, self.formula())
         return left
 
+    # Operators of equal strength that associate to the left are a loop, not a recursion.
     def exclusive(self) -> Formula:
         left = self.disjunction()
         while self.take("xor"):
@@ -169,6 +172,7 @@ class _Parser:
 
 def _split_operators(token: str) -> list[str]:
     """``XFa`` is X F a, as in Spot; names such as F1 or X2 are names."""
+    # A digit after the letter makes it a name, any other letter an operator in front of one.
     if re.fullmatch(r"[FGX][A-Za-z_].*|[FGX]", token):
         return [token[0], *(_split_operators(token[1:]) if len(token) > 1 else [])]
     return [token]
@@ -271,6 +275,7 @@ _DONE: Rest = frozenset({frozenset()})
 _HOPELESS: Rest = frozenset()
 
 
+# Keeping the least sets alone makes equal obligations equal sets, so that searches over them are finite.
 def _minimal(sets: set[frozenset]) -> Rest:
     return frozenset(s for s in sets if not any(other < s for other in sets))
 
@@ -345,6 +350,7 @@ def _own_letters(formula: str, propositions: tuple[str, ...]) -> tuple[frozenset
                 collect(g)
 
     collect(_parsed(formula))
+    # One letter for each combination of the names that the formula mentions: 2 to the power of few.
     own = sorted(set(names))
     unknown = sorted(set(own) - set(propositions))
     if unknown:
@@ -360,6 +366,7 @@ def _successors(rest: Rest, letters: tuple[frozenset[str], ...]) -> frozenset[Re
 @cache
 def _can_reach_done(rest: Rest, letters: tuple[frozenset[str], ...]) -> bool:
     """Some sequence of letters leads to ``_DONE``."""
+    # There are finitely many sets of sub-formulas, so this ends.
     reached, waiting = {rest}, [rest]
     while waiting:
         current = waiting.pop()

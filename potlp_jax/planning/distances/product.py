@@ -4,8 +4,8 @@ Product states are ``(cell, z)``. Grid moves are 8-connected, cost 1 and √2 ti
 a diagonal move needs both cells beside it free. Entering a cell in state ``z`` leads to ``transitions[cell, z]``.
 
 Whole grids of distances are solved by frontal sweeps (``sweeping``). A table of costs between a few cells needs no
-sweep per state where few cells carry letters that matter (``portals``): the table of a fire-fighting decision takes 3
-to 5 ms instead of 20 to 25 (docs/results/planner.md).
+sweep per state where few cells carry letters that matter (``portals``). What both cost beside Dijkstra's algorithm is
+in docs/results/planner.md.
 """
 
 import functools

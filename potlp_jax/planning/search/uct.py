@@ -132,6 +132,9 @@ class Rollout:
       nodes: node left at each level; the spare node where the row had ended.
       actions: action taken at each level.
       costs: sampled cost of each action, ``D + R_S`` or ``D + R_F``.
+      means: Q of each action before the rollout. Recorded on the way down, so that the way up only writes: XLA then
+        updates the tree in place.
+      visits: rollouts that had taken each action before.
     """
 
     level: Int32[Array, ""]
@@ -144,6 +147,8 @@ class Rollout:
     nodes: Int32[Array, "D B"]
     actions: Int32[Array, "D B"]
     costs: Float32[Array, "D B"]
+    means: Float32[Array, "D B"]
+    visits: Int32[Array, "D B"]
 
 
 @struct.dataclass(kw_only=True)
@@ -243,6 +248,7 @@ def _descend(context: Context, tree: UctTree, config: UctConfig) -> Rollout:
     """Sample a rollout from the root to an outcome without a node, or to its end."""
     batch, depth = tree.size.shape[0], config.max_depth
     nowhere = jnp.zeros((batch,), jnp.bool_)
+    integers, floats = jnp.zeros((depth, batch), jnp.int32), jnp.zeros((depth, batch), jnp.float32)
     start = Rollout(
         level=jnp.int32(0),
         active=is_open(context, tree),
@@ -252,8 +258,10 @@ def _descend(context: Context, tree: UctTree, config: UctConfig) -> Rollout:
         expands=nowhere,
         accepted=nowhere,
         nodes=jnp.full((depth, batch), tree.capacity, jnp.int32),
-        actions=jnp.zeros((depth, batch), jnp.int32),
-        costs=jnp.zeros((depth, batch), jnp.float32),
+        actions=integers,
+        costs=floats,
+        means=floats,
+        visits=integers,
     )
 
     def goes_on(rollout: Rollout) -> Bool[Array, ""]:
@@ -291,6 +299,8 @@ def _descend_once(context: Context, tree: UctTree, rollout: Rollout, config: Uct
         nodes=record(rollout.nodes, jnp.where(moves, node, tree.capacity)),
         actions=record(rollout.actions, action),
         costs=record(rollout.costs, cost),
+        means=record(rollout.means, tree.q_values[rows, node, action]),
+        visits=record(rollout.visits, tree.visits[rows, node, action]),
     )
 
 
@@ -352,8 +362,8 @@ def _back_up(tree: UctTree, rollout: Rollout, leaf: Leaf) -> UctTree:
         at = rows, rollout.nodes[level], rollout.actions[level]
         taken = rollout.nodes[level] < tree.capacity
         cost = jnp.where(taken, cost + rollout.costs[level], cost)
-        visits, mean = tree.visits[at] + 1, tree.q_values[at]
-        # Rows that had ended write to the spare node, whose mean is inf: without the condition they would make NaN.
+        visits, mean = rollout.visits[level] + 1, rollout.means[level]
+        # Rows that had ended write to the spare node. Its mean is inf, which must not become NaN.
         mean = jnp.where(taken, mean + (cost - mean) / visits.astype(jnp.float32), mean)
         tree = dataclasses.replace(
             tree,

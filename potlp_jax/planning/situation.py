@@ -1,0 +1,213 @@
+"""A decision's starting point: known space as the planner sees it, and the planning problem that it poses.
+
+References:
+  Bradley et al., Learning and Planning for Temporally Extended Tasks in Unknown Environments, ICRA 2021, III-B.
+"""
+
+import dataclasses
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float32, Int32
+
+from potlp_jax.planning.distances.product import (
+    distance_table,
+    product_distances,
+    product_transitions,
+    reachable_cells,
+    reachable_states,
+)
+from potlp_jax.planning.estimates import Estimates
+from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.search.config import SearchConfig, UctConfig
+from potlp_jax.task.task import TaskArrays
+from potlp_jax.types import NO_STATE
+from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
+from potlp_jax.world.grid import BeliefMap
+
+
+@dataclasses.dataclass(frozen=True)
+class DecisionConfig:
+    """Settings of a decision.
+
+    Attributes:
+      frontiers: how frontiers become subgoals.
+      search: which search, and its settings.
+      dead_end_factor: times ``(H + W)`` times the resolution it is the cost of a dead end (docs/model.md).
+      commitment: hysteresis: fraction of its expected cost by which another action must be cheaper before the robot
+        switches to it. 0: it switches at once, as published.
+      path_horizon: moves in the path of one decision, at most; None means ``4 (H + W)``.
+    """
+
+    frontiers: FrontierConfig = FrontierConfig()
+    search: SearchConfig | UctConfig = SearchConfig()
+    dead_end_factor: float = 4.0
+    commitment: float = 0.15
+    path_horizon: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.commitment < 0.0:
+            raise ValueError(f"commitment is {self.commitment}, must be at least 0")
+
+    def horizon(self, height: int, width: int) -> int:
+        """Moves in the path of one decision on a map of this size."""
+        return self.path_horizon if self.path_horizon is not None else 4 * (height + width)
+
+
+@struct.dataclass(kw_only=True)
+class Situation:
+    """Known space as the planner sees it from the robot's product state.
+
+    Attributes:
+      belief: what is known of the map.
+      task: arrays of the task.
+      cell: the robot's row and column.
+      state: the automaton's state, the letter of the robot's cell read.
+      transitions: state after entering a cell in a state; ``NO_STATE`` where that is impossible, and from accepting
+        states.
+      distances: path cost from the robot to a cell in a state; inf where it is out of reach.
+      subgoals: of the belief, nearest first.
+      finish_cell: cell of the nearest accepting product state in known space.
+      finish_state: its state.
+      finish_cost: its path cost; inf where acceptance is out of reach.
+    """
+
+    belief: BeliefMap
+    task: TaskArrays
+    cell: Int32[Array, "*batch 2"]
+    state: Int32[Array, "*batch"]
+    transitions: Int32[Array, "*batch H W Z"]
+    distances: Float32[Array, "*batch H W Z"]
+    subgoals: Subgoals
+    finish_cell: Int32[Array, "*batch 2"]
+    finish_state: Int32[Array, "*batch"]
+    finish_cost: Float32[Array, "*batch"]
+
+
+def assess(
+    belief: BeliefMap, cell: Int32[Array, "2"], state: Int32[Array, ""], task: TaskArrays, config: FrontierConfig
+) -> Situation:
+    """Distances, subgoals and the path to acceptance from the robot's product state.
+
+    Args:
+      belief: what is known of the map.
+      cell: the robot's cell.
+      state: the automaton's state, the letter of the robot's cell read.
+      task: arrays of the task.
+      config: how frontiers become subgoals.
+
+    Returns:
+      What every policy decides from.
+    """
+    # Nothing remains to be done after acceptance: without moves of their own, accepting states need no sweep.
+    moves = product_transitions(task, belief.letters, belief.free)
+    transitions = jnp.where(task.accepting[None, None, :], NO_STATE, moves)
+    distances = product_distances(transitions, belief.free, cell[None], state[None], belief.resolution)[0]
+    # A frontier counts as reached in whatever state: the automaton may need another state than the nearest one.
+    nearest = jnp.min(distances, axis=2)
+    reachable = reachable_cells(belief.free, cell, jnp.isfinite(nearest))
+    subgoals = find_subgoals(belief, reachable, nearest, config)
+    finish = jnp.where(task.accepting[None, None, :], distances, jnp.inf)
+    finish_cell, finish_state = cell_and_state(jnp.argmin(finish.reshape(-1)), finish.shape)
+    return Situation(
+        belief=belief,
+        task=task,
+        cell=cell,
+        state=state,
+        transitions=transitions,
+        distances=distances,
+        subgoals=subgoals,
+        finish_cell=finish_cell,
+        finish_state=finish_state,
+        finish_cost=jnp.min(finish),
+    )
+
+
+def planning_problem(situation: Situation, estimates: Estimates, config: DecisionConfig) -> PlanningProblem:
+    """The dense problem of a situation: travel through known space, and what lies beyond each subgoal.
+
+    Args:
+      situation: known space, from the robot's product state.
+      estimates: P_S, R_S and R_F of the situation's subgoals.
+      config: ``dead_end_factor`` matters.
+
+    Returns:
+      The unbatched problem.
+    """
+    task, subgoals = situation.task, situation.subgoals
+    travel, finish = _subgoal_travel(situation, estimates)
+    at_subgoals = situation.distances[subgoals.cells[:, 0], subgoals.cells[:, 1]]
+    # The robot's node has its own state alone: no rollout is there in another.
+    at_robot = jnp.arange(task.transitions.shape[0])[:, None, None] == situation.state
+    robot_travel = jnp.where(at_robot & subgoals.mask[None, :, None], at_subgoals[None], jnp.inf)
+    robot_finish = jnp.where(at_robot[:, 0, 0], situation.finish_cost, jnp.inf)
+    belief = situation.belief
+    # Of the map without padding, so that padding changes no result.
+    size = jnp.sum(belief.extent).astype(jnp.float32)
+    return PlanningProblem.from_arrays(
+        task,
+        travel=jnp.concatenate([travel, robot_travel[None]]),
+        finish=jnp.concatenate([finish, robot_finish[None]]),
+        success_probability=estimates.success_probability,
+        success_cost=estimates.success_cost,
+        failure_cost=estimates.failure_cost,
+        dfa_state=situation.state,
+        subgoal_mask=subgoals.mask,
+        dead_end_cost=config.dead_end_factor * size * belief.resolution,
+    )
+
+
+def _subgoal_travel(
+    situation: Situation, estimates: Estimates
+) -> tuple[Float32[Array, "S Z S Z"], Float32[Array, "S Z"]]:
+    """Costs from each subgoal in each state, after re-entering the subgoal's cell (docs/model.md section 5)."""
+    task, subgoals = situation.task, situation.subgoals
+    count, states = subgoals.mask.shape[0], task.transitions.shape[0]
+    # From the unknown region a rollout comes back over the subgoal's cell, and reads its letter.
+    reentered = situation.transitions[subgoals.cells[:, 0], subgoals.cells[:, 1]]
+    # Rollouts leave a subgoal only after an action there, so one where nothing can succeed needs no table. Nor does a
+    # state that no re-entry leads to from where the automaton can still get, or an accepting one.
+    promising = subgoals.mask & jnp.any(estimates.success_probability > 0.0, axis=1)
+    own = jnp.arange(states, dtype=jnp.int32)
+    ahead = jnp.where(reachable_states(task, situation.state)[None], reentered, NO_STATE)
+    needed = jnp.any(ahead[:, :, None] == own[None, None, :], axis=1) & promising[:, None] & ~task.accepting[None]
+    sources = jnp.where(needed, own[None, :], NO_STATE)
+    travel, finish = distance_table(
+        situation.transitions,
+        situation.belief.free,
+        task.accepting,
+        jnp.repeat(subgoals.cells, states, axis=0),
+        sources.reshape(-1),
+        subgoals.cells,
+        situation.belief.resolution,
+    )
+    travel = jnp.where(subgoals.mask[None, :, None], travel, jnp.inf).reshape(count, states, count, states)
+    finish = finish.reshape(count, states)
+    subgoal = jnp.arange(count)[:, None]
+    exists = reentered != NO_STATE
+    # An accepting re-entry satisfies the task at once: nothing remains to be paid.
+    accepted = exists & task.accepting[reentered]
+    finish = jnp.where(exists, jnp.where(accepted, 0.0, finish[subgoal, reentered]), jnp.inf)
+    return jnp.where(exists[:, :, None, None], travel[subgoal, reentered], jnp.inf), finish
+
+
+def nearest_frontier(situation: Situation) -> tuple[Int32[Array, "2"], Int32[Array, ""], Float32[Array, ""]]:
+    """Nearest subgoal by product distance; where none can be reached, nearest frontier cell of any component."""
+    cells, kept = situation.subgoals.cells, situation.subgoals.mask
+    by_subgoal = jnp.full(situation.distances.shape, jnp.inf, jnp.float32)
+    rows, columns = cells[:, 0], cells[:, 1]
+    at_subgoals = jnp.where(kept[:, None], situation.distances[rows, columns], jnp.inf)
+    by_subgoal = by_subgoal.at[rows, columns].min(at_subgoals)
+    # Subgoals may be masked or out of reach, as where there are more than the array holds. A frontier cell then
+    # still leads somewhere new.
+    by_cell = jnp.where(situation.subgoals.frontier[:, :, None], situation.distances, jnp.inf)
+    cost = jnp.where(jnp.isfinite(jnp.min(by_subgoal)), by_subgoal, by_cell)
+    cell, state = cell_and_state(jnp.argmin(cost.reshape(-1)), cost.shape)
+    return cell, state, jnp.min(cost)
+
+
+def cell_and_state(index: Int32[Array, ""], shape: tuple[int, ...]) -> tuple[Int32[Array, "2"], Int32[Array, ""]]:
+    """Cell and state of an index into a flattened [H, W, Z] array."""
+    _, width, states = shape
+    index = index.astype(jnp.int32)
+    return jnp.stack([index // (width * states), (index // states) % width]), index % states
