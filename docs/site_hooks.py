@@ -1,14 +1,14 @@
 """Pages of the site that follow from the sources: the API by room, the notebooks, how to contribute, what changed.
 
-mkdocs calls ``on_config`` and ``on_files`` (`hooks` in mkdocs.yml). Generated pages never go stale when a module moves.
+mkdocs calls ``on_config``, ``on_files`` and ``on_page_markdown`` (`hooks` in mkdocs.yml). Generated pages never go
+stale when a module moves.
 """
 
 import ast
 import json
+import re
 from pathlib import Path
 from typing import Any
-
-from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "potlp_jax"
@@ -28,6 +28,9 @@ def on_config(config: Any) -> Any:
 
 def on_files(files: Any, config: Any) -> Any:
     """Add the generated pages."""
+    # Here, so that what does not build the site, such as tests, can read this module without mkdocs.
+    from mkdocs.structure.files import File
+
     content = {
         "api/index.md": public_names(),
         "contributing.md": ROOT / "CONTRIBUTING.md",
@@ -38,6 +41,15 @@ def on_files(files: Any, config: Any) -> Any:
     for path, text in content.items():
         files.append(File.generated(config, path, content=text.read_text() if isinstance(text, Path) else text))
     return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Keep numbers, units and errors of a table's cell on one line."""
+    lines = markdown.split("\n")
+    return "\n".join(
+        re.sub(r"(?<=\d) (?=%|± )|(?<=±) ", "\N{NO-BREAK SPACE}", line) if line.startswith("|") else line
+        for line in lines
+    )
 
 
 def rooms() -> list[str]:

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 import potlp_jax
-from potlp_jax.environments.base import host_generators
 
 DOORS = 6
 
@@ -24,7 +23,7 @@ class Corridor(potlp_jax.Generator):
 
     def draw(self, key: PRNGKeyArray) -> potlp_jax.World:
         """The corridor of this key."""
-        (rng,) = host_generators(key, 1)
+        (rng,) = potlp_jax.host_generators(key, 1)
         # Rows: wall, corridor, wall with doors, closets of three rows, wall.
         occupied = np.ones((7, 4 * DOORS + 1), bool)
         occupied[1, 1:-1] = False

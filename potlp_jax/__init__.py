@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     # What type checkers and editors see; ``_MODULES`` says the same at run time.
     from potlp_jax.environments.base import Generator as Generator
+    from potlp_jax.environments.base import host_generators as host_generators
     from potlp_jax.environments.registry import make as make
     from potlp_jax.environments.splits import Split as Split
     from potlp_jax.environments.splits import world_key as world_key
@@ -80,6 +81,7 @@ __all__ = [  # noqa: RUF022 - by use, not by the alphabet
     # A world, and what is known of it.
     "make",
     "Generator",
+    "host_generators",
     "Split",
     "world_key",
     "World",
@@ -140,7 +142,7 @@ __all__ = [  # noqa: RUF022 - by use, not by the alphabet
 ]
 
 _MODULES: dict[str, tuple[str, ...]] = {
-    "environments.base": ("Generator",),
+    "environments.base": ("Generator", "host_generators"),
     "environments.registry": ("make",),
     "environments.splits": ("Split", "world_key"),
     "errors": ("PotlpError", "ProblemTooLargeError", "TaskError", "WorldError"),

@@ -14,6 +14,12 @@ from typing import Any
 
 from potlp_jax.errors import PluginError
 
+# Groups of entry points, one for each kind of extension.
+ENVIRONMENTS: str = "potlp_jax.environments"
+POLICIES: str = "potlp_jax.policies"
+CAMERAS: str = "potlp_jax.cameras"
+ESTIMATORS: str = "potlp_jax.estimators"
+
 _REFERENCE = re.compile(r"(?P<module>[^\W\d]\w*(\.[^\W\d]\w*)*):(?P<attribute>[^\W\d]\w*(\.[^\W\d]\w*)*)")
 
 

@@ -77,7 +77,7 @@ def test_task_as_json_is_its_description():
 
 def test_task_as_text_and_picture(tmp_path):
     svg = tmp_path / "task.svg"
-    result = _potlp("task", "toy-2", "--svg", svg)
+    result = _potlp("task", "toy-2", "--out", svg)
     assert result.exit_code == 0
     for part in ("!hazard U goal", "initial", "accepting", "trap", "!goal & hazard", "0→1"):
         assert part in result.stdout
@@ -105,7 +105,7 @@ def test_max_positive_literals_reaches_the_task():
         (("task", "F (a &"), "^"),
         (("task", "F b", "--propositions", "a"), "unknown proposition"),
         (("task", "missing.hoa"), "missing.hoa"),
-        (("task", "F a", "--svg", "picture.docx"), "docx"),
+        (("task", "F a", "--out", "picture.docx"), "docx"),
         (("run", "castle"), ", ".join(FAMILIES)),
         (("run", "map:missing.yaml"), "missing.yaml"),
         (("run", "floorplan:missing.xml"), "missing.xml: cannot be read"),

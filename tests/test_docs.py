@@ -10,7 +10,9 @@ All other Python blocks of a page run in one namespace, in order. Every ``potlp 
 
 import ast
 import copy
+import csv
 import functools
+import gzip
 import importlib
 import importlib.util
 import json
@@ -94,7 +96,8 @@ def _commands(page):
         elif block["language"] in ("sh", "bash"):
             lines += code.splitlines()
     inline = re.findall(r"(?<!`)`(potlp (?!\.\.\.)[^`]+)`(?!`)", re.sub(r"\n *", " ", _prose(page)))
-    lines += [line for line in inline if "..." not in line]
+    # A command that is only mentioned has no arguments: it has to exist.
+    lines += [f"{line} --help" if re.fullmatch(r"[a-z -]+", line) else line for line in inline if "..." not in line]
     for line in lines:
         tokens = shlex.shlex(line, posix=True, punctuation_chars="&|;")
         tokens.whitespace_split, tokens.commenters = True, "#"
@@ -162,7 +165,8 @@ def test_paths_in_code_exist(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=_name)
 def test_dotted_names_exist(page):
-    for name in set(re.findall(r"`(potlp_jax(?:\.\w+)+)`", _prose(page))):
+    groups = {"potlp_jax.environments", "potlp_jax.policies"}  # of entry points
+    for name in set(re.findall(r"`(potlp_jax(?:\.\w+)+)`", _prose(page))) - groups:
         parts = name.split(".")
         for count in range(len(parts), 0, -1):
             module = ".".join(parts[:count])
@@ -208,10 +212,9 @@ def test_the_navigation_has_every_page():
 def test_the_picture_of_the_house_has_every_room():
     picture = (ROOT / "docs" / "architecture.md").read_text().split("```text\n", 1)[1].split("```", 1)[0]
     drawn = set(re.findall(r"^  (\w+)(?:/|\.py)", picture, re.M))
-    rooms = {
-        path.stem for path in (ROOT / "potlp_jax").iterdir() if (path / "__init__.py").exists() or path.suffix == ".py"
-    }
-    assert drawn == rooms
+    package = ROOT / "potlp_jax"
+    rooms = {path.stem for path in package.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    assert drawn == rooms - {"__init__"}
 
 
 QUOTED = yaml.safe_load((ROOT / "docs" / "quoted.yaml").read_text())
@@ -264,6 +267,21 @@ def test_another_figure_in_the_data_is_noticed():
     _value(other, "t3")["attainable_low"] += 0.02
     assert _render(text, data) in _flat(page)
     assert _render(text, other) not in _flat(page)
+
+
+def test_wins_and_ties_are_those_of_the_rows():
+    costs = {}
+    with gzip.open(ROOT / "docs/results/table1/rows.csv.gz", "rt", newline="") as file:
+        for row in csv.DictReader(file):
+            costs.setdefault((row["task"], row["world"]), {})[row["policy"]] = float(row["cost"])
+    page = (ROOT / "docs/results/table1.md").read_text()
+    tasks = json.loads((ROOT / "docs/results/table1/test.json").read_text())["tables"]
+    for number, table in tasks.items():
+        # Costs in the file are rounded to three decimals, and equal paths have equal costs.
+        gains = [world["baseline"] - world["potlp"] for (task, _), world in costs.items() if task == table["task"]]
+        counts = [sum(gain > 0 for gain in gains), sum(gain == 0 for gain in gains), sum(gain < 0 for gain in gains)]
+        shares = [100 * count / len(gains) for count in counts]
+        assert f"| {number} | {' | '.join(f'{share:.1f} %' for share in shares)} |" in page
 
 
 @pytest.mark.parametrize("page", list(QUOTED["complete"]))

@@ -5,6 +5,7 @@ import sys
 import pytest
 
 from potlp_jax import plugins
+from potlp_jax.cli import completion
 from potlp_jax.environments.families import FAMILIES
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.toy import Toy
@@ -76,6 +77,7 @@ def test_an_environment_is_a_class_an_object_or_a_function(elsewhere, name, heig
 def test_an_environment_by_entry_point(installed):
     assert make("small").name == "small"
     assert plugins.entry_points("potlp_jax.environments") == ("gone", "small")
+    assert completion.complete_environment("s") == ["small"]
 
 
 @pytest.mark.usefixtures("installed")

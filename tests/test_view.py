@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import to_hex
-from matplotlib.patches import Circle
 from PIL import Image, ImageSequence
 from rich.console import Console
 
@@ -20,24 +19,40 @@ from potlp_jax.errors import PictureError
 from potlp_jax.sweep.statistics import Comparison, TrialResult
 from potlp_jax.sweep.store import Item, Row
 from potlp_jax.task.task import Task
+from potlp_jax.task.words import transition_words
 from potlp_jax.trials.record import NEVER_SEEN, ActionRecord, Decision, Outcome, Trial
 from potlp_jax.view.animation import frame_steps, save_animation
-from potlp_jax.view.automata import Automaton, draw_automaton
+from potlp_jax.view.automata import draw_automaton, save_automaton, to_dot, to_mermaid
 from potlp_jax.view.comparisons import comparison_table, draw_scatter, remark_lines
-from potlp_jax.view.decisions import action_name, action_table, decision_to_dict, describe_decision, rank_actions
-from potlp_jax.view.maps import (
+from potlp_jax.view.decisions import (
+    FIGURES,
+    action_name,
+    action_table,
+    decision_to_dict,
+    describe_decision,
+    rank_actions,
+    task_of,
+)
+from potlp_jax.view.labels import place_labels
+from potlp_jax.view.layers import cell_image
+from potlp_jax.view.maps import describe_outcome, draw_side_by_side, draw_trial
+from potlp_jax.view.style import (
+    AREA_COLOURS,
+    CHOSEN,
     FREE_SEEN,
     FREE_UNSEEN,
     HATCH,
+    POLICY_COLOURS,
+    STATE_COLOURS,
     WALL_SEEN,
     WALL_UNSEEN,
-    cell_image,
-    describe_outcome,
-    draw_side_by_side,
-    draw_trial,
-    place_labels,
+    area_colour,
+    new_figure,
+    policy_styles,
+    rgb,
+    save_figure,
+    state_colour,
 )
-from potlp_jax.view.style import CHOSEN, area_colour, new_figure, rgb, save_figure, state_colour
 from potlp_jax.view.trees import draw_tree
 from potlp_jax.world.grid import make_world, pad_world
 
@@ -135,7 +150,7 @@ def test_picture_of_a_trial_shows_every_part(trial, tmp_path):
     figure = draw_trial(trial)
     save_figure(figure, tmp_path / "trial.png")
     colours = _colours(Image.open(tmp_path / "trial.png"))
-    for part in (FREE_SEEN, WALL_SEEN, FREE_UNSEEN, HATCH, CHOSEN, area_colour(0), state_colour(0), state_colour(1)):
+    for part in (FREE_SEEN, WALL_SEEN, FREE_UNSEEN, HATCH, area_colour(0), state_colour(0), state_colour(1)):
         assert rgb(part) in colours, part
     (axes,) = figure.axes
     names = {text.get_text() for text in axes.texts}
@@ -143,9 +158,44 @@ def test_picture_of_a_trial_shows_every_part(trial, tmp_path):
     heading = " ".join(text.get_text() for text in figure.texts)
     for part in (trial.task_text, "oracle", "21.2", "satisfied", "world 3"):
         assert part in heading
-    legend = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert {"state 0 (initial)", "state 1 (accepting)", "never seen", "start", "end", "goal", "hazard"} <= set(legend)
-    assert not _overlaps(figure, [*axes.texts, *figure.texts, *figure.legends[0].get_texts()])
+    texts = [text for legend in figure.legends for text in legend.get_texts()]
+    legend = [text.get_text() for text in texts]
+    assert {"state 0: find goal, avoiding hazard", "state 1: satisfied"} <= set(legend)
+    assert {"never seen", "start", "end", "goal", "hazard"} <= set(legend)
+    assert not _overlaps(figure, [*axes.texts, *figure.texts, *texts])
+
+
+def test_a_trial_that_failed_shows_what_was_left_to_try(trial):
+    stuck = dataclasses.replace(trial, outcome=Outcome.STUCK)
+    names = {text.get_text() for text in draw_trial(stuck).axes[0].texts}
+    assert {"s0", "s1"} <= names
+    assert not {"s0", "s1"} & {text.get_text() for text in draw_trial(trial).axes[0].texts}
+
+
+def _lightness_and_warmth(colour: str) -> tuple[float, float]:
+    """Oklab lightness, and how far red-yellow outweighs green-blue (Ottosson 2020)."""
+    linear = np.array(
+        [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in np.array(rgb(colour)) / 255]
+    )
+    to_cone = np.array([[0.4122, 0.5363, 0.0514], [0.2119, 0.6807, 0.1074], [0.0883, 0.2817, 0.6300]])
+    to_lab = np.array([[0.2105, 0.7936, -0.0041], [1.9780, -2.4286, 0.4506], [0.0259, 0.7828, -0.8087]])
+    light, green_red, blue_yellow = to_lab @ np.cbrt(to_cone @ linear)
+    return float(light), float(green_red + blue_yellow)
+
+
+def test_no_state_looks_like_an_area():
+    states = [_lightness_and_warmth(colour) for colour in STATE_COLOURS]
+    areas = [_lightness_and_warmth(colour) for colour in AREA_COLOURS]
+    # Lightness is seen alike by all; warmth by most.
+    assert max(light for light, _ in states) + 0.1 < min(light for light, _ in areas)
+    assert max(warmth for _, warmth in states) < min(warmth for _, warmth in areas)
+
+
+def test_a_policy_has_one_colour_whatever_it_is_compared_with():
+    alone, all_of_them = policy_styles(["potlp"]), policy_styles(["mine", *POLICY_COLOURS, "yours"])
+    assert alone["potlp"] == all_of_them["potlp"]
+    assert len({style.colour for style in all_of_them.values()}) == len(all_of_them)
+    assert not {style.colour for style in all_of_them.values()} & {*AREA_COLOURS}
 
 
 def test_trial_without_decisions_has_a_picture(trial, tmp_path):
@@ -192,7 +242,8 @@ def test_side_by_side_shows_each_path_under_its_cost_and_wastes_no_room(trial, t
     ]
     assert lengths == [len(trial.path) - 1, 7]
     save_figure(figure, tmp_path / "both.png")
-    assert not _overlaps(figure, [*figure.texts, *figure.legends[0].get_texts()])
+    shown = [*figure.texts, *(text for legend in figure.legends for text in legend.get_texts())]
+    assert not _overlaps(figure, shown)
     ink = np.any(np.asarray(Image.open(tmp_path / "both.png").convert("RGB")) != 255, axis=-1)
     # No margin is wider than a third of an inch, and no blank strip between the maps is.
     rows, columns = np.flatnonzero(ink.any(axis=1)), np.flatnonzero(ink.any(axis=0))
@@ -265,12 +316,12 @@ def test_area_labels_stay_apart_and_inside(cells, seed):
     labels = place_labels(world, PROPOSITIONS, [(1, 1)], inches_per_cell=0.15)
     assert labels
     for label in labels:
-        assert np.all(np.subtract(label.spot, label.half_size) >= -0.5)
-        assert np.all(np.add(label.spot, label.half_size) <= (59.5, 29.5))
+        assert np.all(np.subtract(label.centre, label.half_size) >= -0.5)
+        assert np.all(np.add(label.centre, label.half_size) <= (59.5, 29.5))
         column, row = label.anchor
         assert letters[int(row), int(column)] > 0
     for one, other in itertools.combinations(labels, 2):
-        assert np.any(np.abs(np.subtract(one.spot, other.spot)) >= np.add(one.half_size, other.half_size))
+        assert np.any(np.abs(np.subtract(one.centre, other.centre)) >= np.add(one.half_size, other.half_size))
 
 
 def test_animation_has_a_frame_per_decision_and_one_for_the_end(trial, tmp_path):
@@ -307,37 +358,53 @@ def test_animation_that_is_too_large_loses_frames(trial, tmp_path):
 @pytest.mark.parametrize("name", ["toy-2", "firefighting-1", "firefighting-2", "firefighting-3", "firefighting-4"])
 def test_automaton_is_complete_and_its_texts_stay_apart(name, tmp_path):
     task = Task.shipped(name)
-    figure = draw_automaton(Automaton.from_description(task.describe()), task.text)
+    figure = draw_automaton(task)
     path = tmp_path / "task.svg"
     save_figure(figure, path)
     root = ElementTree.parse(path).getroot()
     shown = ["".join(node.itertext()).strip() for node in root.iter("{http://www.w3.org/2000/svg}text")]
-    for state in range(task.dfa.num_states):
-        assert str(state) in shown
     described = task.describe()
     joined = " ".join(" ".join(shown).split())
     for move in described["transitions"]:
         if move["from"] not in described["trap"]:
-            for cube in move["guard"].split(" | "):
-                assert cube in joined
-    circles = [patch for patch in figure.axes[0].patches if isinstance(patch, Circle)]
-    assert len(circles) == task.dfa.num_states + len(described["accepting"])
-    assert ("trap" in shown) == bool(described["trap"])
-    assert not _overlaps(figure, figure.axes[0].texts)
+            assert all(cube in joined for cube in move["guard"].split(" | "))
+            assert transition_words(task, move["from"], move["to"], brief=True) in joined or move["from"] == move["to"]
+    assert all(str(state) in shown for state in range(task.dfa.num_states))
+    assert ("failed" in shown) == bool(described["trap"])
+    assert not _overlaps(figure, [*figure.axes[0].texts, *figure.texts])
+
+
+@pytest.mark.parametrize("name", ["firefighting-3", "delivery-1"])
+def test_automata_in_dot_and_mermaid_have_every_state_and_transition(name, tmp_path):
+    task = Task.shipped(name)
+    moves = [move for move in task.describe()["transitions"] if not task.dfa.trap[move["from"]]]
+    dot, mermaid = to_dot(task), to_mermaid(task)
+    for move in moves:
+        assert f'  {move["from"]} -> {move["to"]} [label="' in dot
+        assert any(
+            line.startswith(f"  s{move['from']} -") and line.endswith(f"| s{move['to']}")
+            for line in mermaid.splitlines()
+        )
+    assert dot.count(" -> ") == len(moves) + 1
+    assert dot.count("doublecircle") == int(task.dfa.accepting.sum())
+    assert mermaid.count("(((") == int(task.dfa.accepting.sum())
+    for ending, text in (("dot", dot), ("mmd", mermaid)):
+        save_automaton(task, tmp_path / f"task.{ending}")
+        assert (tmp_path / f"task.{ending}").read_text() == text
 
 
 def test_pictures_are_reproducible(tmp_path):
-    task = Task.shipped("toy-2")
-    for name in ("a.svg", "b.svg"):
-        save_figure(draw_automaton(Automaton.from_description(task.describe())), tmp_path / name)
-    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
+    for ending in ("svg", "pdf", "png"):
+        for name in ("a", "b"):
+            save_automaton(Task.shipped("toy-2"), tmp_path / f"{name}.{ending}")
+        assert (tmp_path / f"a.{ending}").read_bytes() == (tmp_path / f"b.{ending}").read_bytes()
 
 
 def test_automaton_with_one_state_and_without_accepting_state():
-    single = Automaton(states=(0,), initial=0, accepting=frozenset({0}), trap=frozenset(), guards={(0, 0): "true"})
-    hopeless = Automaton(states=(0,), initial=0, accepting=frozenset(), trap=frozenset({0}), guards={(0, 0): "true"})
-    assert "true" in [text.get_text() for text in draw_automaton(single).axes[0].texts]
-    assert "trap" in [text.get_text() for text in draw_automaton(hopeless).axes[0].texts]
+    pytest.importorskip("spot")
+    for formula, shown in (("true", "true"), ("a & !a", "failed")):
+        texts = [text.get_text() for text in draw_automaton(Task.from_formula(formula)).axes[0].texts]
+        assert shown in texts
 
 
 def test_unknown_kind_of_picture_is_refused(tmp_path):
@@ -349,10 +416,13 @@ def test_unknown_kind_of_picture_is_refused(tmp_path):
 def test_action_table_marks_the_choice(trial):
     console = Console(width=120, record=True, file=io.StringIO())
     console.print(action_table(trial, trial.decisions[1]))
-    lines = [line.split() for line in console.export_text().splitlines()]
+    text = console.export_text()
+    for name, meaning in FIGURES.items():
+        assert f"{name}: {meaning}" in " ".join(text.split())
+    lines = [line.split() for line in text.splitlines()]
     chosen = next(line for line in lines if line[:1] == ["*"])
-    assert chosen == ["*", "s0:", "0→1", "6,12", "0.250", "12.5", "7.0", "10.0", "31.4", "40"]
-    assert ["finish", "-", "0.250", "12.5", "7.0", "10.0", "55.0", "40"] in lines
+    assert chosen == ["*", "s0:", "find", "goal", "0→1", "6,12", "0.250", "12.5", "7.0", "10.0", "31.4", "40"]
+    assert ["finish", "-", "-", "0.250", "12.5", "7.0", "10.0", "55.0", "40"] in lines
 
 
 def test_decision_as_json_is_ranked_and_finite(trial):
@@ -374,7 +444,9 @@ def test_a_decision_that_keeps_on_says_what_was_better(trial):
     keeping = dataclasses.replace(trial.decisions[0], actions=actions, choice=0, preferred=1)
     turning = dataclasses.replace(keeping, choice=1)
     assert keeping.overruled == actions[1]
-    assert describe_decision(trial, keeping).endswith(f"kept although {action_name(actions[1])} is better")
+    assert describe_decision(trial, keeping).endswith(
+        f"kept although {action_name(actions[1], task_of(trial))} is better"
+    )
     # Another choice than the cheapest is none that was kept: the mode of the authors takes the most visited action.
     for other in (turning, dataclasses.replace(keeping, preferred=0), dataclasses.replace(keeping, preferred=None)):
         assert other.overruled is None
@@ -416,13 +488,13 @@ def test_tree_shows_outcomes_and_follows_the_best_action():
             _tree_action(2, float("inf"), 0, _tree_outcome(1.0, None, None)),
         ]
     )
-    figure = draw_tree(tree, "a decision", breadth=2)
+    figure = draw_tree(tree, Task.shipped("toy-2"), "a decision", breadth=2)
     shown = [text.get_text() for text in figure.axes[0].texts]
-    assert "robot in state 0\nV 7.0  n 100" in shown
-    assert "s0: 0→1 succeeds  P 0.75\nQ 7.0  n 40  D 4.0\nR 2.5, then 3.0" in shown
-    assert "s0: 0→1 fails  P 0.25\nQ 7.0  n 40  D 4.0\nR 2.5, then not tried" in shown
-    assert "finish\nQ 3.0  n 30  D 4.0\nR 2.5, then done" in shown
-    assert "s1: 0→1 fails  P 0.50\nQ 8.0  n 30  D 4.0\nR 2.5, then a dead end" in shown
+    assert "robot in state 0\nexpected cost 7.0\nn 100" in shown
+    assert "s0 succeeds  P 0.75\nfind goal\nQ 7.0  n 40  D 4.0\nR 2.5, then 3.0" in shown
+    assert "s0 fails  P 0.25\nfind goal\nQ 7.0  n 40  D 4.0\nR 2.5, then not tried" in shown
+    assert "finish\nin known space\nQ 3.0  n 30  D 4.0\nR 2.5, then done" in shown
+    assert "s1 fails  P 0.50\nfind goal\nQ 8.0  n 30  D 4.0\nR 2.5, then a dead end" in shown
     assert not any(text.startswith(("s2", "s9")) for text in shown)
     styles = [line.get_linestyle() for line in figure.axes[0].lines]
     assert sorted(styles) == ["-", "-", "-", "--", "--"]

@@ -10,8 +10,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from potlp_jax.environments.families import GROUP, NAMED, PREFIXED
-from potlp_jax.plugins import entry_points
+from potlp_jax import plugins
+from potlp_jax.environments.families import NAMED, PREFIXED
 
 TASKS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
@@ -29,14 +29,9 @@ SEARCHES = ("best-first", "uct")
 SPLITS = ("calibration", "training", "validation", "test")
 
 
-# Of `planning.policies`, where importing it would load jax.
-POLICY_GROUP = "potlp_jax.policies"
-"""Entry points of this group add policies from other packages."""
-
-
 def complete_environment(incomplete: str) -> list[str]:
     """Names of environments, those that other installed packages declare among them."""
-    return _starting([*NAMED, *PREFIXED, *entry_points(GROUP)], incomplete)
+    return _starting([*NAMED, *PREFIXED, *plugins.entry_points(plugins.ENVIRONMENTS)], incomplete)
 
 
 def complete_task(ctx: Any, incomplete: str) -> list[str]:
@@ -49,14 +44,14 @@ def complete_task(ctx: Any, incomplete: str) -> list[str]:
 
 def complete_policy(incomplete: str) -> list[str]:
     """Names of policies, those that other installed packages declare among them."""
-    return _starting([*POLICIES, *entry_points(POLICY_GROUP)], incomplete)
+    return _starting(_policies(), incomplete)
 
 
 def complete_policies(incomplete: str) -> list[str]:
     """Names of policies after those that are there already, joined by commas."""
     *before, last = incomplete.split(",")
     # The shell replaces the whole word, so that what stands before the last comma is part of every proposal.
-    return [",".join([*before, name]) for name in complete_policy(last) if name not in before]
+    return [",".join([*before, name]) for name in _starting(_policies(), last) if name not in before]
 
 
 def complete_recipe(incomplete: str) -> list[str]:
@@ -73,6 +68,10 @@ def complete_search(incomplete: str) -> list[str]:
 def complete_split(incomplete: str) -> list[str]:
     """Names of splits."""
     return _starting(SPLITS, incomplete)
+
+
+def _policies() -> list[str]:
+    return [*POLICIES, *plugins.entry_points(plugins.POLICIES)]
 
 
 def _starting(words: Sequence[str], incomplete: str) -> list[str]:

@@ -98,7 +98,7 @@ def _draw(
 
     from potlp_jax.planning.search.inspect import tree_top
     from potlp_jax.trials.replay import panorama_at, replay_decision
-    from potlp_jax.view.decisions import describe_decision
+    from potlp_jax.view.decisions import describe_decision, task_of
     from potlp_jax.view.panoramas import draw_panoramas
     from potlp_jax.view.style import save_figure
     from potlp_jax.view.trees import draw_tree
@@ -111,7 +111,7 @@ def _draw(
     if int(plan.action) != (decision.choice if decision.preferred is None else decision.preferred):
         logger.warning("searching again chose another action than recorded: the versions of the software may differ")
     top = tree_top(problem, tree, depth=depth, width=BREADTH)
-    save_figure(draw_tree(top, describe_decision(trial, decision), breadth=BREADTH), out)
+    save_figure(draw_tree(top, task_of(trial), describe_decision(trial, decision), breadth=BREADTH), out)
     if not decision.observations:
         return [out]
     seen = {look: np.asarray(panorama_at(trial, trial.decisions[look])) for look in decision.observations}

@@ -11,6 +11,8 @@ from rich.table import Table
 from potlp_jax.cli.group import Command, command_app
 from potlp_jax.cli.options import Formula, Json, Propositions
 from potlp_jax.cli.output import console, print_json
+from potlp_jax.task.task import Task
+from potlp_jax.task.words import transition_words
 
 app = command_app()
 
@@ -23,7 +25,7 @@ app = command_app()
 
 [cyan]potlp task "F goal"[/cyan]
 
-[cyan]potlp task "(!fire U extinguisher) & F fire" --propositions fire,extinguisher,exit --svg task.svg[/cyan]
+[cyan]potlp task "(!fire U extinguisher) & F fire" --propositions fire,extinguisher,exit --out task.svg[/cyan]
 
 [cyan]potlp task automaton.hoa --json[/cyan]
 """,
@@ -34,7 +36,12 @@ def show_task(
     max_positive_literals: Annotated[
         int | None, typer.Option(min=0, help="Leave out ways that need more propositions to hold in one place.")
     ] = None,
-    svg: Annotated[Path | None, typer.Option("--svg", help="Draw the automaton (.svg, .png or .pdf).")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="Draw the automaton (.png, .svg, .pdf), or write it as .dot or .mmd (Mermaid)."
+        ),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Show a task as an automaton: states, transitions, and the outcomes that have to be estimated."""
@@ -43,36 +50,38 @@ def show_task(
 
     task = read_task(formula, read_names(propositions), max_positive_literals)
     description = task.describe()
-    if svg is not None:
-        from potlp_jax.view.automata import Automaton, draw_automaton
-        from potlp_jax.view.style import save_figure
+    if out is not None:
+        from potlp_jax.view.automata import save_automaton
 
-        save_figure(draw_automaton(Automaton.from_description(description), task.text), svg)
+        save_automaton(task, out)
     if json:
         print_json(description)
         return
-    out = console()
-    out.print(task.text, style="bold", markup=False)
-    out.print(f"propositions: {', '.join(task.propositions) or 'none'}", markup=False)
-    out.print(_states(description))
+    shown = console()
+    shown.print(task.text, style="bold", markup=False)
+    shown.print(f"propositions: {', '.join(task.propositions) or 'none'}", markup=False)
+    shown.print(_states(task, description))
     if description["classes"]:
-        out.print(_classes(description))
-    if svg is not None:
-        out.print(f"wrote {svg}", markup=False)
+        shown.print(_classes(description))
+    if out is not None:
+        shown.print(f"wrote {out}", markup=False)
 
 
-def _states(description: dict[str, Any]) -> Table:
+def _states(task: Task, description: dict[str, Any]) -> Table:
     table = Table(title="states and transitions", title_justify="left", box=SIMPLE_HEAD)
     table.add_column("state", justify="right")
     table.add_column("role")
     table.add_column("to", justify="right")
+    table.add_column("in words")
     table.add_column("when")
     # State and role on the first line of each state alone, so that a state reads as one block.
     for state in range(description["states"]):
         moves = [move for move in description["transitions"] if move["from"] == state]
         for line, move in enumerate(moves):
             first = (str(state), _role(state, description)) if line == 0 else ("", "")
-            table.add_row(*first, str(move["to"]), escape(move["guard"]), end_section=line == len(moves) - 1)
+            words = transition_words(task, state, move["to"])
+            end = line == len(moves) - 1
+            table.add_row(*first, str(move["to"]), escape(words), escape(move["guard"]), end_section=end)
     return table
 
 

@@ -35,6 +35,7 @@ class Generator(abc.ABC):
 
     name: str
     propositions: tuple[str, ...]
+    # Defaults, so that a family of one's own has to say only what is special about it.
     tasks: Mapping[str, str] = MappingProxyType({})
     settings: Settings = NO_SETTINGS
     config: Any = None

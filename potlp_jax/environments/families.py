@@ -6,9 +6,6 @@ A table of strings, so that listing the names loads neither JAX nor the librarie
 from collections.abc import Mapping
 from types import MappingProxyType
 
-GROUP: str = "potlp_jax.environments"
-"""Entry points of this group add families from other packages."""
-
 NAMED: Mapping[str, str] = MappingProxyType(
     {
         "toy": "potlp_jax.environments.toy:Toy",

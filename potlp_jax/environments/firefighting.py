@@ -196,6 +196,7 @@ def _draw_layout(config: FirefightingConfig, rng: np.random.Generator) -> Firefi
     side, mouth_chance, dead_end_chance, fire_chance, fire_share, *cell_chances = rng.random(8)
     robot_room = Room.LEFT if side < 0.5 else Room.RIGHT
     mouth = robot_room if mouth_chance < config.dead_end_opens_into_robot_room else robot_room.other
+    # Uniform numbers in [0, 1) times the number of hallways, rounded down.
     dead_end, fire_hallway = int(dead_end_chance * HALLWAYS), int(fire_chance * HALLWAYS)
     # A patch reaches beyond its middle, so its middle keeps a distance from the walls; the start is a single cell.
     start = _cell_at(_room_cells(config, robot_room, 0), cell_chances[0])
@@ -234,6 +235,7 @@ def _room_cells(config: FirefightingConfig, room: Room, margin: int) -> Int32[np
 
 
 def _cell_at(cells: Int32[np.ndarray, "cells 2"], share: float) -> Cell:
+    # The same share of any list of cells: with other sizes things stay in like places.
     row, column = cells[int(share * len(cells))]
     return int(row), int(column)
 

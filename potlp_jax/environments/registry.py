@@ -2,7 +2,7 @@
 
 from potlp_jax import plugins
 from potlp_jax.environments.base import Generator
-from potlp_jax.environments.families import FAMILIES, GROUP, NAMED, PREFIXED
+from potlp_jax.environments.families import FAMILIES, NAMED, PREFIXED
 from potlp_jax.errors import PluginError
 
 
@@ -22,8 +22,9 @@ def make(name: str) -> Generator:
     # Only the family asked for is imported: reading maps needs libraries that the others do not.
     for prefix, reference in PREFIXED.items():
         if name.startswith(prefix):
-            return plugins.load(reference, group=GROUP, kind="environment")(name)
-    found = plugins.load(NAMED.get(name, name), group=GROUP, kind="environment", known=FAMILIES)
+            return plugins.load(reference, group=plugins.ENVIRONMENTS, kind="environment")(name)
+    found = plugins.load(NAMED.get(name, name), group=plugins.ENVIRONMENTS, kind="environment", known=FAMILIES)
+    # A class or a function makes one; an object is one.
     generator = found() if callable(found) else found
     if not isinstance(generator, Generator):
         raise PluginError(

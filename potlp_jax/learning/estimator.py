@@ -37,9 +37,6 @@ from potlp_jax.world.camera import bearing
 from potlp_jax.world.frontiers import Subgoals
 from potlp_jax.world.grid import BeliefMap
 
-GROUP: str = "potlp_jax.estimators"
-"""Entry points of this group are estimators of other packages."""
-
 MEMORY: int = 32
 """Panoramas that are remembered. A trial takes 14 to 100, of which seldom more than a dozen still show a frontier."""
 
@@ -244,9 +241,9 @@ def named_estimator(name: str | Path) -> TrainedEstimator | Estimator:
     """
     path = Path(name)
     # A file goes first: its name may well contain a colon.
-    if path.is_file() or not plugins.is_known(str(name), GROUP):
+    if path.is_file() or not plugins.is_known(str(name), plugins.ESTIMATORS):
         return read_estimator(path)
-    found = plugins.load(str(name), group=GROUP, kind="estimator")
+    found = plugins.load(str(name), group=plugins.ESTIMATORS, kind="estimator")
     estimator = found() if isinstance(found, type) else found
     if not (isinstance(estimator, TrainedEstimator) or callable(estimator)):
         raise PluginError(

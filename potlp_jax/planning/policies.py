@@ -47,9 +47,6 @@ from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_ACTION, Status, status_if
 from potlp_jax.world.grid import BeliefMap
 
-GROUP: str = "potlp_jax.policies"
-"""Entry points of this group are policies of other packages."""
-
 
 class Policy(StrEnum):
     """The planners that a trial can run (docs/model.md section 8)."""
@@ -144,7 +141,16 @@ def policy_function(policy: Policy | PolicyFunction) -> PolicyFunction:
 
 
 def direct_move(situation: Situation, policy: Policy, config: DecisionConfig) -> Move:
-    """The move of a policy that does not search."""
+    """The move of a policy that does not search.
+
+    Args:
+        situation: known space, assessed from the robot's product state.
+        policy: ``optimistic``; every other one moves as the baseline does.
+        config: ``path_horizon`` is what matters here.
+
+    Returns:
+        The move; it has the kind NONE where there is none.
+    """
     return _optimistic(situation, config) if policy is Policy.OPTIMISTIC else _finish_or_frontier(situation, config)
 
 
@@ -167,7 +173,7 @@ def named_policy(policy: Policy | PolicyFunction | str) -> Policy | PolicyFuncti
     own = policy.strip().replace("_", "-")
     if own in list(Policy):
         return Policy(own)
-    found = plugins.load(policy, group=GROUP, kind="policy", known=list(Policy))
+    found = plugins.load(policy, group=plugins.POLICIES, kind="policy", known=list(Policy))
     if not callable(found):
         raise PluginError(f"policy {policy!r}: {type(found).__name__} is no function (PolicyFunction)")
     return found

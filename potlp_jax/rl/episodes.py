@@ -23,12 +23,12 @@ from jaxtyping import Array, Bool, Float32, Int8, Int32, PRNGKeyArray
 
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import Split
-from potlp_jax.planning.commitment import Intention
+from potlp_jax.errors import TaskError
 from potlp_jax.planning.move import Move, MoveKind, move_to
-from potlp_jax.planning.policies import Policy, policy_function
+from potlp_jax.planning.policies import Policy, direct_move
 from potlp_jax.planning.situation import Situation, assess
 from potlp_jax.task.task import Task
-from potlp_jax.trials.config import TrialConfig, trial_config_for
+from potlp_jax.trials.config import TrialConfig, config_in
 from potlp_jax.trials.record import Outcome
 from potlp_jax.trials.rules import OUTCOMES, RUNNING
 from potlp_jax.trials.slots import Progress, Scene, Setup, advance, begin
@@ -132,14 +132,20 @@ class TaskEnv:
             worlds: of one family and shape (``grid.pad_world``).
             task: over the worlds' propositions.
             config: default: what the worlds call for.
+
+        Raises:
+            TaskError: the task is decided before the first step, whatever the robot does.
         """
+        if not len(task.edges):
+            raise TaskError(f"there is nothing to do for {task.text!r}: its automaton has no transition to attempt")
         # Their static parts (propositions, settings) must agree, which jax.tree.map checks.
         self.worlds: World = jax.tree.map(lambda *leaves: jnp.stack(leaves), *worlds)
         self.task = task
-        self.config: TrialConfig = trial_config_for(worlds[0]) if config is None else config
+        self.config: TrialConfig = config_in(worlds[0], config)
         self._edges = len(task.edges)
         # What the planner calls A - 1: all pairs of a subgoal and an edge come first.
         self._finish = self.config.decision.frontiers.max_subgoals * self._edges
+        # No policy decides here; the setup only carries the rules of a leg.
         self._setup = Setup(policy=Policy.BASELINE, config=self.config, network=None)
 
     @classmethod
@@ -172,6 +178,7 @@ class TaskEnv:
 
     def reset(self, key: PRNGKeyArray) -> tuple[EnvState, TimeStep]:
         """Begin an episode in a world drawn by ``key``."""
+        # The key makes nothing but this choice: worlds are deterministic, and so is everything that follows.
         index = jax.random.randint(key, (), 0, self.worlds.occupied.shape[0])
         return self.reset_in(jax.tree.map(lambda leaf: leaf[index], self.worlds))
 
@@ -222,25 +229,22 @@ class TaskEnv:
     def _distances(self, situation: Situation) -> Float32[Array, "S Z"]:
         """To each subgoal in each state, inf where there is no way; padded subgoals included."""
         subgoals = situation.subgoals
+        # Masked subgoals point at cell (0, 0), whatever is there.
         found = situation.distances[subgoals.cells[:, 0], subgoals.cells[:, 1]]
         return jnp.where(subgoals.mask[:, None], found, jnp.inf)
 
     def _action_mask(self, situation: Situation) -> Bool[Array, " A"]:
         task = situation.task
+        # An edge can be attempted from where the robot can arrive in the state in which the edge begins.
         reached = jnp.isfinite(self._distances(situation)[:, task.edges[:, 0]]) & task.edge_mask[None, :]
         finishes = jnp.isfinite(situation.finish_cost)
-        explores = self._baseline(situation).kind != MoveKind.NONE
+        explores = direct_move(situation, Policy.BASELINE, self.config.decision).kind != MoveKind.NONE
         return jnp.concatenate([reached.reshape(-1), jnp.stack([finishes, explores])])
-
-    def _baseline(self, situation: Situation) -> Move:
-        """Finish where possible, otherwise to the nearest frontier. Draws nothing, so that any key will do."""
-        decide = policy_function(Policy.BASELINE)
-        return decide(situation, None, jax.random.key(0), self.config.decision, Intention.none())
 
     def _move(self, situation: Situation, action: Int32[Array, ""]) -> Move:
         """The move that carries out an action."""
         task, subgoals = situation.task, situation.subgoals
-        nearest = self._baseline(situation)
+        nearest = direct_move(situation, Policy.BASELINE, self.config.decision)
         goes = action < self._finish
         # Indices of the last two actions, and of any that do not exist, are clipped; what they look up is not used.
         subgoal, edge = jnp.divmod(jnp.clip(action, 0, self._finish - 1), self._edges)

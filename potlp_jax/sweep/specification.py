@@ -26,7 +26,6 @@ from potlp_jax.codec import config_from_dict, json_copy, read_settings, settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
 from potlp_jax.errors import PluginError, SpecificationError, TaskError, WorldError
-from potlp_jax.learning.estimator import GROUP as ESTIMATORS
 from potlp_jax.planning.policies import Policy, named_policy
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 
@@ -195,7 +194,7 @@ def _policies(names: list[Any], where: str) -> tuple[str, ...]:
 def _estimator(name: str, folder: Path) -> str:
     """A file beside the specification, or a name as it stands."""
     beside = folder / name
-    return name if plugins.is_known(name, ESTIMATORS) and not beside.is_file() else str(beside)
+    return name if plugins.is_known(name, plugins.ESTIMATORS) and not beside.is_file() else str(beside)
 
 
 def _split(name: Any, environments: Sequence[str], where: str) -> Split:

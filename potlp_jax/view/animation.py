@@ -13,34 +13,42 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from PIL import Image
 
-from potlp_jax.task.task import Task
+from potlp_jax.task.words import state_words
 from potlp_jax.trials.record import NEVER_SEEN, ActionRecord, Decision, Trial
-from potlp_jax.view.decisions import action_name, rank_actions
-from potlp_jax.view.maps import (
-    FREE_UNSEEN,
-    MAX_INCHES_PER_CELL,
-    WALL_SEEN,
-    WALL_UNSEEN,
+from potlp_jax.view.decisions import (
+    FIGURES,
+    action_name,
+    cost_text,
+    decision_number,
+    describe_move,
+    figure_texts,
+    rank_actions,
+    task_of,
+)
+from potlp_jax.view.labels import draw_labels, map_extent, place_labels
+from potlp_jax.view.layers import (
     area_handles,
-    describe_outcome,
     draw_ends,
-    draw_labels,
     draw_path,
     draw_subgoals,
-    map_extent,
-    place_labels,
     show_cells,
     state_handles,
+    subgoal_handles,
 )
+from potlp_jax.view.maps import MAX_INCHES_PER_CELL, describe_outcome
 from potlp_jax.view.style import (
     AREA_COLOURS,
     CHOSEN,
     CHOSEN_ROW,
     DOTS_PER_INCH,
     FAINT,
+    FREE_UNSEEN,
     INK,
+    QUIET,
     ROBOT,
     STATE_COLOURS,
+    WALL_SEEN,
+    WALL_UNSEEN,
     new_figure,
     rgb,
 )
@@ -50,10 +58,25 @@ MAX_BYTES: int = 3_000_000
 FRAME_MILLISECONDS: int = 700
 LAST_FRAME_MILLISECONDS: int = 3_000
 SHOWN_ACTIONS: int = 7
+"""Rows of the table of actions; a decision may have a hundred."""
+
+KEY_ROWS: float = 0.72 * len(FIGURES)
+"""Rows below the table that say what its columns mean, in smaller letters."""
+
+LETTER_INCHES: float = 0.075
+"""Mean width of a letter in the panel."""
+
+NAME_LETTERS: int = 36
+"""Of an action's name, so that it ends before the bar of P_S."""
+
 LABEL_SIZE: float = 8.0
 ROW_INCHES: float = 0.25
 IMAGE_PIXELS: int = 400
+"""Longer side of the map's raster: coarser than in a picture, for a GIF stores every frame."""
+
 MIXED_COLOURS: int = 64
+"""Of the palette's 256; the rest are the exact colours of states, areas and marks."""
+
 THEME: tuple[str, ...] = ("#FFFFFF", INK, FAINT, CHOSEN, ROBOT, CHOSEN_ROW, WALL_SEEN, FREE_UNSEEN, WALL_UNSEEN)
 
 Progress = Callable[[int, int], None]
@@ -100,14 +123,13 @@ class _Stage:
 
     def __init__(self, trial: Trial) -> None:
         self._trial = trial
-        self._task = Task.from_hoa(trial.task_hoa, trial.propositions)
         self._figure, self._axes, self._panel, self._scale = _layout(*map_extent(trial.world))
         self._labels = place_labels(
             trial.world, trial.propositions, trial.path, inches_per_cell=self._scale, size=LABEL_SIZE
         )
         self._axes.set(xticks=[], yticks=[])
         self._panel.axis("off")
-        _legend(self._axes, trial, self._task)
+        _legend(self._axes, trial)
         formula = trial.task_text if len(trial.task_text) <= 90 else trial.task_text[:87] + "..."
         place = 1 - 0.1 / self._figure.get_figheight()
         heading = f"{formula}\n{describe_outcome(trial)}"
@@ -122,7 +144,7 @@ class _Stage:
         """The belief, path and actions at a decision, or the end of the trial if ``decision`` is None."""
         still = {axes: set(axes.get_children()) for axes in (self._axes, self._panel)}
         self._draw_map(decision)
-        _draw_panel(self._panel, self._trial, decision, self._task)
+        _draw_panel(self._panel, self._trial, decision)
         self._canvas.restore_region(self._background)
         for axes, before in still.items():
             fresh = [artist for artist in axes.get_children() if artist not in before]
@@ -176,14 +198,15 @@ def _draw_intention(axes: Axes, decision: Decision) -> None:
     axes.plot(column, row, "o", ms=9, mfc=ROBOT, mec=INK, mew=1.3, zorder=8)
 
 
-def _legend(axes: Axes, trial: Trial, task: Task) -> None:
+def _legend(axes: Axes, trial: Trial) -> None:
+    """Short entries; what a state asks for is said beside the map at each decision."""
     handles = [
         Patch(facecolor=FREE_UNSEEN, edgecolor=FAINT, label="not seen yet"),
-        *state_handles(trial, task),
-        *area_handles(trial),
+        *state_handles(trial.states, task_of(trial), words=False),
+        *area_handles(trial.propositions, trial.world),
         Line2D([], [], marker="o", ls="", ms=7, mfc=ROBOT, mec=INK, label="robot"),
-        Line2D([], [], marker="^", ls="", ms=6, mfc="white", mec=CHOSEN, mew=1.4, label="subgoal"),
-        Line2D([], [], marker="^", ls=(0, (2, 1.2)), color=CHOSEN, ms=6, label="chosen"),
+        *subgoal_handles(),
+        Line2D([], [], color=CHOSEN, linewidth=1.8, linestyle=(0, (2, 1.2)), label="path to it"),
     ]
     axes.legend(
         handles=handles,
@@ -198,69 +221,67 @@ def _legend(axes: Axes, trial: Trial, task: Task) -> None:
     )
 
 
-def _draw_panel(panel: Axes, trial: Trial, decision: Decision | None, task: Task) -> None:
+def _draw_panel(panel: Axes, trial: Trial, decision: Decision | None) -> None:
+    """What was decided and the actions that were weighed; at the end, how the trial ended."""
     inches = panel.get_window_extent().height / DOTS_PER_INCH
-    panel.set(xlim=(0, 1), ylim=(max(SHOWN_ACTIONS + 2.4, inches / ROW_INCHES), -0.2))
+    panel.set(xlim=(0, 1), ylim=(max(SHOWN_ACTIONS + KEY_ROWS + 3.4, inches / ROW_INCHES), -0.2))
+    letters = int(panel.get_window_extent().width / DOTS_PER_INCH / LETTER_INCHES)
+    task = task_of(trial)
     if decision is None:
-        accepting = bool(task.dfa.accepting[trial.states[-1]])
+        state = trial.states[-1]
         lines = [
-            f"End: {trial.outcome.value} after {len(trial.path) - 1} steps, cost {trial.cost:.1f}",
-            f"automaton state {trial.states[-1]}{' (accepting)' if accepting else ''}, "
-            f"{len(trial.decisions)} decisions",
+            f"end: {trial.outcome.value} after {len(trial.path) - 1} steps, cost {trial.cost:.1f}",
+            f"state {state}: {state_words(task, state)}; {len(trial.decisions)} decisions",
         ]
         _panel_text(panel, lines)
         return
-    # Decisions are numbered from 0, as in the record, on the page and for `potlp explain`.
-    head = f"decision {decision.index} of 0..{len(trial.decisions) - 1}   step {decision.step}   state {decision.state}"
+    lines = [
+        f"{decision_number(trial, decision)}   step {decision.step}   expected cost {cost_text(decision.value)}",
+        textwrap.shorten(f"state {decision.state}: {state_words(task, decision.state)}", letters, placeholder=" ..."),
+    ]
     if not decision.actions:
-        _panel_text(panel, [head, *textwrap.wrap(_KINDS.get(decision.kind, decision.kind), 80)])
+        lines[0] = f"{decision_number(trial, decision)}   step {decision.step}"
+        _panel_text(panel, [*lines, *textwrap.wrap(describe_move(trial, decision), letters)])
         return
-    head += f"   expected cost {decision.value:.1f}"
-    panel.text(0.0, 0.1, head, size=9.5, weight="bold", va="center", color=INK)
-    _action_rows(panel, rank_actions(decision), decision)
-
-
-_KINDS = {
-    "finish": "the task can be finished in known space: go there",
-    "frontier": "go to the nearest frontier that violates nothing",
-    "fallback": "no action is available: go to the nearest frontier that violates nothing",
-    "optimistic": "go where the task could be finished if unseen cells were as one wishes",
-    "none": "nothing can be done",
-}
+    _panel_text(panel, lines)
+    _action_rows(panel, rank_actions(decision), trial, decision)
 
 
 def _panel_text(panel: Axes, lines: Sequence[str]) -> None:
     for line, text in enumerate(lines):
-        panel.text(0.0, 0.1 + 1.1 * line, text, size=9.5, weight="normal" if line else "bold", va="center", color=INK)
+        panel.text(0.0, 0.1 + line, text, size=9.0, weight="normal" if line else "bold", va="center", color=INK)
 
 
-_COLUMNS = (("P_S", 0.52), ("R_S", 0.62), ("R_F", 0.71), ("D", 0.80), ("Q", 0.90), ("visits", 1.0))
+_COLUMNS = dict(zip(FIGURES, (0.61, 0.69, 0.77, 0.84, 0.92, 1.0), strict=True))
+"""Right ends of the columns of figures, as shares of the panel's width."""
+
+_BAR, _BAR_WIDTH = 0.44, 0.1
+"""Left end and width of the bar that shows P_S."""
 
 
-def _action_rows(panel: Axes, actions: Sequence[ActionRecord], decision: Decision) -> None:
-    panel.text(0.0, 1.2, "best actions", size=8, color="#6E6E6E", va="center")
-    for name, place in _COLUMNS:
-        panel.text(place, 1.2, name, size=8, color="#6E6E6E", ha="right", va="center")
-    for row, action in enumerate(actions[:SHOWN_ACTIONS], start=2):
+def _action_rows(panel: Axes, actions: Sequence[ActionRecord], trial: Trial, decision: Decision) -> None:
+    """The best actions as a table, and below it what its columns mean."""
+    panel.text(0.0, 2.2, "best actions", size=8, color=QUIET, va="center")
+    for name, place in _COLUMNS.items():
+        panel.text(place, 2.2, name, size=8, color=QUIET, ha="right", va="center")
+    for row, action in enumerate(actions[:SHOWN_ACTIONS], start=3):
         chosen = action.index == decision.choice
         if chosen:
             panel.add_patch(Rectangle((-0.01, row - 0.34), 1.02, 0.9, facecolor=CHOSEN_ROW, edgecolor="none"))
         colour, weight = (CHOSEN, "bold") if chosen else (INK, "normal")
-        panel.text(0.0, row + 0.1, action_name(action), size=8.5, color=colour, weight=weight, va="center")
-        panel.add_patch(Rectangle((0.27, row - 0.15), 0.17, 0.5, facecolor="#EEEEEE", edgecolor="none"))
-        panel.add_patch(
-            Rectangle((0.27, row - 0.15), 0.17 * action.success_probability, 0.5, facecolor=colour, edgecolor="none")
-        )
-        values = (
-            f"{action.success_probability:.2f}",
-            *(f"{value:.1f}" for value in (action.success_cost, action.failure_cost, action.distance, action.q_value)),
-            str(action.visits),
-        )
-        for value, (_, place) in zip(values, _COLUMNS, strict=True):
+        name = textwrap.shorten(action_name(action, task_of(trial)), NAME_LETTERS, placeholder=" ...")
+        panel.text(0.0, row + 0.1, name, size=8.5, color=colour, weight=weight, va="center")
+        for share, fill in ((1.0, "#EEEEEE"), (action.success_probability, colour)):
+            bar = Rectangle((_BAR, row - 0.15), _BAR_WIDTH * share, 0.5, facecolor=fill, edgecolor="none")
+            panel.add_patch(bar)
+        for value, place in zip(figure_texts(action), _COLUMNS.values(), strict=True):
             panel.text(place, row + 0.1, value, size=8.5, color=colour, weight=weight, ha="right", va="center")
+    last = 3 + min(len(actions), SHOWN_ACTIONS)
     if len(actions) > SHOWN_ACTIONS:
         rest = f"and {len(actions) - SHOWN_ACTIONS} more"
-        panel.text(0.0, SHOWN_ACTIONS + 2.05, rest, size=8, color="#6E6E6E", va="center")
+        panel.text(0.0, last + 0.05, rest, size=8, color=QUIET, va="center")
+    for row, (name, meaning) in enumerate(FIGURES.items()):
+        panel.text(0.0, last + 1.0 + 0.72 * row, f"{name}: {meaning}", size=7, color=QUIET, va="center")
 
 
 def _encode(frames: Sequence[Image.Image]) -> bytes:

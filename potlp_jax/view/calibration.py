@@ -15,7 +15,7 @@ from rich.table import Table
 
 from potlp_jax.learning.dataset import Samples, decode
 from potlp_jax.learning.metrics import INTACT, CostErrors, Figures, Predictions, Report, class_in_words
-from potlp_jax.view.style import CHOSEN, FAINT, INK, STATE_COLOURS, new_figure
+from potlp_jax.view.style import CHOSEN, FAINT, INK, RIGHT, SERIES_COLOURS, WRONG, new_figure
 from potlp_jax.world.camera import roll_to
 
 VARIANTS: Mapping[str, str] = MappingProxyType({INTACT: "intact", "image": "image blacked out", "phi": "phi shuffled"})
@@ -127,7 +127,7 @@ def _draw_bins(axes: Axes, figures: Figures) -> None:
     axes.axhline(figures.success_rate, color=FAINT, linewidth=1.0, linestyle=":", label="mean of all samples")
     said, seen = [entry.predicted for entry in filled], [entry.observed for entry in filled]
     errors = [2 * math.sqrt(max(y * (1 - y), 0.0) / entry.samples) for y, entry in zip(seen, filled, strict=True)]
-    style = {"color": STATE_COLOURS[0], "marker": "o", "markersize": 5, "linewidth": 1.5, "capsize": 2}
+    style = {"color": SERIES_COLOURS[0], "marker": "o", "markersize": 5, "linewidth": 1.5, "capsize": 2}
     axes.errorbar(said, seen, errors, **style, label="± 2 standard errors, as if independent")
     axes.set(xlim=(0, 1), ylim=(-0.02, 1.02))
     axes.set_ylabel("how often it was there", color=INK)
@@ -145,7 +145,7 @@ def _draw_bins(axes: Axes, figures: Figures) -> None:
 def _draw_counts(axes: Axes, figures: Figures) -> None:
     middle = [(entry.low + entry.high) / 2 for entry in figures.bins]
     width = 0.9 * (figures.bins[0].high - figures.bins[0].low)
-    axes.bar(middle, [entry.samples for entry in figures.bins], width, color=STATE_COLOURS[5])
+    axes.bar(middle, [entry.samples for entry in figures.bins], width, color=SERIES_COLOURS[3])
     axes.set(xlim=(0, 1))
     axes.set_xlabel("predicted P_S", color=INK)
     axes.set_ylabel("samples", color=INK)
@@ -154,7 +154,7 @@ def _draw_counts(axes: Axes, figures: Figures) -> None:
 
 def _draw_skills(axes: Axes, reports: Mapping[str, Report]) -> None:
     rows = _rows(reports[INTACT])
-    styles = {INTACT: ("o", STATE_COLOURS[0]), "image": ("s", STATE_COLOURS[1]), "phi": ("D", STATE_COLOURS[2])}
+    styles = {INTACT: ("o", SERIES_COLOURS[0]), "image": ("s", SERIES_COLOURS[1]), "phi": ("D", SERIES_COLOURS[2])}
     least = 0.0
     for name, report in reports.items():
         skills = [figures.skill for _, figures in _rows(report)]
@@ -223,7 +223,7 @@ def draw_predictions(
     figure.text(0.5, 1 - 0.1 / height, title, ha="center", va="top", size=9, color=INK)
     top = height - 0.45
     for name, members in chosen.items():
-        colour = STATE_COLOURS[2] if name.startswith("true") else STATE_COLOURS[1]
+        colour = RIGHT if name.startswith("true") else WRONG
         label = f"{_KINDS[name]} (most confident first)" if len(members) else f"{_KINDS[name]}: none"
         figure.text(0.2 / width, (top - 0.2) / height, label, va="center", size=11, weight="bold", color=colour)
         top -= heading

@@ -8,16 +8,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.box import SIMPLE_HEAD
 from rich.table import Table as RichTable
+from rich.text import Text
 
 from potlp_jax.sweep.results import Pair
 from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, SATISFIED, Comparison, PolicyRow
-from potlp_jax.view.style import FAINT, INK, STATE_COLOURS, new_figure
+from potlp_jax.view.style import FAINT, INK, PolicyStyle, new_figure, policy_styles
 
 FEW_WORLDS: int = 30
 """Below so many worlds a comparison is shown with a warning: percentile intervals of few pairs are too narrow."""
-
-_MARKERS = "osD^vP*X"
-_LINES = ("-", "--", "-.", ":")
 
 
 def comparison_table(comparison: Comparison) -> RichTable:
@@ -47,11 +45,18 @@ def comparison_table(comparison: Comparison) -> RichTable:
         names.append("attainable,\nall worlds")
     for name in names:
         shown.add_column(name, justify="right", no_wrap=True)
+    styles = policy_styles(row.policy for row in satisfied.rows)
     for row, of_all in zip(satisfied.rows, charged.rows, strict=True):
         ended = comparison.outcomes[row.policy].get(SATISFIED, 0)
         last = (_percent(of_all.attainable_share),) if satisfied.dropped else ()
-        shown.add_row(row.policy, f"{ended} of {comparison.worlds}", *_cells(row), *last)
+        shown.add_row(_policy_name(row.policy, styles), f"{ended} of {comparison.worlds}", *_cells(row), *last)
     return shown
+
+
+def _policy_name(policy: str, styles: Mapping[str, PolicyStyle]) -> Text:
+    """In the colour that the policy has in pictures; ink is whatever the terminal writes in."""
+    colour = styles[policy].colour
+    return Text(policy, style="" if colour == INK else colour)
 
 
 def _cells(row: PolicyRow) -> tuple[str, ...]:
@@ -101,18 +106,6 @@ def loss_lines(comparison: Comparison) -> list[str]:
     ]
 
 
-def policy_styles(policies: Sequence[str]) -> Mapping[str, tuple[str, str, str]]:
-    """Colour, marker and line of each policy: told apart without colour too."""
-    return {
-        policy: (
-            STATE_COLOURS[index % len(STATE_COLOURS)],
-            _MARKERS[index % len(_MARKERS)],
-            _LINES[index % len(_LINES)],
-        )
-        for index, policy in enumerate(policies)
-    }
-
-
 def draw_scatter(pairs: Sequence[Pair], policies: Sequence[str], title: str) -> Figure:
     """The picture of `scatter_costs` with a title."""
     figure = new_figure(6.4, 6.9)
@@ -133,7 +126,7 @@ def scatter_costs(axes: Axes, pairs: Sequence[Pair], policies: Sequence[str]) ->
     axes.set_axisbelow(True)
     _mark_diagonal(axes, limit)
     unsatisfied = False
-    for policy, (colour, marker, _) in policy_styles(policies).items():
+    for policy, style in policy_styles(policies).items():
         if policy == BASELINE:
             continue
         good = [pair for pair in pairs if pair[policy].outcome == pair[BASELINE].outcome == SATISFIED]
@@ -142,15 +135,15 @@ def scatter_costs(axes: Axes, pairs: Sequence[Pair], policies: Sequence[str]) ->
             [pair[BASELINE].cost for pair in good],
             [pair[policy].cost for pair in good],
             s=12 if policy == KNOWN_MAP else 26,
-            marker=marker,
-            color=colour,
+            marker=style.marker,
+            color=style.colour,
             alpha=0.65,
             linewidths=0,
             label=f"{policy} ({len(good)} worlds)",
             zorder=2,
         )
         failed = [pair[BASELINE].cost for pair in bad], [pair[policy].cost for pair in bad]
-        axes.scatter(*failed, s=34, marker="x", color=colour, zorder=3)
+        axes.scatter(*failed, s=34, marker="x", color=style.colour, zorder=3)
         unsatisfied = unsatisfied or bool(bad)
     if unsatisfied:
         axes.scatter([], [], s=34, marker="x", color=FAINT, label="not satisfied")

@@ -1,14 +1,53 @@
-"""One decision for people and programs: the table of its actions."""
+"""One decision for people and programs: its actions in words, their figures, and the table of them."""
 
 import dataclasses
+import math
+from collections.abc import Mapping
+from functools import lru_cache
+from types import MappingProxyType
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from potlp_jax.codec import finite_or_null
+from potlp_jax.task.task import Task
+from potlp_jax.task.words import state_words, transition_words
 from potlp_jax.trials.record import ActionRecord, Decision, Trial
 from potlp_jax.types import status_names
+
+FIGURES: Mapping[str, str] = MappingProxyType(
+    {
+        "P_S": "probability that the attempt beyond the subgoal succeeds",
+        "R_S": "expected cost beyond the subgoal if it succeeds",
+        "R_F": "expected cost beyond the subgoal if it fails",
+        "D": "path cost to the subgoal in known space",
+        "Q": "expected cost of the rest of the task if this action is taken now",
+        "visits": "simulations of the search that began with this action",
+    }
+)
+"""What the columns of an action's table mean; costs are in units of the map's resolution."""
+
+KINDS: Mapping[str, str] = MappingProxyType(
+    {
+        "finish": "finish the task in known space",
+        "frontier": "go to the nearest frontier that violates nothing",
+        "fallback": "no action is available: go to the nearest frontier that violates nothing",
+        "optimistic": "go where the task could be finished if unseen cells were as one wishes",
+        "none": "nothing can be done",
+    }
+)
+"""What a decision is for where it is no attempt beyond a subgoal, by ``Decision.kind``."""
+
+
+@lru_cache(maxsize=8)
+def _task(hoa: str, propositions: tuple[str, ...]) -> Task:
+    return Task.from_hoa(hoa, propositions)
+
+
+def task_of(trial: Trial) -> Task:
+    """The task of a record; the last few are kept, because every decision of a trial asks for it."""
+    return _task(trial.task_hoa, trial.propositions)
 
 
 def rank_actions(decision: Decision) -> list[ActionRecord]:
@@ -16,52 +55,83 @@ def rank_actions(decision: Decision) -> list[ActionRecord]:
     return sorted(decision.actions, key=lambda action: (action.q_value, action.index != decision.choice, action.index))
 
 
-def action_name(action: ActionRecord) -> str:
-    """``finish``, or the subgoal and the transition that is tried beyond it."""
+def chosen_action(decision: Decision) -> ActionRecord | None:
+    """The action that was taken; None unless the policy searched."""
+    return next((action for action in decision.actions if action.index == decision.choice), None)
+
+
+def action_name(action: ActionRecord, task: Task) -> str:
+    """``finish``, or the subgoal and the transition that is tried beyond it, such as ``s2: find alarm``."""
     if action.subgoal is None:
         return "finish"
-    return f"s{action.subgoal}: {action.from_state}→{action.to_state}"
+    assert action.from_state is not None
+    assert action.to_state is not None
+    return f"s{action.subgoal}: {transition_words(task, action.from_state, action.to_state, brief=True)}"
 
 
 def action_table(trial: Trial, decision: Decision) -> Table:
-    """The actions of a decision by expected cost, the chosen one marked."""
-    caption = f"expected cost {decision.value:.2f}; costs in units of resolution"
+    """The actions of a decision by expected cost, the chosen one marked, with what the columns mean below."""
+    meanings = "; ".join(f"{name}: {meaning}" for name, meaning in FIGURES.items())
     table = Table(
         title=describe_decision(trial, decision),
-        caption=caption,
+        caption=f"expected cost {decision.value:.2f}, in units of resolution as are all costs. {meanings}",
         title_justify="left",
         box=SIMPLE_HEAD,
         caption_justify="left",
     )
     table.add_column("", width=1)
-    table.add_column("action", no_wrap=True)
-    table.add_column("subgoal")
-    for name in ("P_S", "R_S", "R_F", "D", "Q", "visits"):
-        table.add_column(name, justify="right")
+    for name in ("action", "transition", "subgoal"):
+        table.add_column(name, no_wrap=name != "action")
+    for name in FIGURES:
+        table.add_column(name, justify="right", no_wrap=True)
     for action in rank_actions(decision):
         chosen = action.index == decision.choice
-        place = "-" if action.cell is None else f"{action.cell[0]},{action.cell[1]}"
         table.add_row(
             "*" if chosen else "",
-            action_name(action),
-            place,
-            f"{action.success_probability:.3f}",
-            *(f"{value:.1f}" for value in (action.success_cost, action.failure_cost, action.distance, action.q_value)),
-            str(action.visits),
+            action_name(action, task_of(trial)),
+            "-" if action.subgoal is None else f"{action.from_state}→{action.to_state}",
+            "-" if action.cell is None else f"{action.cell[0]},{action.cell[1]}",
+            *figure_texts(action, digits=3),
             style="bold" if chosen else None,
         )
     return table
 
 
+def figure_texts(action: ActionRecord, *, digits: int = 2) -> list[str]:
+    """The values of the columns ``FIGURES``; probabilities with ``digits`` digits, costs with one."""
+    costs = (action.success_cost, action.failure_cost, action.distance, action.q_value)
+    return [f"{action.success_probability:.{digits}f}", *map(cost_text, costs), str(action.visits)]
+
+
+def cost_text(value: float) -> str:
+    """A cost with one digit; infinity as a sign."""
+    return f"{value:.1f}" if math.isfinite(value) else "∞"
+
+
+def decision_number(trial: Trial, decision: Decision) -> str:
+    """Which decision it is. Numbers count from 0, as in the record and in ``potlp explain FOLDER:NUMBER``."""
+    return f"decision {decision.index} (last: {len(trial.decisions) - 1})"
+
+
 def describe_decision(trial: Trial, decision: Decision) -> str:
     """Where and when the decision was made, and what it led to, in one line."""
-    went = "nowhere" if decision.target is None else f"cell {decision.target} in state {decision.target_state}"
-    better = decision.overruled
-    kept = "" if better is None else f", kept although {action_name(better)} is better"
+    row, column = decision.cell
     return (
-        f"decision {decision.index} of {trial.policy} (step {decision.step}): cell {decision.cell} in state "
-        f"{decision.state}, {decision.kind} toward {went}{kept}"
+        f"decision {decision.index} of {trial.policy}, step {decision.step}: at cell {row},{column} in state "
+        f"{decision.state} ({state_words(task_of(trial), decision.state)}): {describe_move(trial, decision)}"
     )
+
+
+def describe_move(trial: Trial, decision: Decision) -> str:
+    """What was decided: the attempt and where it is made, or why the robot went elsewhere."""
+    target = "" if decision.target is None else f" at {decision.target[0]},{decision.target[1]}"
+    chosen = chosen_action(decision)
+    if chosen is None or chosen.subgoal is None:
+        move = KINDS.get(decision.kind, decision.kind) + target
+    else:
+        move = action_name(chosen, task_of(trial)).replace(":", f"{target}:", 1)
+    better = decision.overruled
+    return move if better is None else f"{move}; kept although {action_name(better, task_of(trial))} is better"
 
 
 def decision_to_dict(decision: Decision) -> dict[str, Any]:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -17,7 +16,8 @@ from potlp_jax.environments.ros.map_files import GridFrame, OccupancyMap
 from potlp_jax.environments.ros.places import component_labels
 from potlp_jax.environments.ros.ros_map import RosMap
 from potlp_jax.environments.ros.survey import SPECK
-from potlp_jax.view.maps import AreaLabel, draw_labels, place_labels
+from potlp_jax.view.labels import AreaLabel, draw_labels, place_labels
+from potlp_jax.view.layers import area_handles
 from potlp_jax.view.style import CHOSEN, FAINT, INK, area_colour, new_figure, rgb
 from potlp_jax.world.grid import World
 
@@ -40,10 +40,7 @@ def draw_map(image_map: OccupancyMap, clean: CleanMap, title: str) -> Figure:
 
 def draw_places(family: RosMap, world: World, title: str) -> Figure:
     """The same with the propositions of a family of worlds, and the start if its places fix one."""
-    present: list[Patch | Line2D] = [
-        Patch(facecolor=to_rgba(area_colour(bit)), edgecolor=FAINT, linewidth=0.5, label=name)
-        for bit, name in enumerate(family.propositions)
-    ]
+    present: list[Patch | Line2D] = [*area_handles(family.propositions, world)]
     figure, axes = _plan(family.image_map, family.clean, title, _letter_raster(world, len(family.propositions)))
     scale = axes.bbox.width / figure.dpi / float(np.ptp(axes.get_xlim()))
     draw_labels(axes, _labels_in_metres(family, world, scale * family.clean.frame.resolution))
@@ -164,8 +161,8 @@ def _labels_in_metres(family: RosMap, world: World, inches_per_cell: float) -> l
     frame = family.clean.frame
     to_metres = _to_metres(frame)
 
-    def metres(spot: tuple[float, float]) -> tuple[float, float]:
-        x, y = to_metres.transform((spot[0] + 0.5, frame.height - 0.5 - spot[1]))
+    def metres(cell: tuple[float, float]) -> tuple[float, float]:
+        x, y = to_metres.transform((cell[0] + 0.5, frame.height - 0.5 - cell[1]))
         return float(x), float(y)
 
     start = tuple(np.asarray(world.start).tolist())
@@ -174,7 +171,7 @@ def _labels_in_metres(family: RosMap, world: World, inches_per_cell: float) -> l
     return [
         AreaLabel(
             label.name,
-            metres(label.spot),
+            metres(label.centre),
             metres(label.anchor),
             (label.half_size[0] * half, label.half_size[1] * half),
         )

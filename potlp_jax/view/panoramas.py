@@ -1,5 +1,6 @@
 """What the robot saw of each subgoal when it decided: panoramas with the answers of the estimator."""
 
+import textwrap
 from collections.abc import Mapping
 
 import jax.numpy as jnp
@@ -9,11 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from potlp_jax.trials.record import Decision, Trial
-from potlp_jax.view.decisions import describe_decision, rank_actions
+from potlp_jax.view.decisions import action_name, describe_decision, rank_actions, task_of
 from potlp_jax.view.style import CHOSEN, INK, new_figure
 from potlp_jax.world.camera import bearing, roll_to
 
 _ACTIONS_SHOWN = 6
+_NAME_LETTERS = 24
+"""Of what is tried; longer words are cut."""
 
 
 def draw_panoramas(
@@ -46,7 +49,7 @@ def draw_panoramas(
             color=CHOSEN if mark else INK,
         )
         text.axis("off")
-        text.text(0.0, 1.0, _answers(decision, subgoal), va="top", fontsize=7.5, family="monospace", color=INK)
+        text.text(0.0, 1.0, _answers(trial, decision, subgoal), va="top", fontsize=7.5, family="monospace", color=INK)
     return figure
 
 
@@ -59,14 +62,14 @@ def _draw_rolled(axes: Axes, panorama: np.ndarray, origin: tuple[int, int], subg
     axes.set_yticks([])
 
 
-def _answers(decision: Decision, subgoal: int) -> str:
+def _answers(trial: Trial, decision: Decision, subgoal: int) -> str:
     """The cheapest actions of a subgoal as lines of text; says how many are left out."""
     own = [action for action in rank_actions(decision) if action.subgoal == subgoal]
-    lines = ["try      P_S    R_S    R_F      Q"] if own else ["nothing can be tried here"]
+    lines = [f"{'try':{_NAME_LETTERS}}  P_S    R_S    R_F      Q"] if own else ["nothing can be tried here"]
     for action in own[:_ACTIONS_SHOWN]:
-        lines.append(
-            f"{action.from_state}→{action.to_state}  {action.success_probability:8.2f} {action.success_cost:6.0f} "
-            f"{action.failure_cost:6.0f} {action.q_value:6.0f}"
-        )
+        name = action_name(action, task_of(trial)).split(": ", 1)[1]
+        costs = "".join(f" {value:6.0f}" for value in (action.success_cost, action.failure_cost, action.q_value))
+        shown = textwrap.shorten(name, _NAME_LETTERS, placeholder="...")
+        lines.append(f"{shown:{_NAME_LETTERS}} {action.success_probability:.2f}{costs}")
     hidden = len(own) - _ACTIONS_SHOWN
     return "\n".join(lines + ([f"and {hidden} more"] if hidden > 0 else []))

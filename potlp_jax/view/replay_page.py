@@ -4,6 +4,7 @@ import base64
 import html
 import io
 import json
+import math
 from collections.abc import Mapping
 from importlib import resources
 from typing import Any
@@ -13,10 +14,17 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from potlp_jax.task.task import Task
-from potlp_jax.trials.record import Decision, Trial
-from potlp_jax.view.decisions import action_name, describe_decision, rank_actions
-from potlp_jax.view.maps import map_extent
+from potlp_jax.task.words import state_words, transition_words
+from potlp_jax.trials.record import ActionRecord, Decision, Trial
+from potlp_jax.view.decisions import FIGURES, action_name, describe_move, figure_texts, rank_actions, task_of
+from potlp_jax.view.labels import map_extent, place_labels
 from potlp_jax.view.style import area_colour, state_colour
+
+MAP_PIXELS: tuple[int, int] = (1100, 640)
+"""Width and height of the map on a page, at most: with its controls and table it fits most screens."""
+
+PIXELS_PER_INCH: int = 96
+"""Of a browser, by definition of CSS."""
 
 _JPEG_QUALITY: int = 80
 
@@ -65,22 +73,28 @@ def _text(name: str) -> str:
 
 def replay_data(trial: Trial, panoramas: Mapping[int, UInt8[np.ndarray, "rows columns 3"]]) -> dict[str, Any]:
     """What ``mountReplay`` shows, JSON-able."""
-    task = Task.from_hoa(trial.task_hoa, trial.propositions)
+    task = task_of(trial)
     letters = np.asarray(trial.world.letters)
     labelled = np.argwhere(letters > 0)
+    rows, columns = map_extent(trial.world)
+    pixels = int(np.clip(min(MAP_PIXELS[0] // columns, MAP_PIXELS[1] // rows), 2, 24))
+    labels = place_labels(trial.world, trial.propositions, trial.path, inches_per_cell=pixels / PIXELS_PER_INCH)
     return {
         "facts": _facts(trial),
-        "extent": list(map_extent(trial.world)),
+        "extent": [rows, columns],
+        "cell_pixels": pixels,
+        "labels": [{"name": label.name, "x": label.centre[0], "y": label.centre[1]} for label in labels],
         "width": int(letters.shape[1]),
         "occupied": _base64(np.asarray(trial.world.occupied, np.uint8)),
         "first_seen": _base64(np.asarray(trial.first_seen, "<i4")),
         "letters": [[int(row), int(column), int(letters[row, column])] for row, column in labelled],
         "propositions": list(trial.propositions),
         "area_colours": [area_colour(bit) for bit in range(len(trial.propositions))],
-        "state_names": [_state_name(task, state) for state in range(task.dfa.num_states)],
+        "state_names": [f"state {state}: {state_words(task, state)}" for state in range(task.dfa.num_states)],
         "state_colours": [state_colour(state) for state in range(task.dfa.num_states)],
         "path": [list(cell) for cell in trial.path],
         "states": list(trial.states),
+        "figures": dict(FIGURES),
         "decisions": [_decision(trial, decision) for decision in trial.decisions],
         "panoramas": {number: _jpeg(image) for number, image in panoramas.items()},
     }
@@ -94,35 +108,36 @@ def _facts(trial: Trial) -> str:
     )
 
 
-def _state_name(task: Task, state: int) -> str:
-    kind = ", satisfied" if task.dfa.accepting[state] else ", violated" if task.dfa.trap[state] else ""
-    return f"state {state}{kind}"
-
-
 def _decision(trial: Trial, decision: Decision) -> dict[str, Any]:
     return {
         "index": decision.index,
         "step": decision.step,
+        "state": decision.state,
         "cell": list(decision.cell),
-        "text": describe_decision(trial, decision),
+        "text": f"Decision {decision.index}: {describe_move(trial, decision)}",
+        "value": decision.value if math.isfinite(decision.value) else None,
         "subgoals": [list(cell) for cell in decision.subgoals],
         "observations": list(decision.observations),
         "path": [list(cell) for cell in decision.path],
         "actions": [
             {
-                "name": action_name(action),
+                "name": action_name(action, task_of(trial)),
+                "meaning": _meaning(task_of(trial), action),
                 "subgoal": action.subgoal,
                 "chosen": action.index == decision.choice,
-                "success_probability": action.success_probability,
-                "success_cost": action.success_cost,
-                "failure_cost": action.failure_cost,
-                "distance": action.distance,
-                "q_value": action.q_value,
-                "visits": action.visits,
+                "figures": figure_texts(action, digits=3),
             }
             for action in rank_actions(decision)
         ],
     }
+
+
+def _meaning(task: Task, action: ActionRecord) -> str:
+    """What is tried, whole: the transition by its states and with what must be avoided."""
+    if action.from_state is None or action.to_state is None:
+        return "the rest of the task, in known space"
+    words = transition_words(task, action.from_state, action.to_state)
+    return f"{words} (state {action.from_state} to state {action.to_state})"
 
 
 def _base64(array: np.ndarray) -> str:

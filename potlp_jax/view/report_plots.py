@@ -1,17 +1,15 @@
 """The pictures of a report, as SVG that takes its text and line colours from the page, light or dark."""
 
-import io
 from collections.abc import Sequence
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from potlp_jax.sweep.results import Pair
 from potlp_jax.sweep.statistics import BASELINE
-from potlp_jax.view.comparisons import policy_styles, scatter_costs
-from potlp_jax.view.style import FAINT, INK, new_figure
+from potlp_jax.view.comparisons import scatter_costs
+from potlp_jax.view.style import FAINT, INK, figure_bytes, new_figure, policy_styles
 
 
 def scatter(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
@@ -24,9 +22,9 @@ def scatter(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
 def cumulative(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
     """Costs summed over the worlds, in the order of their numbers."""
     figure, axes = _axes(5.2, 4.6)
-    for policy, (colour, _, line) in policy_styles(policies).items():
+    for policy, style in policy_styles(policies).items():
         total = np.cumsum([pair[policy].cost for pair in pairs])
-        axes.plot(np.arange(1, len(pairs) + 1), total, line, color=colour, linewidth=1.6, label=policy)
+        axes.plot(np.arange(1, len(pairs) + 1), total, style.line, color=style.colour, linewidth=1.6, label=policy)
     axes.set(xlim=(0, max(len(pairs), 1)), xlabel="worlds", ylabel="cost of all of them")
     axes.set_ylim(bottom=0)
     _legend(axes)
@@ -38,11 +36,11 @@ def savings_by_world(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
     figure, axes = _axes(5.2, 4.6)
     axes.axhline(0.0, color=FAINT, linewidth=1.0)
     share = 100 * (np.arange(len(pairs)) + 0.5) / max(len(pairs), 1)
-    for policy, (colour, _, line) in policy_styles(policies).items():
+    for policy, style in policy_styles(policies).items():
         if policy == BASELINE:
             continue
         saved = np.sort([pair[BASELINE].cost - pair[policy].cost for pair in pairs])[::-1]
-        axes.plot(share, saved, line, color=colour, linewidth=1.6, label=policy)
+        axes.plot(share, saved, style.line, color=style.colour, linewidth=1.6, label=policy)
     axes.set(xlim=(0, 100), xlabel="worlds (%), most saved first", ylabel="saved against the baseline")
     _legend(axes)
     return _svg(figure)
@@ -65,11 +63,8 @@ def _svg(figure: Figure) -> str:
     figure.patch.set_alpha(0.0)
     for axes in figure.axes:
         axes.patch.set_alpha(0.0)
-    buffer = io.StringIO()
     _recolour(figure)
-    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "potlp"}):
-        figure.savefig(buffer, format="svg", metadata={"Date": None})
-    text = buffer.getvalue()
+    text = figure_bytes(figure, "svg").decode()
     text = text[text.index("<svg") :]
     return text.replace(INK, "currentColor").replace(FAINT.lower(), "var(--faint)")
 

@@ -4,8 +4,11 @@ Colours are those of Okabe and Ito (2008) and Tol's light scheme, which remain d
 deficiencies. Figures are made without pyplot, so drawing keeps no global state and works in any thread.
 """
 
+import dataclasses
 import io
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -16,39 +19,83 @@ from potlp_jax.errors import PictureError
 
 STATE_COLOURS: tuple[str, ...] = (
     "#0072B2",
-    "#D55E00",
-    "#009E73",
-    "#CC79A7",
-    "#8C510A",
-    "#56B4E9",
-    "#6A3D9A",
-    "#B79F00",
-    "#882255",
-    "#332288",
-    "#E69F00",
-    "#117733",
+    "#3C3C96",
+    "#7A1F7A",
+    "#00835F",
+    "#008796",
+    "#7A45D6",
+    "#1F5C1F",
+    "#3C69C8",
+    "#5A1A5A",
+    "#005A78",
 )
-"""Strong colours: automaton states (repeating after twelve, where the numbers beside them tell states apart)."""
+"""Automaton states: dark and cool. They repeat after ten, where the numbers beside them tell states apart."""
 
 AREA_COLOURS: tuple[str, ...] = (
-    "#EE8866",
-    "#EEDD88",
-    "#99DDFF",
-    "#44BB99",
-    "#FFAABB",
-    "#BBCC33",
-    "#77AADD",
-    "#AAAA00",
+    "#F0906A",
+    "#EBD36A",
+    "#FF9FB0",
+    "#C8C850",
+    "#F0C396",
+    "#FFB3DC",
+    "#D9B46C",
+    "#FFC8B4",
 )
-"""Light colours: areas where a proposition holds."""
+"""Areas where a proposition holds: light and warm, so that none is taken for a state, in any kind of sight."""
 
 INK = "#222222"
+QUIET = "#6E6E6E"
+"""Small print: axes, captions, explanations."""
+
 FAINT = "#9A9A9A"
 CHOSEN = "#E6007E"
 CHOSEN_ROW = "#FCE1F0"
 ROBOT = "#FFD400"
 
+FREE_SEEN, WALL_SEEN = "#FFFFFF", "#4A4A4A"
+FREE_UNSEEN, WALL_UNSEEN = "#E4E4E4", "#C6C6C6"
+HATCH = "#B4B4B4"
+
+RIGHT, WRONG = "#009E73", "#D55E00"
+"""Predictions that came true, and those that did not."""
+
+SERIES_COLOURS: tuple[str, ...] = ("#0072B2", "#D55E00", "#009E73", "#56B4E9", "#8C510A", "#F0C808")
+"""Data that are neither states nor policies, and policies that the library does not ship."""
+
+POLICY_COLOURS: Mapping[str, str] = MappingProxyType(
+    {"known-map": INK, "baseline": "#747474", "optimistic": "#E69F00", "oracle": "#CC79A7", "potlp": "#D55E00"}
+)
+"""One colour a policy in every picture, page and table. The known map is drawn in ink, which follows the page."""
+
+MARKERS = "osD^vP*X"
+LINES = ("-", "--", "-.", ":")
+
 DOTS_PER_INCH: int = 110
+
+
+@dataclasses.dataclass(frozen=True)
+class PolicyStyle:
+    """Colour, marker and line of a policy: policies are told apart without colour too."""
+
+    colour: str
+    marker: str
+    line: str
+
+
+def policy_styles(policies: Iterable[str]) -> dict[str, PolicyStyle]:
+    """The style of each policy.
+
+    A shipped policy looks the same whatever it is compared with. Others take the remaining colours in the order in
+    which they are given, the same colours in all pictures of one comparison.
+    """
+    shown = list(dict.fromkeys(policies))
+    names = [*POLICY_COLOURS, *(policy for policy in shown if policy not in POLICY_COLOURS)]
+    colours = list(dict.fromkeys([*POLICY_COLOURS.values(), *SERIES_COLOURS]))
+    styles = {
+        name: PolicyStyle(colours[rank % len(colours)], MARKERS[rank % len(MARKERS)], LINES[rank % len(LINES)])
+        for rank, name in enumerate(names)
+    }
+    return {policy: styles[policy] for policy in shown}
 
 
 def state_colour(state: int) -> str:
@@ -75,16 +122,26 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure in the format of the file's ending (png, svg, pdf); text stays text in SVG.
+    """Write a figure in the format of the file's ending.
 
-    Raises PictureError where the ending names no known format.
+    Args:
+        figure: any figure of ``new_figure``.
+        path: where to write; ``.png``, ``.svg`` or ``.pdf``. In SVG text stays text.
+
+    Raises:
+        PictureError: the ending names no known format.
     """
     suffix = path.suffix.removeprefix(".").lower()
     if suffix not in figure.canvas.get_supported_filetypes():
         raise PictureError(f"{path}: cannot write a picture of type {suffix!r}; use .svg, .png or .pdf")
-    metadata = {"Date": None} if suffix == "svg" else None
+    path.write_bytes(figure_bytes(figure, suffix))
+
+
+def figure_bytes(figure: Figure, suffix: str) -> bytes:
+    """A figure as the content of a file of the given type; equal figures give equal bytes."""
+    # Dates and random identifiers would make equal pictures differ from run to run.
+    date = {"svg": "Date", "pdf": "CreationDate"}.get(suffix)
     buffer = io.BytesIO()
-    # Identifiers and dates would make equal pictures differ from run to run.
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "potlp"}):
-        figure.savefig(buffer, format=suffix, metadata=metadata)
-    path.write_bytes(buffer.getvalue())
+        figure.savefig(buffer, format=suffix, metadata=None if date is None else {date: None})
+    return buffer.getvalue()

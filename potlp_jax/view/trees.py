@@ -10,17 +10,24 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from potlp_jax.view.style import CHOSEN, FAINT, INK, new_figure
+from potlp_jax.task.task import Task
+from potlp_jax.task.words import transition_words
+from potlp_jax.view.decisions import cost_text
+from potlp_jax.view.style import CHOSEN, FAINT, INK, QUIET, new_figure
 
 LEVEL_INCHES: float = 2.35
-ROW_INCHES: float = 0.62
+ROW_INCHES: float = 0.75
 BOX_WIDTH: float = 0.8
 BOX_HEIGHT: float = 0.82
 """Of a box, as shares of the distances between levels and rows."""
 
+NAME_LETTERS: int = 30
+"""Of what is tried, so that it stays in its box; longer words are cut."""
+
 KEY = (
     "solid: success, dashed: failure; coloured: least expected cost, followed further\n"
-    "P: probability of the outcome, Q: expected cost of the action, n: simulations, D: distance, R: cost of the outcome"
+    "P: probability of the outcome, Q: expected cost of the rest of the task if the action is taken, n: simulations,\n"
+    "D: path cost to the subgoal, R: expected cost beyond it (R_S after success, R_F after failure), then what follows"
 )
 
 
@@ -37,18 +44,27 @@ class _Box:
     height: float = 0.0
 
 
-def draw_tree(tree: Mapping[str, Any], title: str | None = None, *, breadth: int = 3) -> Figure:
+def draw_tree(tree: Mapping[str, Any], task: Task, title: str | None = None, *, breadth: int = 3) -> Figure:
     """The tree from left to right: up to ``breadth`` actions of a node, each with its outcomes, the best followed.
 
     The width of a line follows the probability of getting there times the share of simulations of its action.
+
+    Args:
+        tree: the nested values of ``tree_top``.
+        task: says what the attempts of the tree are.
+        title: stands above; default: nothing.
+        breadth: actions of a node that are drawn, those of least expected cost.
+
+    Returns:
+        The figure: one box an outcome.
     """
-    text = f"robot in state {tree['state']}\nV {_number(tree['value'])}  n {tree['visits']}"
-    root = _Box(text, best=True, children=_children(tree, breadth, tree["visits"]))
+    text = f"robot in state {tree['state']}\nexpected cost {cost_text(tree['value'])}\nn {tree['visits']}"
+    root = _Box(text, best=True, children=_children(tree, task, breadth, tree["visits"]))
     rows = _arrange(root, level=0, row=0.0)
     boxes = list(_walk(root))
     width = max(7.0, 0.3 + LEVEL_INCHES * (1 + max(box.level for box in boxes)))
     heading = textwrap.wrap(title, int(width / 0.09)) if title else []
-    top, bottom = 1.0 + 0.34 * len(heading), max(rows, 2.0) + 0.15
+    top, bottom = 1.15 + 0.34 * len(heading), max(rows, 2.0) + 0.15
     figure = new_figure(width, ROW_INCHES * (top + bottom))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(-0.1, (width - 0.3) / LEVEL_INCHES), ylim=(bottom, -top))
@@ -59,11 +75,11 @@ def draw_tree(tree: Mapping[str, Any], title: str | None = None, *, breadth: int
         _draw_box(axes, box)
     for line, part in enumerate(heading):
         axes.text(-0.03, -top + 0.3 + 0.34 * line, part, size=10, weight="bold", va="center", color=INK)
-    axes.text(-0.03, -0.45, KEY, size=8, va="center", color="#6E6E6E")
+    axes.text(-0.03, -0.5, KEY, size=8, va="center", color=QUIET)
     return figure
 
 
-def _children(node: Mapping[str, Any], breadth: int, simulations: int) -> list[_Box]:
+def _children(node: Mapping[str, Any], task: Task, breadth: int, simulations: int) -> list[_Box]:
     """Both outcomes of a node's first actions; only those of the best action are followed."""
     boxes = []
     for rank, action in enumerate(node["actions"][:breadth]):
@@ -74,22 +90,25 @@ def _children(node: Mapping[str, Any], breadth: int, simulations: int) -> list[_
             below = outcome["node"] if rank == 0 else None
             boxes.append(
                 _Box(
-                    _outcome_text(action, outcome, name == "success"),
+                    _outcome_text(action, task, outcome, name == "success"),
                     best=rank == 0,
                     success=name == "success",
                     share=outcome["probability"] * action["visits"] / max(simulations, 1),
-                    children=[] if below is None else _children(below, breadth, simulations),
+                    children=[] if below is None else _children(below, task, breadth, simulations),
                 )
             )
     return boxes
 
 
-def _outcome_text(action: Mapping[str, Any], outcome: Mapping[str, Any], success: bool) -> str:
-    finish = action["subgoal"] is None
-    name = "finish" if finish else f"s{action['subgoal']}: {action['from_state']}→{action['to_state']}"
-    head = name if finish else f"{name} {'succeeds' if success else 'fails'}  P {outcome['probability']:.2f}"
-    figures = f"Q {_number(action['q_value'])}  n {action['visits']}  D {_number(action['distance'])}"
-    return f"{head}\n{figures}\nR {_number(outcome['cost'])}, then {_then(outcome)}"
+def _outcome_text(action: Mapping[str, Any], task: Task, outcome: Mapping[str, Any], success: bool) -> str:
+    """Four lines: what was tried and how it ended, in words, the figures of the action, the cost of the outcome."""
+    figures = f"Q {cost_text(action['q_value'])}  n {action['visits']}  D {cost_text(action['distance'])}"
+    last = f"R {cost_text(outcome['cost'])}, then {_then(outcome)}"
+    if action["subgoal"] is None:
+        return f"finish\nin known space\n{figures}\n{last}"
+    words = transition_words(task, action["from_state"], action["to_state"], brief=True)
+    head = f"s{action['subgoal']} {'succeeds' if success else 'fails'}  P {outcome['probability']:.2f}"
+    return f"{head}\n{textwrap.shorten(words, NAME_LETTERS, placeholder=' ...')}\n{figures}\n{last}"
 
 
 def _then(outcome: Mapping[str, Any]) -> str:
@@ -98,7 +117,7 @@ def _then(outcome: Mapping[str, Any]) -> str:
         return "done"
     if outcome["value"] is None:
         return "not tried"
-    return "a dead end" if node is not None and node["dead_end"] else _number(outcome["value"])
+    return "a dead end" if node is not None and node["dead_end"] else cost_text(outcome["value"])
 
 
 def _arrange(box: _Box, level: int, row: float) -> float:
@@ -139,7 +158,3 @@ def _draw_box(axes: Axes, box: _Box) -> None:
         Rectangle(corner, BOX_WIDTH, BOX_HEIGHT, facecolor="white", edgecolor=colour, linewidth=line, zorder=3)
     )
     axes.text(box.level + 0.02, box.height, box.text, size=7.5, va="center", linespacing=1.3, color=INK, zorder=4)
-
-
-def _number(value: float) -> str:
-    return f"{value:.1f}" if math.isfinite(value) else "∞"

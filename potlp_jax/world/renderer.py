@@ -56,9 +56,6 @@ _TAYLOR = tuple((-1) ** order / math.factorial(order) for order in range(8))
 _TAYLOR_AT_ZERO = sum(term * (-_HALF_DIAGONAL) ** order for order, term in enumerate(_TAYLOR))
 """What the polynomial gives without smoke; divided by it, clear air lets exactly all light through."""
 
-CAMERAS: str = "potlp_jax.cameras"
-"""Entry points of this group are renderers of other packages."""
-
 _Tables = TypeVar("_Tables", "_Rays", "_Planes")
 
 
@@ -146,7 +143,7 @@ def render(
 
 def _render_elsewhere(world: World, cell: Int32[Array, "2"], config: CameraConfig) -> UInt8[Array, "rows columns 3"]:
     """The picture of a renderer that is not ours."""
-    picture = plugins.load(config.renderer, group=CAMERAS, kind="camera")(world, cell, config)
+    picture = plugins.load(config.renderer, group=plugins.CAMERAS, kind="camera")(world, cell, config)
     found, wanted = (picture.dtype, picture.shape), (jnp.uint8, (config.height, config.width, 3))
     # Shapes are known while jit traces, so the check costs nothing later.
     if found != wanted:

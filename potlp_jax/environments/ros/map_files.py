@@ -184,6 +184,7 @@ def load_map(file: Path | str) -> OccupancyMap:
 def load_settings(file: Path | str) -> MapSettings:
     """Read and check a map's YAML; `load_map` lists what it raises."""
     file = Path(file)
+    # Every scalar is still text here, so that 0.196 stays 196/1000.
     fields = read_yaml(file)
     _check_keys(file, fields)
     settings = MapSettings(

@@ -268,6 +268,7 @@ def _centres(frame: GridFrame) -> tuple[Float64[np.ndarray, "H 1"], Float64[np.n
 
 
 def _propositions(file: Path, value: Any) -> tuple[tuple[str, tuple[Region, ...]], ...]:
+    # Regions of rooms (``load_regions``) may be more than a letter has bits; propositions may not.
     found = _named_regions(file, "propositions", value)
     if len(found) > MAX_PROPOSITIONS:
         raise MapError(file, "propositions", f"{len(found)} of them, at most {MAX_PROPOSITIONS} are possible")

@@ -77,6 +77,7 @@ class RosMap(Generator):
         """
         self.config = config
         self.image_map = load_map(config.file)
+        # From Python the places may be given as they are; from the command line they are a file.
         places = config.places if isinstance(config.places, Places) else _find_places(config, self.image_map)
         self.places = places
         self.clean = clean_map(self.image_map, config.resolution, config.radius, places.start, places.source)

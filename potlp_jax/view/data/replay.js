@@ -1,12 +1,15 @@
 "use strict";
-// Shows one recorded trial: the map as it was known at every step, and what the robot thought at its last decision.
-// `data` is what view/replay_page.py writes.
+// Shows one recorded trial: the map as it was known at every step, and what was weighed at the decision in force.
+// `data` is what view/replay_page.py writes. Steps and decisions count from 0, as in the record.
+
+const MARK_PIXELS = 7;
 
 function mountReplay(root, data) {
   const seen = decodeIntegers(data.first_seen);
   const occupied = Uint8Array.from(atob(data.occupied), (letter) => letter.charCodeAt(0));
   const [rows, columns] = data.extent;
-  const scale = Math.max(2, Math.min(24, Math.floor(1100 / columns), Math.floor(640 / rows)));
+  const scale = data.cell_pixels;
+  const lane = keepRight(data.path, 0.24);
   const last = data.path.length - 1;
   let step = 0;
 
@@ -24,7 +27,9 @@ function mountReplay(root, data) {
     </div>
     <ul class="legend"></ul>
     <h2 class="decision"></h2>
+    <p class="note"></p>
     <div class="scroll"><table class="actions"></table></div>
+    <details class="key"><summary>What the columns mean</summary><dl></dl></details>
     <div class="views"></div>`;
   const part = (name) => root.querySelector(name);
   const canvas = part("canvas"), slider = part("input");
@@ -32,25 +37,28 @@ function mountReplay(root, data) {
   canvas.height = rows * scale;
   part(".facts").textContent = data.facts;
   part(".legend").append(...legend());
+  for (const [name, meaning] of Object.entries(data.figures)) {
+    const term = document.createElement("dt"), text = document.createElement("dd");
+    term.textContent = name;
+    text.textContent = meaning;
+    part(".key dl").append(term, text);
+  }
 
+  // Areas as squares, states as strokes: as they look on the map.
   function legend() {
-    const entries = data.propositions.map((name, bit) => [name, data.area_colours[bit]]);
-    for (const [state, name] of data.state_names.entries()) entries.push([name, data.state_colours[state]]);
-    return entries.map(([name, colour]) => {
-      const item = document.createElement("li"), box = document.createElement("i");
-      box.style.background = colour;
-      item.append(box, name);
+    const entries = data.propositions.map((name, bit) => [name, data.area_colours[bit], "area"]);
+    for (const state of new Set([...data.states].sort((a, b) => a - b))) entries.push([data.state_names[state], data.state_colours[state], "state"]);
+    return entries.map(([name, colour, kind]) => {
+      const item = document.createElement("li"), mark = document.createElement("i");
+      mark.className = kind;
+      mark.style.background = colour;
+      item.append(mark, name);
       return item;
     });
   }
 
   function colour(name) {
     return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-  }
-
-  function cellBox(context, [row, column], size = 1) {
-    const side = scale * size;
-    context.rect((column + 0.5) * scale - side / 2, (row + 0.5) * scale - side / 2, side, side);
   }
 
   function line(context, cells, style, width, dash = []) {
@@ -91,7 +99,7 @@ function mountReplay(root, data) {
     for (let first = 0; first < step; ) {
       let end = first + 1;
       while (end < step && data.states[end] === data.states[first]) end++;
-      line(context, data.path.slice(first, end + 1), data.state_colours[data.states[first]], Math.max(2, scale / 2.5));
+      line(context, lane.slice(first, end + 1), data.state_colours[data.states[first]], Math.max(2, scale / 2.5));
       first = end;
     }
   }
@@ -100,19 +108,41 @@ function mountReplay(root, data) {
     if (!decision) return;
     line(context, decision.path, colour("--chosen"), Math.max(1, scale / 5), [scale, scale]);
     const chosen = decision.actions.find((action) => action.chosen);
-    context.font = `600 ${Math.max(11, scale * 2)}px system-ui, sans-serif`;
     decision.subgoals.forEach((cell, number) => {
       const mine = chosen && chosen.subgoal === number;
+      const [x, y] = [(cell[1] + 0.5) * scale, (cell[0] + 0.5) * scale];
       context.beginPath();
-      cellBox(context, cell, 2.2);
-      context.fillStyle = colour(mine ? "--chosen" : "--subgoal");
+      for (const corner of [-90, 30, 150]) {
+        const angle = (corner * Math.PI) / 180;
+        context.lineTo(x + MARK_PIXELS * Math.cos(angle), y + MARK_PIXELS * Math.sin(angle));
+      }
+      context.closePath();
+      context.fillStyle = mine ? colour("--chosen") : colour("--free");
+      context.strokeStyle = mine ? colour("--free") : colour("--chosen");
+      context.lineWidth = 2;
       context.fill();
-      context.lineWidth = 3;
-      context.strokeStyle = colour("--paper");
-      const [x, y] = [(cell[1] + 1.8) * scale, (cell[0] - 0.6) * scale];
-      context.strokeText(`s${number}`, x, y);
-      context.fillText(`s${number}`, x, y);
+      context.stroke();
+      // Toward the middle, so that no number leaves the map.
+      const inward = [x < canvas.width / 2 ? 1 : -1, y < canvas.height / 2 ? 1 : -1];
+      write(context, `s${number}`, x + 15 * inward[0], y + 12 * inward[1], mine ? "--chosen" : "--ink", 700);
     });
+  }
+
+  // Text with a rim in the colour of the paper, readable on walls and paths.
+  function write(context, text, x, y, ink, weight) {
+    context.font = `${weight} 12px system-ui, sans-serif`;
+    context.textAlign = "center";
+    context.textBaseline = "middle";
+    context.lineWidth = 4;
+    context.lineJoin = "round";
+    context.strokeStyle = colour("--paper");
+    context.strokeText(text, x, y);
+    context.fillStyle = colour(ink);
+    context.fillText(text, x, y);
+  }
+
+  function drawNames(context) {
+    for (const label of data.labels) write(context, label.name, (label.x + 0.5) * scale, (label.y + 0.5) * scale, "--ink", 400);
   }
 
   function drawRobot(context) {
@@ -137,19 +167,20 @@ function mountReplay(root, data) {
     table.replaceChildren();
     if (!decision || !decision.actions.length) return;
     const head = table.createTHead().insertRow();
-    for (const name of ["action", "P_S", "R_S", "R_F", "way", "Q", "visits"]) {
-      const cell = document.createElement("th");
+    for (const [name, meaning] of [["action", "subgoal and what is tried beyond it"], ...Object.entries(data.figures)]) {
+      const cell = document.createElement("th"), text = document.createElement("abbr");
       cell.scope = "col";
-      cell.textContent = name;
+      text.title = meaning;
+      text.textContent = name;
+      cell.append(text);
       head.append(cell);
     }
     const body = table.createTBody();
     for (const action of decision.actions) {
       const row = body.insertRow();
       if (action.chosen) row.className = "chosen";
-      const numbers = [action.success_probability.toFixed(3)];
-      for (const name of ["success_cost", "failure_cost", "distance", "q_value"]) numbers.push(action[name].toFixed(1));
-      for (const text of [(action.chosen ? "▸ " : "") + action.name, ...numbers, String(action.visits)]) row.insertCell().textContent = text;
+      row.title = action.meaning;
+      for (const text of [(action.chosen ? "▸ " : "") + action.name, ...action.figures]) row.insertCell().textContent = text;
     }
   }
 
@@ -181,13 +212,17 @@ function mountReplay(root, data) {
     slider.value = step;
     const number = decisionNumber(), decision = data.decisions[number], context = canvas.getContext("2d");
     drawCells(context);
+    drawNames(context);
     drawPath(context);
     drawPlan(context, decision);
     drawRobot(context);
     const state = data.state_names[data.states[step]];
-    part(".where").textContent = `step ${step} of ${last}, decision ${number < 0 ? "-" : number} of ${data.decisions.length - 1}, ${state}`;
+    part(".where").textContent = `step ${step} of ${last}, decision ${number < 0 ? "-" : number} (last: ${data.decisions.length - 1})`;
     canvas.setAttribute("aria-label", `map after step ${step}: robot at row ${data.path[step][0]}, column ${data.path[step][1]}, ${state}`);
     part(".decision").textContent = decision ? decision.text : "";
+    const expected = decision && decision.value !== null ? `, expected cost ${decision.value.toFixed(1)}` : "";
+    part(".note").textContent = decision ? `In ${data.state_names[decision.state]}${expected}` : "";
+    part(".key").hidden = !decision || !decision.actions.length;
     showActions(decision);
     showViews(decision);
   }
@@ -219,6 +254,15 @@ function mountReplay(root, data) {
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", show);
   show();
   slider.focus({ preventScroll: true });
+}
+
+// Cells moved to the right of the direction of travel, averaged over a few steps: a way back does not hide the way out.
+function keepRight(path, offset) {
+  return path.map(([row, column], step) => {
+    const before = path[Math.max(0, step - 2)], after = path[Math.min(path.length - 1, step + 2)];
+    const down = after[0] - before[0], across = after[1] - before[1], length = Math.hypot(down, across) || 1;
+    return [row + (offset * across) / length, column - (offset * down) / length];
+  });
 }
 
 function decodeIntegers(text) {
