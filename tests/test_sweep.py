@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 
 from eval.savings import decisions_of
 from potlp_jax.cli import app
+from potlp_jax.codec import shipped_settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.errors import ConfigurationError, StoreError
@@ -104,6 +105,15 @@ def test_files_that_are_no_specification_are_named(tmp_path):
         (tmp_path / "sweep.yaml").write_text(text)
         with pytest.raises(ConfigurationError, match=rf"sweep\.yaml: .*{message}"):
             read_specification(tmp_path / "sweep.yaml")
+
+
+@pytest.mark.parametrize("name", ["firefighting", "firefighting-held-out"])
+def test_shipped_sweeps_are_found_by_name_and_can_be_run(name):
+    assert name in shipped_settings("potlp_jax.sweep")
+    specification = read_specification(name)
+    assert Policy.POTLP in specification.policies
+    with pytest.raises(ConfigurationError, match="neither a file nor one of those that are shipped: firefighting"):
+        read_specification("fire-fighting")
 
 
 def test_rows_come_back_as_they_were_written(tmp_path):

@@ -52,7 +52,7 @@ app = command_app(
     epilog="""
 [bold]Examples[/bold]
 
-[cyan]potlp sweep eval/sweeps/validation.yaml --out out/validation[/cyan]
+[cyan]potlp sweep firefighting --out out/firefighting[/cyan] - one that is shipped
 
 [cyan]potlp sweep mine.yaml --out out/mine --processes 1[/cyan]
 
@@ -61,7 +61,13 @@ the file.[/dim]
 """,
 )
 def run(
-    file: Annotated[Path, typer.Argument(metavar="FILE.yaml", help="What to run: docs/sweeps.md.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE.yaml",
+            help="What to run (docs/sweeps.md), or the name of a shipped sweep: firefighting, firefighting-held-out.",
+        ),
+    ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the results.")],
     processes: Annotated[
         int | None, typer.Option(min=1, help="Workers, each on a core of its own; default: one per core.")
