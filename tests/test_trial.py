@@ -12,7 +12,7 @@ from eval.formulas import random_tasks
 from potlp_jax.codec import config_from_dict
 from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.splits import Split, world_key
-from potlp_jax.errors import RecordError
+from potlp_jax.errors import PluginError, RecordError
 from potlp_jax.learning.estimator import TrainedEstimator, observe_panorama
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
@@ -338,5 +338,5 @@ def test_an_oracle_without_estimator_is_refused():
 
 def test_policies_are_named_in_one_place():
     assert {policy.value for policy in policies.Policy} == {"known-map", "baseline", "optimistic", "oracle", "potlp"}
-    with pytest.raises(ValueError, match="not a valid Policy"):
+    with pytest.raises(PluginError, match="unknown policy 'wizard'"):
         _run(make_world(np.zeros((3, 3), bool), np.zeros((3, 3), np.int32), (1, 1)), TASKS[0], "wizard", 0)
