@@ -13,6 +13,7 @@ from potlp_jax.cli.output import console, fail, print_json
 
 if TYPE_CHECKING:
     from potlp_jax.learning.estimator import TrainedEstimator
+    from potlp_jax.planning.estimates import Estimator
     from potlp_jax.trials.record import Decision, Trial
 
 logger = logging.getLogger(__name__)
@@ -91,7 +92,7 @@ def _read_decision(name: str) -> "tuple[Trial, Decision]":
 
 
 def _draw(
-    trial: "Trial", decision: "Decision", out: Path, *, depth: int, estimator: "TrainedEstimator | None"
+    trial: "Trial", decision: "Decision", out: Path, *, depth: int, estimator: "TrainedEstimator | Estimator | None"
 ) -> list[Path]:
     """Pictures of the tree and, where the policy looks, of the panoramas; returns their files."""
     import numpy as np

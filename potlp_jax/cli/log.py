@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from potlp_jax.logs.drive import Drive
     from potlp_jax.logs.log import LogConfig
     from potlp_jax.logs.working_grid import GridConfig
+    from potlp_jax.planning.estimates import Estimator
     from potlp_jax.planning.policies import Policy
 
 logger = logging.getLogger(__name__)
@@ -408,7 +409,7 @@ def _read_drive(bag: Path, labels: Path, log: "LogConfig", grid: "GridConfig") -
     return drive
 
 
-def _default_policy(drive: "Drive", trained: "TrainedEstimator | None") -> "Policy":
+def _default_policy(drive: "Drive", trained: "TrainedEstimator | Estimator | None") -> "Policy":
     """PO-TLP where an estimator knows the propositions and there are pictures, otherwise the baseline, with a note."""
     from potlp_jax.learning.estimator import shipped_estimator
     from potlp_jax.planning.policies import Policy
