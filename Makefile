@@ -29,7 +29,7 @@ lint: $(VENV)/installed  ## Style, format and types
 	$(BIN)/pyright
 
 site: $(VENV)/installed  ## The documentation, in out/site; warnings are errors
-	$(BIN)/mkdocs build --strict --quiet
+	$(BIN)/mkdocs build --strict
 
 clean:
 	rm -rf $(VENV) out

@@ -33,13 +33,14 @@ def on_files(files: Any, config: Any) -> Any:
 
     content = {
         "api/index.md": public_names(),
-        "contributing.md": ROOT / "CONTRIBUTING.md",
-        "changes.md": ROOT / "CHANGELOG.md",
+        # Their links start at the root of the repository.
+        "contributing.md": (ROOT / "CONTRIBUTING.md").read_text().replace("](docs/", "]("),
+        "changes.md": (ROOT / "CHANGELOG.md").read_text().replace("](docs/", "]("),
     }
     content |= {f"api/{room}.md": api_page(room) for room in rooms()}
     content |= {f"notebooks/{notebook.stem}.md": notebook_page(notebook) for notebook in notebooks()}
     for path, text in content.items():
-        files.append(File.generated(config, path, content=text.read_text() if isinstance(text, Path) else text))
+        files.append(File.generated(config, path, content=text))
     return files
 
 
@@ -127,10 +128,10 @@ def _cells(notebook: Path) -> list[dict[str, Any]]:
 
 
 def notebook_page(notebook: Path) -> str:
-    """A notebook as a page: its text, and its code as blocks."""
+    """A notebook as a page: its text, and its code as blocks. Links to other notebooks lead to their pages."""
     parts = []
     for cell in _cells(notebook):
         source = "".join(cell["source"])
         parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
     where = f"*This page is the notebook `notebooks/{notebook.name}` of the repository.*"
-    return "\n\n".join([parts[0], where, *parts[1:]])
+    return "\n\n".join([parts[0], where, *parts[1:]]).replace(".ipynb)", ".md)")

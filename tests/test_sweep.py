@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 
 from eval.savings import decisions_of
 from potlp_jax.cli import app
+from potlp_jax.codec import shipped_settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.errors import ConfigurationError, StoreError
@@ -79,7 +80,7 @@ def test_settings_reach_every_depth():
         ({"worlds": 0}, "worlds: give a whole number of at least 1, found 0"),
         ({"worlds": True}, "worlds"),
         ({"polices": ["baseline"]}, "unknown entry 'polices'"),
-        ({"policies": ["best"]}, "unknown policy 'best'; choose from"),
+        ({"policies": ["best"]}, "policies: unknown policy 'best'; choose"),
         ({"policies": "baseline"}, "policies: give a list"),
         ({"split": "exam"}, "unknown split 'exam'"),
         ({"tasks": [17]}, "toy has no task 17"),
@@ -90,7 +91,8 @@ def test_settings_reach_every_depth():
         ({"settings": {"decision": {"search": {"simulations": "many"}}}}, "settings.decision.search.simulations"),
         ({"settings": {"decision": {"frontiers": {"max_subgoals": 0}}}}, "settings.decision.frontiers: .*at least 1"),
         ({"settings": {"revealed": 1}}, "settings.revealed: give true or false, found 1"),
-        ({"settings": {"decision": {"search": {"mode": "guess"}}}}, "settings.decision.search.mode: give '"),
+        ({"settings": {"decision": {"search": {"mode": "guess"}}}}, "settings.decision.search: unknown field 'mode'"),
+        ({"settings": {"decision": {"search": {"kind": "guess"}}}}, "settings.decision.search"),
     ],
 )
 def test_wrong_entries_are_named(changes, message):
@@ -103,6 +105,15 @@ def test_files_that_are_no_specification_are_named(tmp_path):
         (tmp_path / "sweep.yaml").write_text(text)
         with pytest.raises(ConfigurationError, match=rf"sweep\.yaml: .*{message}"):
             read_specification(tmp_path / "sweep.yaml")
+
+
+@pytest.mark.parametrize("name", ["firefighting", "firefighting-held-out"])
+def test_shipped_sweeps_are_found_by_name_and_can_be_run(name):
+    assert name in shipped_settings("potlp_jax.sweep")
+    specification = read_specification(name)
+    assert Policy.POTLP in specification.policies
+    with pytest.raises(ConfigurationError, match="neither a file nor one of those that are shipped: firefighting"):
+        read_specification("fire-fighting")
 
 
 def test_rows_come_back_as_they_were_written(tmp_path):

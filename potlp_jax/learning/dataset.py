@@ -291,6 +291,7 @@ def read_dataset(folder: Path | str) -> Samples:
         columns["view_of"] = len(images) + _index_of(columns.pop("view"), views["view"].to_numpy(), path)
         parts.append(columns)
         images += views["image"].to_pylist()
+    # Once at the end: joining shard by shard would copy the first ones again and again.
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return Samples(images=images, metadata=metadata, **joined)
 

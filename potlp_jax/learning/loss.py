@@ -124,6 +124,7 @@ def network_config(
 
 
 def _geometry(samples: Samples) -> dict[str, Any]:
+    # Real data need not have these: a fovea is then refused, and everything else works.
     names, camera = ("horizon", "far", "fold"), samples.metadata.camera
     missing = [name for name in names if name not in camera]
     if missing:

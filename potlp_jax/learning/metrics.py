@@ -179,6 +179,7 @@ def check_fit(
 
 def prior_of(metadata: Mapping[str, Any], samples: Samples) -> Prior:
     """The mean P_S of the training data if the estimator's metadata have it (``prior``), else of these samples."""
+    # Metadata are anybody's JSON: a prior that is none is not worth an error, and the report says which one was used.
     stored = metadata.get("prior")
     if isinstance(stored, int | float) and 0 <= stored <= 1:
         return Prior(float(stored), "training")
@@ -274,8 +275,10 @@ def evaluate(samples: Samples, predictions: Predictions, prior: Prior) -> Report
 
 def groups_of(samples: Samples) -> dict[str, dict[str, Bool[np.ndarray, "N"]]]:
     """Which samples belong to the parts of each group (see ``Report``)."""
+    # +1: the class asks for the proposition; -1 in phi_stay: it must be avoided on the way.
     asked = {name: samples.phi_go[:, p] == 1 for p, name in enumerate(samples.metadata.propositions)}
     avoided = np.sum(samples.phi_stay == -1, axis=1)
+    # In cells, so that families with other units have the same bands.
     bounds = (0.0, *(bound * samples.metadata.resolution for bound in DISTANCE_BANDS), np.inf)
     bands = {}
     for low, high in itertools.pairwise(bounds):
@@ -320,6 +323,7 @@ def figures_of(samples: Samples, predictions: Predictions, prior: Prior) -> Figu
 
 def reliability(true: Float64[np.ndarray, "N"], said: Float64[np.ndarray, "N"]) -> tuple[ReliabilityBin, ...]:
     """The bins of a reliability diagram."""
+    # p = 1 belongs to the last bin.
     index = np.minimum((said * BINS).astype(np.int64), BINS - 1)
     counts = np.bincount(index, minlength=BINS)
     # 0 / 0 in an empty bin is the NaN that says so.
@@ -339,6 +343,7 @@ def roc_auc(true: Float64[np.ndarray, "N"], score: Float64[np.ndarray, "N"]) -> 
     _, rank = np.unique(score, return_inverse=True)
     successes, failures = np.bincount(rank, true), np.bincount(rank, 1 - true)
     pairs = successes.sum() * failures.sum()
+    # Equal scores share a rank, so a constant answer has an area of one half.
     below = np.cumsum(failures) - failures
     return float(np.sum(successes * (below + failures / 2)) / pairs) if pairs > 0 else float("nan")
 

@@ -243,8 +243,10 @@ class Recorder:
             questions: what is asked of each of them.
         """
         config = self.config
+        # One sheet size for all views: the labels are compiled once.
         sheet = question_sheet(questions, config.classes, config.staying_sets)
         labels, weights = label(world, pose.belief, scene, sheet, self._bounds)
+        # Numbered in the order of recording; samples refer to their view by it.
         view = view_id(self._shard, len(self.views["view"]))
         row = {
             "view": view,

@@ -86,6 +86,7 @@ class TrainingConfig(TrainingOptions):
         steps: planned optimiser steps; the learning rate ends at 0 there.
     """
 
+    # Apart from the options: a plan for a time knows the number only when the speed has been measured.
     steps: int
 
     def __post_init__(self) -> None:
@@ -454,6 +455,7 @@ class _Loop:
     def evaluate(self) -> Progress:
         """Scores on the validation data; remembers the best parameters and starts new sums."""
         sums = _no_sums()
+        # The moving average is what is evaluated and kept: it is less noisy than the parameters of any step.
         for batch in self._validation.evaluation_batches():
             sums = jax.tree.map(jnp.add, sums, self._evaluate_step(self._state.average, batch))
         config, network = self._config, self._network.config
@@ -494,6 +496,7 @@ class _Loop:
         """Why training is over, or None."""
         if self.steps_done >= self._config.steps:
             return "planned"
+        # After the plan, which is the usual end: its name says that the schedule was completed.
         if self._config.patience and int(self._state.evaluations_since_best) >= self._config.patience:
             return "patience"
         return "time" if self.seconds >= budget_seconds else None

@@ -130,6 +130,7 @@ def collect(
     # Before anything is made: a collection with other settings must not mix with what is there.
     metadata = dataset_metadata(generator, environment, split, config)
     finished = finished_shards(folder)
+    # What is there was recorded with settings of its own; a dataset has one set of them.
     differences = read_metadata(folder).differences(metadata) if finished else []
     if differences:
         raise DatasetError(
@@ -265,6 +266,7 @@ def summary(samples: Samples) -> str:
         f"{views} views, {len(holds)} samples ({len(holds) / views:.1f} a view), {holds.mean():.1%} successes",
         f"images: {np.mean([len(image) for image in samples.images]) / 1024:.1f} KiB each",
     ]
+    # A proposition that is hardly ever asked for, or never found, will not be learned.
     for index, name in enumerate(samples.metadata.propositions):
         asked = samples.phi_go[:, index] > 0
         lines.append(f"{name}: asked for in {asked.mean():.1%} of samples, {holds[asked].mean():.1%} of them successes")

@@ -154,6 +154,7 @@ def planned_steps(folder: Path, epoch: int, config: FitConfig, measure: Callable
     Raises:
         TrainingError: there is a plan for other options.
     """
+    # What the number of steps follows from. Other options are compared with the checkpoint.
     asked = {"epochs": config.epochs, "minutes": config.minutes, "seed": config.training.seed}
     path = folder / "plan.json"
     if path.exists():

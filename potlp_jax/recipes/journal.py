@@ -47,6 +47,7 @@ class Journal:
         # A process may have been killed after it wrote a row and before it saved the checkpoint.
         self._rows = [row for row in _read_rows(self._folder / TABLE) if row["step"] <= step]
         self._display.advance(step, self._planned)
+        # TensorBoard drops what it shows after this step: the resumed training writes it again.
         self._writer = SummaryWriter(str(self._folder / "tensorboard"), purge_step=step + 1)
 
     def step(self, step: int, loss: float) -> None:
@@ -88,6 +89,7 @@ class Journal:
 
 
 def _row_of(progress: Progress) -> Row:
+    # Flat names: the table's header, TensorBoard's curves and the estimator's metadata share them.
     row: Row = {
         "step": progress.step,
         "epoch": progress.epoch,

@@ -58,6 +58,7 @@ def read_recipe(given: str | Path) -> Recipe:
     """
     path = settings_file(given, PACKAGE)
     data = read_settings(path)
+    # Before the rest, because without an environment there are no defaults.
     missing = [name for name in ("environment", "training_worlds", "validation_worlds") if name not in data]
     if missing:
         raise ConfigurationError(f"{path}: {', '.join(missing)} is missing")
@@ -68,6 +69,7 @@ def read_recipe(given: str | Path) -> Recipe:
 def recipe_for(environment: str) -> Recipe:
     """What is recorded and fitted where nothing else is said, for a family of worlds by name; of no worlds yet."""
     collect = collection_of(make(environment))
+    # Both numbers are required of a recipe's file; 0 worlds are refused when they are collected.
     return Recipe(environment=environment, training_worlds=0, validation_worlds=0, collect=collect)
 
 
