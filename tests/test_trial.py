@@ -338,5 +338,5 @@ def test_an_oracle_without_estimator_is_refused():
 
 def test_policies_are_named_in_one_place():
     assert {policy.value for policy in policies.Policy} == {"known-map", "baseline", "optimistic", "oracle", "potlp"}
-    with pytest.raises(ValueError, match="not a valid Policy"):
+    with pytest.raises(ValueError, match="unknown policy 'wizard'"):
         _run(make_world(np.zeros((3, 3), bool), np.zeros((3, 3), np.int32), (1, 1)), TASKS[0], "wizard", 0)
