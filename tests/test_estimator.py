@@ -253,7 +253,7 @@ def test_each_subgoal_is_shown_in_the_centre_of_the_panorama_that_its_estimates_
 def test_explain_writes_the_panoramas_beside_the_tree(trial, trained_file, tmp_path, capsys):
     trial.save(tmp_path / "trial.json")
     index = next(decision.index for decision in trial.decisions if decision.actions)
-    explain_decision(f"{tmp_path}:{index}", out=tmp_path / "tree.png", estimator=trained_file)
+    explain_decision(f"{tmp_path}:{index}", out=tmp_path / "tree.png", estimator=str(trained_file))
     told = capsys.readouterr().out
     for name in ("tree.png", "tree-panoramas.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")

@@ -240,7 +240,7 @@ def test_the_same_key_gives_the_same_world():
         ({"room_height": 40}, "the three hallways need 51 rows, room_height is 40"),
         ({"hallway_spacing": 7}, "hallway_spacing must exceed"),
         ({"hallway_width": 0}, "hallway_width"),
-        ({"dead_end_fraction": 1.0}, "no room for the closing wall"),
+        ({"dead_end_fraction": 1.0}, "no space for the closing wall"),
         ({"dead_end_fraction": 0.01}, "must hold the alarm and the fire"),
         ({"dead_end_wall": 0}, "dead_end_wall"),
         ({"fire_range": (0.9, 0.1)}, "fire_range"),

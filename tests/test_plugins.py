@@ -15,6 +15,7 @@ from potlp_jax.planning.policies import Policy, named_policy
 from potlp_jax.sweep.runner import RESULTS, run_sweep
 from potlp_jax.sweep.specification import specification_from_dict, specification_from_store
 from potlp_jax.sweep.store import Store
+from potlp_jax.trials.replay import replay_decision
 from potlp_jax.trials.run import run
 
 MODULE = """
@@ -120,6 +121,8 @@ def test_an_estimator_is_a_function_by_name_or_a_file(elsewhere):
     assert trial.outcome == "satisfied"
     assert trial.versions["estimator"] == "foreign_worlds:guess"
     assert {action.success_probability for action in trial.decisions[0].actions if action.subgoal is not None} == {0.5}
+    _, plan, _ = replay_decision(trial, 0, named_estimator("foreign_worlds:guess"))
+    assert float(plan.value) == trial.decisions[0].value
     with pytest.raises(PluginError, match="int cannot be called with belief"):
         named_estimator("foreign_worlds:number")
     with pytest.raises(CheckpointError, match=r"missing\.npz"):

@@ -93,7 +93,6 @@ def _draw(trial: "Trial", decision: "Decision", out: Path, *, depth: int, estima
     import numpy as np
 
     from potlp_jax.cli.inputs import read_estimator
-    from potlp_jax.learning.estimator import TrainedEstimator
     from potlp_jax.planning.search.inspect import tree_top
     from potlp_jax.trials.replay import panorama_at, replay_decision
     from potlp_jax.view.decisions import describe_decision, task_of
@@ -103,12 +102,8 @@ def _draw(trial: "Trial", decision: "Decision", out: Path, *, depth: int, estima
 
     if not decision.actions:
         fail(f"decision {decision.index} of policy {trial.policy} did not search: there is no tree to draw")
-    trained = read_estimator(estimator)
-    # A record names the estimator by the hash of its parameters, which a function has not.
-    if trained is not None and not isinstance(trained, TrainedEstimator):
-        fail(f"--estimator {estimator}: searching again needs the file of a trained estimator")
     # A record keeps the actions of a decision but not the tree. Searching again with its key grows the same tree.
-    problem, plan, tree = replay_decision(trial, decision.index, trained)
+    problem, plan, tree = replay_decision(trial, decision.index, read_estimator(estimator))
     # Where commitment overrode the search, the record holds what the search itself preferred apart.
     if int(plan.action) != (decision.choice if decision.preferred is None else decision.preferred):
         logger.warning("searching again chose another action than recorded: the versions of the software may differ")

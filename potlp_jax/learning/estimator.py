@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -245,11 +245,14 @@ def named_estimator(name: str | Path) -> TrainedEstimator | Estimator:
         return read_estimator(path)
     found = plugins.load(str(name), group=plugins.ESTIMATORS, kind="estimator")
     estimator = found() if isinstance(found, type) else found
-    if not (isinstance(estimator, TrainedEstimator) or callable(estimator)):
+    if isinstance(estimator, TrainedEstimator):
+        return estimator
+    if not callable(estimator):
         raise PluginError(
             f"estimator {name}: {type(estimator).__name__} cannot be called with belief, subgoals and task"
         )
-    return estimator
+    # Its signature is checked when it is called.
+    return cast(Estimator, estimator)
 
 
 def identity_of(estimator: TrainedEstimator | Estimator) -> str:

@@ -15,7 +15,7 @@ References:
 
 import dataclasses
 from enum import StrEnum
-from typing import Protocol, runtime_checkable
+from typing import Protocol, cast, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -177,7 +177,8 @@ def named_policy(policy: Policy | PolicyFunction | str) -> Policy | PolicyFuncti
     found = plugins.load(policy, group=plugins.POLICIES, kind="policy", known=list(Policy))
     if not isinstance(found, PolicyFunction):
         raise PluginError(f"policy {policy!r}: {type(found).__name__} is no function (PolicyFunction)")
-    return found
+    # Its signature is checked when it is called.
+    return cast(PolicyFunction, found)
 
 
 def policy_name(policy: Policy | PolicyFunction) -> str:

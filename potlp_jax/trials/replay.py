@@ -9,7 +9,7 @@ from jaxtyping import Array, Int32, UInt8
 
 from potlp_jax.codec import config_from_dict
 from potlp_jax.errors import CheckpointError, RecordError
-from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, observe_panorama
+from potlp_jax.learning.estimator import TrainedEstimator, identity_of, observe_panorama
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.estimates import Estimator, ask
 from potlp_jax.planning.policies import Policy
@@ -22,12 +22,13 @@ from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import LOG_PREFIX, Decision, Trial
 from potlp_jax.trials.robot import photograph
+from potlp_jax.trials.rules import estimator_of
 from potlp_jax.world.camera import Disturbance
 from potlp_jax.world.grid import BeliefMap
 
 
 def replay_decision(
-    trial: Trial, index: int, estimator: TrainedEstimator | None = None
+    trial: Trial, index: int, estimator: TrainedEstimator | Estimator | None = None
 ) -> tuple[PlanningProblem, Plan, Tree | UctTree]:
     """Search again as in one decision of a recorded trial.
 
@@ -67,19 +68,23 @@ def replay_decision(
 
 
 def _replayed_estimator(
-    trial: Trial, index: int, task: Task, estimator: TrainedEstimator | None, config: TrialConfig
+    trial: Trial, index: int, task: Task, estimator: TrainedEstimator | Estimator | None, config: TrialConfig
 ) -> Estimator | None:
     """The estimator with all that it had seen at a decision: the panoramas are taken again."""
     if trial.policy != Policy.POTLP:
         return TrueMapEstimator(world=trial.world)
-    trained = estimator_for(task.propositions, estimator)
-    # Another network would answer otherwise, and the replay would explain a decision that was never taken.
-    if trial.versions.get("estimator") != trained.identity:
+    given = estimator_of(Policy.POTLP, task.propositions, estimator)
+    assert given is not None, "potlp asks an estimator"
+    # Another estimator would answer otherwise, and the replay would explain a decision that was never taken.
+    if trial.versions.get("estimator") != identity_of(given):
         raise CheckpointError(
-            f"the trial was made with the estimator {trial.versions.get('estimator')}, not {trained.identity}: "
+            f"the trial was made with the estimator {trial.versions.get('estimator')}, not {identity_of(given)}: "
             "give that one"
         )
-    asked = trained.start(*trial.world.shape)
+    if not isinstance(given, TrainedEstimator):
+        # A function of the belief alone: it has seen nothing that would have to be seen again.
+        return given
+    asked = given.start(*trial.world.shape)
     # The decision's own panorama included: it is taken before the decision.
     for decision in trial.decisions[: index + 1]:
         cell = jnp.asarray(decision.cell, jnp.int32)
