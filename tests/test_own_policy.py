@@ -12,7 +12,7 @@ from potlp_jax.errors import PotlpError, RecordError
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.move import MoveKind, move_to
 from potlp_jax.planning.policies import Policy
-from potlp_jax.planning.search.graph import SearchConfig
+from potlp_jax.planning.search.config import SearchConfig
 from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task
 from potlp_jax.trials.batch import Start, run_batch

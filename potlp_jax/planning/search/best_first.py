@@ -104,8 +104,10 @@ class Path:
     pending_cost: Float32[Array, "*D B"]
 
     @staticmethod
-    def empty(depth: int, batch: int, spare: int) -> "Path":
-        """Nothing recorded."""
+    def empty(depth: int, spare: int, rows: Int32[Array, "B"]) -> "Path":
+        """Nothing recorded, for ``depth`` levels of as many rows; ``spare`` is the index of the spare node."""
+        # Their number may be a symbol: programs are exported for batches of any length.
+        batch = rows.shape[0]
         # Separate arrays: stacked into one, XLA recomputed the step for each part (docs/results/dropped.md, "Search").
         floats = jnp.zeros((depth, batch), jnp.float32)
         return Path(
@@ -269,7 +271,7 @@ def _descend(context: Context, tree: Tree, config: SearchConfig) -> Descent:
         expands=nowhere,
         accepted=nowhere,
         # Two descents never need each other's records, so their memory is used again by every simulation.
-        path=Path.empty(config.max_depth, batch, tree.capacity),
+        path=Path.empty(config.max_depth, tree.capacity, context.model.rows),
     )
 
     def goes_on(descent: Descent) -> Bool[Array, ""]:
