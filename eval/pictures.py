@@ -36,8 +36,11 @@ ENVIRONMENT, TASK, WORLD = "firefighting", 2, 2
 POLICIES = {"baseline": "nearest frontier (baseline)", "potlp": "PO-TLP"}
 """Policies that are drawn, with their titles."""
 
-MAX_BYTES: int = 200_000
-"""Of a picture. Larger ones are stored with fewer colours (PNG) or at lower quality (JPEG), the least that fits."""
+MAX_BYTES: int = 220_000
+"""Of a picture. Larger ones are stored with fewer colours (PNG) or at lower quality (JPEG), as little as needed."""
+
+MAX_WIDTH: int = 1200
+"""Pixels of a photograph (JPEG): what a page shows. Above it lower quality costs more than lower resolution."""
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--virtual-time-budget=8000")
@@ -70,16 +73,17 @@ def draw_comparison(file: Path) -> list[Trial]:
 
 
 def photograph_replay(file: Path) -> list[Trial]:
-    """The replay of PO-TLP's trial, halfway: at a decision with several actions to weigh."""
+    """The replay of PO-TLP's trial, at the decision with the most actions to weigh."""
     trial = picture_trial("potlp")
-    decision = max(trial.decisions[len(trial.decisions) // 3 :], key=lambda decision: len(decision.actions))
+    simple = [decision for decision in trial.decisions if decision.overruled is None]
+    decision = max(simple, key=lambda decision: len(decision.actions))
     page = replay_page(trial, panoramas_of(trial))
     # The page's slider moves as if a person had drawn it there.
     move = (
         'const slider = document.querySelector("input");'
         f'slider.value = {decision.step}; slider.dispatchEvent(new Event("input", {{bubbles: true}}));'
     )
-    photograph(page.replace("</body>", f"<script>{move}</script></body>"), file, (1150, 900))
+    photograph(page.replace("</body>", f"<script>{move}</script></body>"), file, (1150, 1000))
     return [trial]
 
 
@@ -88,8 +92,8 @@ def photograph_report(file: Path) -> list[Trial]:
     with tempfile.TemporaryDirectory() as folder:
         specification = Path(folder) / "sweep.yaml"
         specification.write_text(
-            f"environments: [{ENVIRONMENT}]\ntasks: [{TASK}]\nworlds: 12\nsplit: validation\n"
-            "policies: [known-map, baseline, oracle, potlp]\n"
+            f"environments: [{ENVIRONMENT}]\ntasks: [{TASK}]\nworlds: 8\nsplit: validation\n"
+            "policies: [known-map, baseline, potlp]\n"
         )
         command("sweep", str(specification), "--out", f"{folder}/sweep")
         command("report", f"{folder}/sweep", "--replays", "1")
@@ -164,13 +168,16 @@ def make_pictures(folder: Path, names: Iterable[str]) -> list[str]:
             "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
             "trials": {trial.policy: trial_digest(trial) for trial in trials},
         }
-    facts_file.write_text(json.dumps(dict(sorted(facts.items())), indent=1) + "\n")
+        # After each picture, so that a run that is stopped leaves the facts of those it made.
+        facts_file.write_text(json.dumps(dict(sorted(facts.items())), indent=1) + "\n")
     return missing
 
 
 def shrink(file: Path) -> None:
     """Store a picture within ``MAX_BYTES``: as it is, or else with the most colours or the highest quality that fit."""
     image = Image.open(file).convert("RGB")
+    if file.suffix == ".jpg" and image.width > MAX_WIDTH:
+        image = image.resize((MAX_WIDTH, MAX_WIDTH * image.height // image.width), Image.Resampling.LANCZOS)
     for step in (256, 128, 64) if file.suffix == ".png" else (84, 74, 64, 54, 44):
         if file.stat().st_size <= MAX_BYTES:
             return

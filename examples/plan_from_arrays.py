@@ -35,7 +35,11 @@ def main() -> None:
     belief, robot = read_belief(MAP)
     cell, state = jnp.array(robot, jnp.int32), jnp.int32(task.dfa.initial)
 
-    subgoals = potlp_jax.frontier_subgoals(belief, cell, state, task.arrays)
+    # Both parts of a decision are pure: compiled once, they serve every decision on maps of this size.
+    find = jax.jit(potlp_jax.frontier_subgoals, static_argnames="config")
+    decide = jax.jit(potlp_jax.decide_from_estimates, static_argnames="config")
+
+    subgoals = find(belief, cell, state, task.arrays)
     count, classes = subgoals.mask.shape[0], len(task.classes)
     # P_S, R_S and R_F of Eq. 3: the chance that the exit is beyond a frontier, the cost to it, and the cost to find
     # out that it is not. Here they only depend on which frontier it is.
@@ -46,7 +50,7 @@ def main() -> None:
         success_cost=jnp.full((count, classes), 6.0),
         failure_cost=jnp.full((count, classes), 8.0),
     )
-    move = potlp_jax.decide_from_estimates(belief, subgoals, estimates, task.arrays, cell, state, jax.random.key(0))
+    move = decide(belief, subgoals, estimates, task.arrays, cell, state, jax.random.key(0))
     print(f"the robot is at {robot}, frontiers are at {np.asarray(subgoals.cells)[np.asarray(subgoals.mask)].tolist()}")
     print(
         f"go to {move.target_cell.tolist()}, expected cost {float(move.value):.1f}, over {int(move.path.length)} cells"

@@ -60,6 +60,8 @@ if TYPE_CHECKING:
     from potlp_jax.trials.run import run as run
     from potlp_jax.types import NO_ACTION as NO_ACTION
     from potlp_jax.types import Status as Status
+    from potlp_jax.verify.audit import problems_of as problems_of
+    from potlp_jax.verify.audit import problems_of_path as problems_of_path
     from potlp_jax.world.frontiers import FrontierConfig as FrontierConfig
     from potlp_jax.world.frontiers import Subgoals as Subgoals
     from potlp_jax.world.frontiers import find_subgoals as find_subgoals
@@ -131,6 +133,9 @@ __all__ = [  # noqa: RUF022 - by use, not by the alphabet
     "Finished",
     "run_batch",
     "TaskEnv",
+    # An auditor that shares no code with the planner.
+    "problems_of",
+    "problems_of_path",
     # Sentinels, flags and errors.
     "NO_ACTION",
     "Status",
@@ -167,6 +172,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "trials.rules": ("Stop",),
     "trials.run": ("run",),
     "types": ("NO_ACTION", "Status"),
+    "verify.audit": ("problems_of", "problems_of_path"),
     "world.frontiers": ("FrontierConfig", "Subgoals", "find_subgoals"),
     "world.grid": ("BeliefMap", "World", "belief_from_numpy", "make_world"),
     "world.sensing": ("SensorConfig", "observe"),

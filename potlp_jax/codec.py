@@ -179,7 +179,8 @@ def with_settings(config: _Config, settings: Any, where: str = "settings") -> _C
     Args:
         config: a frozen dataclass.
         settings: new values by field, nested mappings for nested configurations. With another ``kind`` than the
-            nested configuration has, the fields that are not given take the defaults of that kind.
+            nested configuration has, the fields that are not given take the defaults of that kind. A text alone
+            in place of such a configuration is its kind.
         where: what the settings are called; begins the message of an error.
 
     Returns:
@@ -193,6 +194,9 @@ def with_settings(config: _Config, settings: Any, where: str = "settings") -> _C
 
 
 def _merged(current: Any, changes: Any) -> Any:
+    # Where a kind can be chosen, its name alone means its defaults: `search: uct`.
+    if isinstance(changes, str) and isinstance(current, Mapping) and KIND in current:
+        changes = {KIND: changes}
     if not (isinstance(current, Mapping) and isinstance(changes, Mapping)):
         return changes
     # A configuration of another kind has other fields: none of the current ones means anything there.

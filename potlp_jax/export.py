@@ -47,7 +47,11 @@ MANIFEST: str = "manifest.json"
 PLATFORMS: tuple[str, ...] = ("cpu", "cuda")
 ANY_BATCH: str = "any"
 _BATCH_DIMENSION = "b"
+
+# Named, because a caller without this package has to make the same kind of key from two words.
 _KEY_IMPLEMENTATION = "threefry2x32"
+
+_SEARCH_NAMES = {"best-first": "Best-first search on bounds", "uct": "PO-UCT"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +61,7 @@ class ExportConfig:
     Attributes:
       grid: rows and columns of the map; None exports the search alone.
       subgoals: S, length of the array of subgoals.
-      decision: settings of the search and of the decision; its ``frontiers.max_subgoals`` gives way to ``subgoals``.
+      decision: settings of the search and of the decision; ``subgoals`` replaces its ``frontiers.max_subgoals``.
       batch: None for programs of one problem; a number for a leading axis of that length on every input and output;
         ``ANY_BATCH`` for a leading axis of any length, the same for all inputs of a call.
       platforms: what the programs are lowered for, of jax's names ``cpu``, ``cuda``, ``rocm``, ``tpu``.
@@ -109,14 +113,22 @@ class _Program:
 
 
 def export_planner(task: Task, folder: Path, config: ExportConfig = ExportConfig()) -> list[Path]:
-    """Write the planner for one task into a folder; returns the files.
+    """Write the planner for one task into a folder.
 
-    The folder is made if it is not there; files of the same names are replaced. Lowering for a platform needs neither
-    that platform nor its libraries.
+    Lowering for a platform needs neither that platform nor its libraries.
+
+    Args:
+      task: its arrays become constants of the programs.
+      folder: made if it is not there; files of the same names are replaced.
+      config: what to export.
+
+    Returns:
+      The files: programs, automaton and manifest.
 
     Raises:
       ModuleNotFoundError: flatbuffers is not installed; jax writes and reads programs with it.
     """
+    # jax imports it when it serialises, after minutes of lowering: better asked for at once.
     if importlib.util.find_spec("flatbuffers") is None:
         raise ModuleNotFoundError(
             "exporting needs flatbuffers, with which jax writes programs: pip install flatbuffers"
@@ -139,6 +151,7 @@ def export_planner(task: Task, folder: Path, config: ExportConfig = ExportConfig
 
 def export_program(program: _Program, config: ExportConfig) -> jax.export.Exported:
     """Lower one program for the configuration's platforms and batch."""
+    # Shapes alone: nothing is computed or allocated.
     lead = batch_shape(config.batch)
     function = program.function if config.batch is None else jax.vmap(program.function)
     arguments = [jax.ShapeDtypeStruct((*lead, *value.shape), value.dtype) for value in program.inputs]
@@ -164,6 +177,7 @@ def load_program(folder: Path, name: str) -> Callable[..., dict[str, Array]]:
     if name not in manifest["functions"]:
         raise ValueError(f"{folder} holds no program {name!r}; it has: {', '.join(manifest['functions'])}")
     entry = manifest["functions"][name]
+    # `deserialize` is annotated for a bytearray.
     program = jax.export.deserialize(bytearray((folder / entry["file"]).read_bytes()))
     names = [value["name"] for value in entry["inputs"]]
     results = [value["name"] for value in entry["outputs"]]
@@ -185,7 +199,8 @@ def _programs(task: Task, config: ExportConfig) -> list[_Program]:
 
 def _plan_program(task: Task, subgoals: int, search: SearchConfig | UctConfig) -> _Program:
     arrays, states, classes = task.arrays, task.sizes.states, task.sizes.classes
-    # Concrete here, constants of the program there.
+    # The task's arrays are concrete here, and constants of the program. The names are those of `PlanningProblem`, so
+    # that inputs by position become fields by name.
     names = ("travel", "finish", "success_probability", "success_cost", "failure_cost")
     names = (*names, "dfa_state", "subgoal_mask", "dead_end_cost")
 
@@ -196,27 +211,32 @@ def _plan_program(task: Task, subgoals: int, search: SearchConfig | UctConfig) -
 
     return _Program(
         name="plan",
-        meaning="PO-UCT on a planning problem: the high-level action of least expected cost",
+        meaning=f"{_SEARCH_NAMES[search.kind]} on a planning problem: the high-level action of least expected cost",
         function=plan,
         inputs=(
             _Value(
                 "travel",
                 (subgoals + 1, states, subgoals, states),
                 "float32",
-                "[u, z, s, z']: shortest way through known space from node u in state z to subgoal s in state z', inf "
-                "where there is none; nodes 0 .. S-1 are the subgoals, S is the robot. From a subgoal the way starts "
-                "by re-entering the subgoal's cell",
+                "[u, z, s, z']: path cost through known space from node u in state z to subgoal s in state z', inf "
+                "where there is no path; nodes 0 .. S-1 are the subgoals, S is the robot. From a subgoal the path "
+                "starts by re-entering the subgoal's cell",
             ),
             _Value(
                 "finish",
                 (subgoals + 1, states),
                 "float32",
-                "[u, z]: shortest way through known space to acceptance, inf where there is none",
+                "[u, z]: path cost through known space to acceptance, inf where there is no path",
             ),
             *_estimate_inputs(subgoals, classes),
             _Value("dfa_state", (), "int32", "the automaton's state, the letter of the robot's cell read"),
             _Value("subgoal_mask", (subgoals,), "bool", "True where a subgoal is real, False on padding"),
-            _Value("dead_end_cost", (), "float32", "cost of having nothing left to do, positive"),
+            _Value(
+                "dead_end_cost",
+                (),
+                "float32",
+                "cost of a history in which no action is available and the task is not satisfied, positive",
+            ),
             _KEY_INPUT,
         ),
         outputs=_PLAN_OUTPUTS,
@@ -227,6 +247,7 @@ def _subgoals_program(task: Task, grid: tuple[int, int], config: ExportConfig) -
     arrays, settings = task.arrays, config.settings
 
     def subgoals(*inputs: Array) -> tuple[Array, ...]:
+        # `Subgoals` calls them `cells` and `mask`; `decide` has an input `cells` already, the map's.
         found = frontier_subgoals(*_belief_and_robot(inputs), arrays, settings)
         return tuple(getattr(found, name.removeprefix("subgoal_")) for name in _SUBGOAL_OUTPUTS)
 
@@ -241,6 +262,7 @@ def _subgoals_program(task: Task, grid: tuple[int, int], config: ExportConfig) -
 
 def _decide_program(task: Task, grid: tuple[int, int], config: ExportConfig) -> _Program:
     arrays, settings = task.arrays, config.settings
+    # Three groups of inputs, in this order: the map and the robot, the subgoals and their estimates, the key.
     map_inputs = _map_inputs(grid)
 
     def decide(*inputs: Array) -> tuple[Array, ...]:
@@ -281,6 +303,7 @@ def _key(words: UInt32[Array, "2"]) -> Array:
 
 
 def _move_outputs(move: Move) -> tuple[Array, ...]:
+    # `decide_from_estimates` always searches; for type checkers.
     assert move.search is not None
     plan = move.search.plan
     values = {
@@ -337,7 +360,7 @@ _PLAN_OUTPUTS = {
     "value": "expected cost to go",
     "q_values": "expected cost of each action, inf where it is not available",
     "visits": "simulations that began with each action",
-    "gap": "by how much value might still fall if what was guessed on the way to it were too high; 0: it will not",
+    "gap": "fraction by which value would fall if its guesses were too high by the optimism; 0: converged",
     "status": "bits, see status_bits",
 }
 
@@ -345,8 +368,8 @@ _SUBGOAL_OUTPUTS = {
     "subgoal_cells": "row and column of each subgoal, nearest first; (0, 0) where masked",
     "subgoal_mask": "True on real subgoals; they come first",
     "size": "cells of the subgoal's frontier; 0 where masked",
-    "distance": "shortest way to the subgoal in any state; inf where masked",
-    "component": "subgoal whose frontier the cell belongs to, else NO_SUBGOAL",
+    "distance": "path cost to the subgoal in any state; inf where masked",
+    "component": "subgoal whose frontier the cell belongs to, NO_SUBGOAL elsewhere",
     "frontier": "True on every cell of the frontier",
     "status": "bits, see status_bits",
 }
@@ -365,6 +388,7 @@ _MOVE_OUTPUTS = {
 
 
 def _describe_program(program: _Program, exported: jax.export.Exported, file: str) -> dict[str, Any]:
+    # Shapes and types as jax lowered them, not as they were asked for: what a caller has to give.
     inputs = [
         {"name": value.name, "shape": _shape(aval.shape), "dtype": str(aval.dtype), "meaning": value.meaning}
         for value, aval in zip(program.inputs, exported.in_avals, strict=True)
@@ -402,6 +426,7 @@ def _manifest(task: Task, config: ExportConfig, functions: dict[str, Any]) -> di
             "decision": dataclasses.asdict(config.settings),
         },
         "sentinels": {"NO_ACTION": NO_ACTION, "NO_STATE": NO_STATE, "NO_SUBGOAL": NO_SUBGOAL},
+        # Read off the classes, so that the manifest cannot fall behind them.
         "move_kinds": {name: value for name, value in vars(MoveKind).items() if name.isupper()},
         "status_bits": {str(bit.name): int(bit) for bit in Status},
         "functions": functions,

@@ -69,6 +69,7 @@ def test_settings_change_what_they_name_at_every_depth():
 def test_settings_of_another_kind_start_from_its_defaults():
     assert with_settings(POLYGON, {"shape": {"kind": "circle"}}).shape == Circle()
     assert with_settings(Drawing(), {"shape": {"kind": "polygon", "corners": [[1, 2]]}}).shape == Polygon(((1, 2),))
+    assert with_settings(POLYGON, {"shape": "circle"}).shape == Circle()
 
 
 @pytest.mark.parametrize(

@@ -120,7 +120,7 @@ def test_an_estimator_is_a_function_by_name_or_a_file(elsewhere):
     assert trial.outcome == "satisfied"
     assert trial.versions["estimator"] == "foreign_worlds:guess"
     assert {action.success_probability for action in trial.decisions[0].actions if action.subgoal is not None} == {0.5}
-    with pytest.raises(PluginError, match="int is no function of belief"):
+    with pytest.raises(PluginError, match="int cannot be called with belief"):
         named_estimator("foreign_worlds:number")
     with pytest.raises(CheckpointError, match=r"missing\.npz"):
         named_estimator("missing.npz")

@@ -83,7 +83,7 @@ def test_the_same_key_gives_the_same_episode_alone_and_in_a_batch(env):
 
 def _rewards_of_choices(env, world, actions):
     """Rewards of given actions, and the last time step."""
-    state, time_step = env.reset_in(world)
+    state, time_step = jax.jit(env.reset_in)(world)
     step, rewards = jax.jit(env.step), []
     for action in actions:
         assert time_step.observation.action_mask[action]
@@ -125,9 +125,10 @@ def test_an_action_that_is_masked_makes_no_move_and_ends_stuck(env):
 def test_an_episode_that_its_budget_ends_is_truncated():
     generator = Toy(ToyConfig(height=7, width=11))
     tight = TaskEnv([generator.world(0)], generator.task(1), config=TrialConfig(budget_factor=0.1))
-    state, time_step = tight.reset(jax.random.key(0))
+    state, time_step = jax.jit(tight.reset)(jax.random.key(0))
+    step = jax.jit(tight.step)
     while not bool(time_step.last()):
-        state, time_step = jax.jit(tight.step)(state, jnp.int32(tight.num_actions - 1))
+        state, time_step = step(state, jnp.int32(tight.num_actions - 1))
     assert OUTCOME_NAMES[int(time_step.extras["outcome"])] == "budget"
     assert float(time_step.discount) == 1.0
 

@@ -17,7 +17,7 @@ from potlp_jax.planning.search.api import plan_actions, plan_within, search, sea
 from potlp_jax.planning.search.config import SearchConfig, UctConfig
 from potlp_jax.planning.search.graph import NodeValues, Tree
 from potlp_jax.planning.search.inspect import tree_top
-from potlp_jax.planning.search.lockstep import Search, run_search
+from potlp_jax.planning.search.lockstep import SearchMethod, run_search
 from potlp_jax.planning.search.plan import Plan
 from potlp_jax.task.task import TaskSizes
 from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL, Status
@@ -130,7 +130,7 @@ def test_agrees_with_dictionary_pouct():
 def test_pessimistic_guess_is_revisited():
     """An action that looks bad at first must still be tried often enough to be found out.
 
-    The second subgoal's estimate says that success is unlikely, but failing there is nearly free and settles nothing
+    The second subgoal's estimate says that success is unlikely, but failing there is nearly free and closes nothing
     else; the first costs a little less than the second's guess and more than its true value.
     """
     task = task_of("F g")
@@ -372,7 +372,7 @@ def test_a_search_is_its_verbs():
         going = jnp.sum(tree.pulls, axis=1) < context
         return Bandit(tree.pulls.at[:, 1].add(going.astype(jnp.int32)))
 
-    bandit = Search(
+    bandit = SearchMethod(
         tree=Bandit,
         prepare=lambda problems, seeds, config: seeds[:, 0].astype(jnp.int32),
         plant=lambda context, config: Bandit(jnp.zeros((context.shape[0], 2), jnp.int32)),

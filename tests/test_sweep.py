@@ -80,7 +80,7 @@ def test_settings_reach_every_depth():
         ({"worlds": 0}, "worlds: give a whole number of at least 1, found 0"),
         ({"worlds": True}, "worlds"),
         ({"polices": ["baseline"]}, "unknown entry 'polices'"),
-        ({"policies": ["best"]}, "unknown policy 'best'; choose from"),
+        ({"policies": ["best"]}, "policies: unknown policy 'best'; choose"),
         ({"policies": "baseline"}, "policies: give a list"),
         ({"split": "exam"}, "unknown split 'exam'"),
         ({"tasks": [17]}, "toy has no task 17"),
@@ -91,7 +91,8 @@ def test_settings_reach_every_depth():
         ({"settings": {"decision": {"search": {"simulations": "many"}}}}, "settings.decision.search.simulations"),
         ({"settings": {"decision": {"frontiers": {"max_subgoals": 0}}}}, "settings.decision.frontiers: .*at least 1"),
         ({"settings": {"revealed": 1}}, "settings.revealed: give true or false, found 1"),
-        ({"settings": {"decision": {"search": {"mode": "guess"}}}}, "settings.decision.search.mode: give '"),
+        ({"settings": {"decision": {"search": {"mode": "guess"}}}}, "settings.decision.search: unknown field 'mode'"),
+        ({"settings": {"decision": {"search": {"kind": "guess"}}}}, "settings.decision.search"),
     ],
 )
 def test_wrong_entries_are_named(changes, message):

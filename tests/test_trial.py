@@ -77,7 +77,8 @@ def test_trials_keep_their_promises(policy):
 
 def test_an_episode_compiles_nothing_new():
     """After one trial of each policy, another world and another task run with the programs that are there."""
-    programs = (trial_module._decide, robot.follow, robot._observe, robot.photograph, observe_panorama)
+    rules = (trial_module._first_tally, trial_module._arrive, trial_module._stop_of, trial_module._count_decision)
+    programs = (trial_module._decide, *rules, robot.follow, robot._observe, robot.photograph, observe_panorama)
 
     def run_all(number):
         for policy in Policy:

@@ -37,7 +37,7 @@ from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions
 from potlp_jax.planning.search.best_first import BEST_FIRST
 from potlp_jax.planning.search.config import SearchConfig, UctConfig
-from potlp_jax.planning.search.lockstep import Search
+from potlp_jax.planning.search.lockstep import SearchMethod
 from potlp_jax.planning.search.uct import UCT
 from potlp_jax.types import NO_ACTION
 
@@ -140,7 +140,7 @@ def _long_search(problem: PlanningProblem, key: Any) -> Any:
 
 
 def ours(
-    name: str, search: Search = BEST_FIRST, kind: type[SearchConfig | UctConfig] = SearchConfig, **settings: Any
+    name: str, search: SearchMethod = BEST_FIRST, kind: type[SearchConfig | UctConfig] = SearchConfig, **settings: Any
 ) -> Callable[..., Iterator[Answer]]:
     """One of our searches on all instances in one batch; every budget goes on from the one before."""
 

@@ -76,7 +76,7 @@ def potlp(
     ] = False,
 ) -> None:
     """The options of ``potlp`` itself, which stand before the command: ``potlp --quiet run toy``."""
-    # `group.Command` heeds `no_cache`, because only a command that really runs may import jax.
+    # `group.Command` applies `no_cache`, because only a command that really runs may import jax.
     set_verbosity(_QUIET if quiet else _VERBOSE if verbose else _NORMAL)
 
 

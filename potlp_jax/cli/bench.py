@@ -37,7 +37,7 @@ app = command_app()
 
 [cyan]potlp bench --parts perception --environment firefighting --world 1[/cyan] - what the camera and the network add
 
-[dim]Compiled anew for every measurement: the cache of compiled programs is left out.[/dim]
+[dim]Every measurement compiles anew, without the cache of compiled programs.[/dim]
 """,
 )
 def run_bench(
@@ -69,6 +69,7 @@ def run_bench(
     from potlp_jax.cli.inputs import setting_changes, trial_config
     from potlp_jax.environments.registry import make
     from potlp_jax.learning.estimator import estimator_for
+    from potlp_jax.planning.search.config import SearchConfig
 
     chosen = _read_parts(parts)
     # All words are read before anything is measured: measuring takes minutes.
@@ -78,11 +79,13 @@ def run_bench(
     # Before anything starts XLA, which counts the cores once and makes a thread for each.
     _pin(core)
     decision = trial_config(setting_changes(simulations=simulations)).decision
+    # Of the two searches the default is measured; `eval.bench` compares them.
+    searching = SearchConfig() if simulations is None else SearchConfig(simulations=simulations)
     rows: dict[str, list[Any]] = {}
     with progress_bar() as progress:
         bar = progress.add_task("compiling and measuring", total=None)
         if "search" in chosen:
-            rows["search"] = [measure_search(family, subgoals, batch, decision.search, repeats) for batch in counts]
+            rows["search"] = [measure_search(family, subgoals, batch, searching, repeats) for batch in counts]
         if set(chosen) - {"search"}:
             progress.update(bar, description="exploring a world")
             asked = make(environment).task(task)
@@ -93,6 +96,7 @@ def run_bench(
             rows |= _measure_scene(
                 scene, parts=chosen, trained=trained, decision=decision, sources=sources, repeats=repeats
             )
+    # Figures mean nothing without the machine: every table and document begins with it.
     where = describe_environment()
     if json:
         print_json({"potlp_jax": package_version(), "environment": where, "rows": _plain(rows)})
@@ -193,6 +197,7 @@ def _search_table(rows: "list[SearchRow]") -> Table:
             str(row.batch),
             f"{row.simulations_per_s:,.0f}",
             f"{row.searches_per_s:,.1f}",
+            # Not every search counts its depth.
             "-" if row.mean_depth is None else f"{row.mean_depth:.2f}",
             _bytes(row.tree_bytes),
             _bytes(row.batch_tree_bytes),
@@ -227,12 +232,14 @@ def _phase_table(title: str, rows: "list[PhaseRow]") -> Table:
             "-" if memory is None else _bytes(memory["temporaries"]),
             _seconds(row.timing.trace_s),
             _seconds(row.timing.compile_s),
+            # The last phase is the whole decision, apart from its parts.
             end_section=row is rows[-2],
         )
     return table
 
 
 def _seconds(seconds: float) -> str:
+    # Three digits: repeated runs agree in no more.
     return f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"
 
 

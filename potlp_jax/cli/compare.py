@@ -107,6 +107,7 @@ def compare_policies(
         files = []
         with tempfile.TemporaryDirectory(prefix="potlp-compare-") as folder:
             results = _run(specification, Path(folder), processes)
+    # The document of `potlp sweep show --json`: one way to read the results of both.
     if json:
         print_json(results.to_dict())
         return
@@ -136,6 +137,7 @@ def _write(results: "Results", folder: Path) -> list[Path]:
     data, trials, scatter, table = (folder / name for name in names)
     data.write_text(to_json(results.to_dict()) + "\n", "utf-8")
     split, policies = results.specification["split"], results.specification["policies"]
+    # As wide as the widest table: a file has no terminal to ask.
     with table.open("w", encoding="utf-8") as file:
         print_cell(Console(file=file, width=150, highlight=False), cell, split)
     _write_csv(cell, trials)
@@ -154,6 +156,7 @@ def _draw(specification: "Specification", results: "Results", folder: Path, worl
 
     (cell,) = results.cells
     numbers = [world_of(pair) for pair in cell.pairs]
+    # Impossible worlds are not among those compared, although their numbers lie between them.
     if world not in numbers:
         fail(f"--picture {world}: the worlds compared are {', '.join(map(str, numbers))}")
     # Rows keep no maps. The trials are made again from world and key, and are the same (tests/test_sweep.py).

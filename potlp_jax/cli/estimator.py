@@ -69,9 +69,11 @@ def evaluate_estimator(
     from potlp_jax.learning.network import EstimatorNetwork
     from potlp_jax.learning.serialization import load_estimator
 
+    # Before the file is read and the network compiled, like every check of words.
     variants = _read_variants(ablate)
     params, config, metadata = load_estimator(checkpoint)
     samples = read_dataset(dataset)
+    # An estimator asked about propositions that it does not know would answer without meaning.
     check_fit(config, metadata, samples, str(checkpoint), str(dataset))
     _warn(metadata, samples)
     folder = None if out is None else make_folder(out)
@@ -121,6 +123,7 @@ def _warn(metadata: Mapping[str, Any], samples: "Samples") -> None:
 
     trained_on = metadata.get("data", {})
     own = (samples.metadata.environment, samples.metadata.split)
+    # By name and split: other worlds of the same split are still worlds that training may have seen.
     if (trained_on.get("environment"), trained_on.get("split")) == own:
         logger.warning(
             f"the estimator was trained on {'/'.join(own)}: these figures say nothing about worlds it has not seen"
@@ -176,6 +179,7 @@ def _write(
 
     with (folder / "table.txt").open("w", encoding="utf-8") as file:
         _print_reports(Console(file=file, width=160, highlight=False), heading, reports, list(reports))
+    # The confident ones, right and wrong, show most of what the network has learned.
     chosen = most_confident(samples, predictions, SHOWN)
     save_figure(draw_reliability(reports, heading), folder / "reliability.png")
     save_figure(draw_costs(samples, predictions, reports[INTACT].overall, heading), folder / "costs.png")
@@ -200,6 +204,7 @@ def show_estimator(checkpoint: EstimatorArgument, json: Json = False) -> None:
     from potlp_jax.learning.serialization import load_estimator
 
     params, config, metadata = load_estimator(checkpoint)
+    # The network runs in two parts: once for a panorama, then once for each subgoal and outcome class.
     per_panorama, per_answer = operation_counts(config)
     description = {
         "estimator": str(checkpoint),

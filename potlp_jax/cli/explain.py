@@ -12,7 +12,6 @@ from potlp_jax.cli.options import EstimatorName, Json
 from potlp_jax.cli.output import console, fail, print_json
 
 if TYPE_CHECKING:
-    from potlp_jax.learning.estimator import TrainedEstimator
     from potlp_jax.trials.record import Decision, Trial
 
 logger = logging.getLogger(__name__)
@@ -54,11 +53,10 @@ def explain_decision(
     json: Json = False,
 ) -> None:
     """Explain one decision: the actions that were weighed, their estimates and expected costs."""
-    from potlp_jax.cli.inputs import read_estimator
     from potlp_jax.view.decisions import action_table, decision_to_dict, describe_decision
 
     trial, found = _read_decision(decision)
-    files = [] if out is None else _draw(trial, found, out, depth=depth, estimator=read_estimator(estimator))
+    files = [] if out is None else _draw(trial, found, out, depth=depth, estimator=estimator)
     if json:
         print_json({"trial": trial.summary(), **decision_to_dict(found)})
         return
@@ -90,12 +88,12 @@ def _read_decision(name: str) -> "tuple[Trial, Decision]":
     return trial, trial.decisions[index]
 
 
-def _draw(
-    trial: "Trial", decision: "Decision", out: Path, *, depth: int, estimator: "TrainedEstimator | None"
-) -> list[Path]:
+def _draw(trial: "Trial", decision: "Decision", out: Path, *, depth: int, estimator: str | None) -> list[Path]:
     """Pictures of the tree and, where the policy looks, of the panoramas; returns their files."""
     import numpy as np
 
+    from potlp_jax.cli.inputs import read_estimator
+    from potlp_jax.learning.estimator import TrainedEstimator
     from potlp_jax.planning.search.inspect import tree_top
     from potlp_jax.trials.replay import panorama_at, replay_decision
     from potlp_jax.view.decisions import describe_decision, task_of
@@ -105,8 +103,12 @@ def _draw(
 
     if not decision.actions:
         fail(f"decision {decision.index} of policy {trial.policy} did not search: there is no tree to draw")
+    trained = read_estimator(estimator)
+    # A record names the estimator by the hash of its parameters, which a function has not.
+    if trained is not None and not isinstance(trained, TrainedEstimator):
+        fail(f"--estimator {estimator}: searching again needs the file of a trained estimator")
     # A record keeps the actions of a decision but not the tree. Searching again with its key grows the same tree.
-    problem, plan, tree = replay_decision(trial, decision.index, estimator)
+    problem, plan, tree = replay_decision(trial, decision.index, trained)
     # Where commitment overrode the search, the record holds what the search itself preferred apart.
     if int(plan.action) != (decision.choice if decision.preferred is None else decision.preferred):
         logger.warning("searching again chose another action than recorded: the versions of the software may differ")
@@ -115,6 +117,7 @@ def _draw(
     if not decision.observations:
         return [out]
     seen = {look: np.asarray(panorama_at(trial, trial.decisions[look])) for look in decision.observations}
+    # Panoramas are photographs, for which PNG serves whatever format the tree is wanted in.
     beside = out.with_name(f"{out.stem}-panoramas.png")
     save_figure(draw_panoramas(trial, decision, seen), beside)
     return [out, beside]

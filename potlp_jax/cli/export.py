@@ -80,6 +80,7 @@ def export_task(
 def _read_batch(text: str | None) -> int | str | None:
     from potlp_jax.export import ANY_BATCH
 
+    # None leaves the batch axis away altogether, which is not the same as a batch of one.
     if text is None or text == ANY_BATCH:
         return text
     if not text.isdigit() or int(text) < 1:
@@ -89,6 +90,7 @@ def _read_batch(text: str | None) -> int | str | None:
 
 def _read_platforms(text: str) -> tuple[str, ...]:
     platforms = tuple(name.strip() for name in text.split(",") if name.strip())
+    # `jax.export` lowers for a platform without having one: a GPU's program can be made on any machine.
     for name in platforms:
         if name not in KNOWN_PLATFORMS:
             fail(f"unknown platform {name!r}; choose from: {', '.join(KNOWN_PLATFORMS)}")

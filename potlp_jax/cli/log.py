@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from potlp_jax.logs.drive import Drive
     from potlp_jax.logs.log import LogConfig
     from potlp_jax.logs.working_grid import GridConfig
+    from potlp_jax.planning.estimates import Estimator
     from potlp_jax.planning.policies import Policy
 
 logger = logging.getLogger(__name__)
@@ -291,6 +292,7 @@ def replay_log(
         )
         for file in files:
             console().print(f"wrote {file}", markup=False)
+    # Not by default, unlike `potlp view`: replays of logs are made in loops over bags.
     if open_it:
         open_page(files[2])
 
@@ -354,6 +356,7 @@ def _print_inspection(found: dict[str, Any]) -> None:
             topic["type"].replace("/msg/", "/"),
             topic["use"],
             str(topic["count"]),
+            # A rate needs two messages.
             "" if rate is None else f"{rate:.1f}",
             str(len(gaps)) if gaps else "",
             f"{max(gap['seconds'] for gap in gaps):.1f} s" if gaps else "",
@@ -362,6 +365,7 @@ def _print_inspection(found: dict[str, Any]) -> None:
     for name, value in _facts(found):
         out.print(f"{name:10} {value}", markup=False)
     for name, answer in found["uses"].items():
+        # An answer begins with yes or no, and goes on with why.
         good = answer.startswith("yes")
         out.print(f"{name}: {answer}", markup=False, style="green" if good else "red")
     for problem in found["problems"]:
@@ -370,6 +374,7 @@ def _print_inspection(found: dict[str, Any]) -> None:
 
 def _facts(found: dict[str, Any]) -> list[tuple[str, str]]:
     facts = []
+    # A log without a map can still be inspected; its uses say what is missing.
     if found["map"] is not None:
         last = found["map"]
         (height, width), (x, y, yaw) = last["cells"], last["origin"]
@@ -403,12 +408,13 @@ def _read_drive(bag: Path, labels: Path, log: "LogConfig", grid: "GridConfig") -
     from potlp_jax.logs.log import Log
 
     drive = read_drive(Log(bag, log), load_places(labels), grid)
+    # The drive can be used in spite of them; what makes it useless is an error.
     for remark in drive.notes:
         logger.warning(f"{bag}: {remark}")
     return drive
 
 
-def _default_policy(drive: "Drive", trained: "TrainedEstimator | None") -> "Policy":
+def _default_policy(drive: "Drive", trained: "TrainedEstimator | Estimator | None") -> "Policy":
     """PO-TLP where an estimator knows the propositions and there are pictures, otherwise the baseline, with a note."""
     from potlp_jax.learning.estimator import shipped_estimator
     from potlp_jax.planning.policies import Policy

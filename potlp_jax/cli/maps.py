@@ -70,6 +70,7 @@ def inspect_map(
     # What is odd about the file is listed with the map's other defects rather than as notes on stderr.
     with _caught_warnings() as remarks:
         image_map = load_map(file)
+    # `--start` names the option in messages about a start that lies in a wall.
     clean = clean_map(image_map, resolution, radius, _read_start(start), "--start")
     survey = survey_map(image_map, clean)
     defects = [*remarks, *_defects(survey, clean)]
@@ -109,7 +110,7 @@ def write_clean_map(
     start: Start = None,
     json: Json = False,
 ) -> None:
-    """Write the grid on which the robot moves, where all else is an obstacle, as a ROS map."""
+    """Write the grid on which the robot moves, where everything else is an obstacle, as a ROS map."""
     from potlp_jax.environments.ros.cleaning import clean_map
     from potlp_jax.environments.ros.map_files import load_map
     from potlp_jax.environments.ros.map_writer import save_map
@@ -195,6 +196,7 @@ def label_map(
     save_places(labels, target)
     # Bit i of a cell's letter is proposition i.
     cells = {name: int((letters >> bit & 1).sum()) for bit, name in enumerate(labels.names)}
+    # Areas, because a proposition that covers three cells instead of thirty is seen in them at once.
     side = clean.frame.resolution
     if json:
         print_json({"file": str(target), "cells": cells, "start": labels.start, "tasks": dict(labels.tasks)})
@@ -203,6 +205,7 @@ def label_map(
     for name, count in cells.items():
         output.print(f"{name:12} {count} cells, {count * side**2:.1f} m2", markup=False)
     output.print(f"wrote {target}", markup=False)
+    # A command that works as it stands: a task of the labels, or to reach every place.
     example = labels.tasks[0][0] if labels.tasks else " & ".join(f"F {name}" for name in labels.names)
     world = _environment(file, None if out is None else target, resolution, radius)
     output.print(f"next: potlp run {world} --task '{example}'", markup=False, style="dim")
@@ -321,6 +324,7 @@ def _map_lines(image_map: "OccupancyMap", survey: "MapSurvey") -> Iterator[tuple
     yield "mode", f"{settings.mode}{inverted}, {thresholds}"
     shares = ((survey.free, "free"), (survey.occupied, "occupied"), (survey.unknown, "unknown"))
     yield "pixels", ", ".join(f"{100 * share:.1f} % {name}" for share, name in shares)
+    # Specks count as parts, so that they are named: otherwise a noisy map seems to fall into hundreds of rooms.
     specks = f", {survey.specks} of them specks" if survey.specks else ""
     yield "free space", f"connected parts: {survey.components}{specks}; the largest has {survey.largest:.1f} m2"
 
@@ -411,6 +415,7 @@ def _joined(
 
 
 def _named(option: str, text: str, form: str) -> tuple[str, str]:
+    # Only the first "=" separates: formulas and file names may hold others.
     name, equals, value = (part.strip() for part in text.partition("="))
     if not (name and equals and value):
         fail(f"{option} {text}: write {option} {form}")
@@ -423,6 +428,7 @@ def _read_disc(option: str, text: str) -> "Disc":
     numbers = _read_numbers(f"--place {option}", text)
     if len(numbers) not in (2, 3):
         fail(f"--place {option}: give x and y in metres and, if you like, a radius: 2.1,3.4,0.5")
+    # Two numbers are a point, three a point and a radius.
     radius = numbers[2] if len(numbers) == 3 else PLACE_RADIUS
     if radius < 0:
         fail(f"--place {option}: a radius of {radius:g} m is negative")
@@ -433,6 +439,7 @@ def _read_polygon(option: str, text: str) -> "Polygon":
     from potlp_jax.environments.ros.places import Polygon
 
     corners = [_read_numbers(f"--room {option}", corner) for corner in text.split()]
+    # Fewer corners enclose nothing.
     if len(corners) < 3 or any(len(corner) != 2 for corner in corners):
         fail(f"--room {option}: give three corners or more, in metres: 1,1 4,1 4,3")
     return Polygon(tuple((x, y) for x, y in corners))

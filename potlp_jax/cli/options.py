@@ -14,14 +14,17 @@ from potlp_jax.cli.completion import (
     complete_task,
 )
 
+# How results are shown.
 Json = Annotated[bool, typer.Option("--json", help="Write JSON, and nothing else, to stdout.")]
 OpenPage = Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")]
 
+# A type is an option with its names and help; a default is the command's, since commands differ in it.
 # Which trial: environment, task, policy and world. Commands that have these give them the same short names.
 Environment = Annotated[
     str,
     typer.Argument(
         metavar="ENV",
+        # The families that need no explanation, and the forms of names that do; TAB lists them all.
         help="[cyan]toy[/cyan], [cyan]firefighting[/cyan], [cyan]delivery[/cyan], [cyan]rooms[/cyan], "
         "[cyan]map:FILE.yaml[/cyan] (ROS map), [cyan]floorplan:FILE.xml[/cyan] (real floor plan, or a folder), or "
         "[cyan]module:attribute[/cyan] of an environment of your own.",

@@ -48,7 +48,7 @@ def write_report(
 
     with open_store(folder) as store:
         facts = store.facts()
-    # A browser goes by the name: a page called .htm or .txt would be shown as text, or not at all.
+    # A browser goes by the ending of a file's name.
     page = out or folder / PAGE
     if page.suffix != ".html":
         fail(f"--out {page}: give a name that ends in .html")
@@ -65,6 +65,7 @@ def write_report(
             pairs = pair_rows(found, policies)
             shown = []
             for reason, row, baseline in _notable(pairs, _subject(policies), replays):
+                # A replay needs the beliefs of every step, which rows do not keep.
                 progress.update(bar, description=f"running world {row.item.world} again")
                 shown.append(_shown(sweep, reason, row, baseline))
             cells.append(Cell(cell.environment, cell.task, pairs, shown))
@@ -112,6 +113,7 @@ def _shown(sweep: "Sweep", reason: str, row: "Row", baseline: "Row") -> "Shown":
 def _facts(facts: dict[str, Any], rows: "Sequence[Row]") -> list[tuple[str, str]]:
     """What was run, and with what; where rows differ, all that there is."""
 
+    # A store that several versions have written names them all: figures are then not of one.
     def all_of(values: Sequence[str]) -> str:
         return "; ".join(sorted({value for value in values if value})) or "-"
 

@@ -94,6 +94,7 @@ def run_one(
     config = trial_config(setting_changes(simulations=simulations, search=search, camera=camera), generator)
     folder = None if out is None else make_folder(out)
     with progress_bar() as progress:
+        # How many decisions a trial takes is not known before it ends.
         progress.add_task("running the trial (the first decision compiles the planner)", total=None)
         trial = run_trial(
             made,
@@ -132,6 +133,7 @@ def _why_infeasible(generator: "Generator", split: "Split", task: "Task", config
         made = make_world(generator, split, number)
         return run_trial(made, task, Policy.KNOWN_MAP, trial_key(number), config).outcome is Outcome.SATISFIED
 
+    # A task without a way back, such as one that forbids what was entered, can be lost by a decision.
     if is_possible(world):
         return "with the whole map the task is possible in this world: the policy went where it cannot be satisfied"
     # As many as tell a task that is impossible everywhere from a few unlucky worlds.
@@ -166,16 +168,19 @@ def _print(trial: "Trial", files: list[Path]) -> None:
     from potlp_jax.types import status_names
 
     out = console()
+    # The colour repeats the word, so that nothing is lost without it.
     colour = "green" if trial.outcome is Outcome.SATISFIED else "red"
     out.print(f"[bold {colour}]{trial.outcome.value}[/]  cost {trial.cost:.2f}")
     summary = trial.summary()
     for name in _SHOWN:
         out.print(f"{name:12} {summary[name]}", markup=False)
+    # Flags say that an array or a loop was too small for this trial (`types.Status`); most trials have none.
     if trial.status:
         flags = ", ".join(status_names(trial.status)).replace("_", " ")
         out.print(f"{'status':12} {flags}", markup=False)
     for file in files:
         out.print(f"wrote {file}", markup=False)
+    # What one would do next with these files; a newcomer need not look it up.
     if files:
         out.print(f"next: potlp explain {files[0].parent}:0", markup=False, style="dim")
     else:

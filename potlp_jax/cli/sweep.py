@@ -80,6 +80,7 @@ def run(
     from potlp_jax.sweep.specification import read_specification
 
     specification = read_specification(file)
+    # `potlp run` and `potlp compare` say so where they read the split; here the file names it.
     if specification.split is Split.TEST:
         warn_of_test_worlds()
     run_reported(specification, make_folder(out), processes)
@@ -145,6 +146,7 @@ class _Reporter:
 
     def _rate(self, progress: "Progress") -> str:
         seconds, done = time.monotonic() - self._start, progress.done - self._done_before
+        # Before the first trial has ended there is no rate, and a guess would be of compilation.
         if done < 1:
             return ""
         remaining = (progress.total - progress.done) * seconds / done
@@ -152,6 +154,7 @@ class _Reporter:
 
 
 def _duration(seconds: float) -> str:
+    # In the unit in which the number is small: nobody counts 5,400 seconds.
     minutes = round(seconds / 60)
     return f"{round(seconds)} s" if seconds < 90 else f"{minutes} min" if minutes < 90 else f"{minutes / 60:.1f} h"
 
@@ -216,6 +219,7 @@ def _write_parquet(rows: list[dict[str, Any]], file: Path) -> None:
     try:
         import pyarrow
         import pyarrow.parquet
+    # CSV needs nothing; only the extra for training brings pyarrow.
     except ImportError:
         fail("Parquet files need pyarrow: pip install 'potlp-jax[train]', or write a .csv")
     pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows), file)

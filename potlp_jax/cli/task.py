@@ -34,7 +34,7 @@ def show_task(
     formula: Formula,
     propositions: Propositions = None,
     max_positive_literals: Annotated[
-        int | None, typer.Option(min=0, help="Leave out ways that need more propositions to hold in one place.")
+        int | None, typer.Option(min=0, help="Leave out cubes that need more propositions to hold at one cell.")
     ] = None,
     out: Annotated[
         Path | None,
@@ -86,6 +86,7 @@ def _states(task: Task, description: dict[str, Any]) -> Table:
 
 
 def _role(state: int, description: dict[str, Any]) -> str:
+    # The initial state may also accept, when the task holds from the start.
     roles = ["initial"] if state == description["initial"] else []
     roles += [role for role in ("accepting", "trap") if state in description[role]]
     return ", ".join(roles)
@@ -103,6 +104,7 @@ def _classes(description: dict[str, Any]) -> Table:
             for edge in description["edges"]
             if index in description["conditions"][edge["condition"]]["classes"]
         ]
+        # Literals that all keeping letters share may admit further letters; labels use the exact ones.
         stay = outcome["stay"] + ("" if outcome["stay_is_exact"] else " (among others)")
         table.add_row(str(index), escape(stay), escape(outcome["cube"]), ", ".join(edges))
     return table

@@ -45,6 +45,7 @@ def view_trial(
     file = record_file(trial)
     recorded = load_trial(file)
     page = out or file.with_name(PAGE)
+    # A browser goes by the ending of a file's name.
     if page.suffix != ".html":
         fail(f"--out {page}: give a name that ends in .html")
     page.write_text(replay_page(recorded, panoramas_of(recorded)), "utf-8")

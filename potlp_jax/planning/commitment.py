@@ -19,7 +19,7 @@ from potlp_jax.world.frontiers import Subgoals
 
 SAME_WITHIN: int = 8
 """Cells, in rows and in columns, within which a subgoal may be the one of the decision before: frontiers recede as the
-robot nears them, and it decides again after 4 cells. Twice that distance; not tuned."""
+robot nears them, and it decides again after 4 cells. No experiment on it is recorded."""
 
 
 @struct.dataclass(kw_only=True)

@@ -37,14 +37,26 @@ def frontier_subgoals(
       state: the automaton's state, the letter of the robot's cell read.
       task: arrays of the task.
       config: ``config.frontiers`` is what matters here.
+
+    Returns:
+      Where estimates are wanted.
     """
     return assess(belief, cell, state, task, config.frontiers).subgoals
 
 
 def subgoals_at(cells: Int32[Array, "S 2"], mask: Bool[Array, " S"], height: int, width: int) -> Subgoals:
-    """Subgoals of the caller's own, on a map of this size: known free cells where the robot may leave known space.
+    """Subgoals of the caller's own: known free cells where the robot may leave known space.
 
     What only the library's own search for frontiers knows (sizes, distances, components) is left empty.
+
+    Args:
+      cells: row and column of each.
+      mask: True where a subgoal is real.
+      height: rows of the map.
+      width: its columns.
+
+    Returns:
+      The subgoals.
     """
     count = mask.shape[0]
     return Subgoals(
@@ -82,13 +94,18 @@ def decide_from_estimates(
       task: arrays of the task.
       cell: the robot's cell.
       state: the automaton's state, the letter of the robot's cell read.
-      key: drives the search.
+      key: drives the search where it samples (``UctConfig``).
       config: settings; ``config.frontiers`` counts where no action is available and the robot falls back on the
         nearest frontier.
       intention: ``Move.intention`` of the decision before, for ``config.commitment``; without one the robot chooses
         afresh.
+
+    Returns:
+      The move, with what the search considered.
     """
+    # Assessed again, although the caller may have called `frontier_subgoals`: arrays in between are the caller's.
     situation = assess(belief, cell, state, task, config.frontiers)
+    # The frontiers themselves stay those of the belief: they count where no action is available.
     given = dataclasses.replace(situation.subgoals, cells=subgoals.cells, mask=subgoals.mask)
     return search_move(dataclasses.replace(situation, subgoals=given), estimates, key, config, intention)
 

@@ -120,6 +120,7 @@ def move_to(
         horizon=config.horizon(*situation.belief.cells.shape),
         resolution=situation.belief.resolution,
     )
+    # What was cut off among the subgoals concerns every move that was chosen among them.
     bits = status_array() if status is None else status
     return Move(
         kind=kind.astype(jnp.int32),

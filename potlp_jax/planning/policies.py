@@ -133,6 +133,7 @@ class PolicyFunction(Protocol):
 
 def policy_function(policy: Policy | PolicyFunction) -> PolicyFunction:
     """The function of a policy: that of the name, or the function itself."""
+    # A user's function is called like the library's own: there is one signature.
     if not isinstance(policy, Policy):
         return policy
     if policy.searches:
@@ -174,7 +175,7 @@ def named_policy(policy: Policy | PolicyFunction | str) -> Policy | PolicyFuncti
     if own in list(Policy):
         return Policy(own)
     found = plugins.load(policy, group=plugins.POLICIES, kind="policy", known=list(Policy))
-    if not callable(found):
+    if not isinstance(found, PolicyFunction):
         raise PluginError(f"policy {policy!r}: {type(found).__name__} is no function (PolicyFunction)")
     return found
 
@@ -242,6 +243,7 @@ def planned_move(
     Returns:
         The move.
     """
+    # What the search found is recorded as found; the commitment is applied to what the robot does.
     task, subgoals = situation.task, situation.subgoals
     search = Search(problem=problem, plan=plan, terms=action_terms(problem, initial_history(problem)))
     plan = apply_commitment(plan, intention, situation.state, subgoals, task, jnp.float32(config.commitment))
@@ -317,6 +319,7 @@ def _optimistic(situation: Situation, config: DecisionConfig) -> Move:
 
 def _cut_before_unobserved(path: KnownPath, belief: BeliefMap) -> KnownPath:
     """The part of a path before its first unobserved cell: a path never enters one (docs/model.md section 7)."""
+    # The first cell is the robot's own, which it has observed, so that at least that remains.
     hidden = belief.unknown[path.cells[:, 0], path.cells[:, 1]]
     index = jnp.arange(hidden.shape[0], dtype=jnp.int32)
     first_hidden = jnp.min(jnp.where(hidden, index, path.length + 1))

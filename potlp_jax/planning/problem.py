@@ -21,13 +21,13 @@ class PlanningProblem:
 
     Attributes:
       task: automaton, edges, conditions and outcome classes.
-      travel: ``travel[u, z, s, z']``, shortest way through known space from node ``u`` in state ``z`` to subgoal ``s``
-        in state ``z'``, inf where there is none. From a subgoal's node the way starts by entering the subgoal's cell
+      travel: ``travel[u, z, s, z']``, path cost through known space from node ``u`` in state ``z`` to subgoal ``s`` in
+        state ``z'``, inf where there is no path. From a subgoal's node the path starts by entering the subgoal's cell
         from the unknown region, so its first state is ``δ(z, l(s))``; from the robot's node it starts in ``z``.
-      finish: ``finish[u, z]``, shortest way through known space to acceptance, inf where there is none.
+      finish: ``finish[u, z]``, path cost through known space to acceptance, inf where there is no path.
       success_probability: P_S of each subgoal and outcome class.
-      success_cost: R_S, way from the subgoal to the success, positive (also where P_S is 0).
-      failure_cost: R_F, way from the subgoal to where the failure is known, not negative.
+      success_cost: R_S, path cost from the subgoal to the success, positive (also where P_S is 0).
+      failure_cost: R_F, path cost from the subgoal to where the failure is known, not negative.
       dfa_state: the robot's automaton state, the letter of its cell read.
       subgoal_mask: True where a subgoal is real.
       dead_end_cost: what a history costs in which nothing can be done and the task is not satisfied, positive.
@@ -71,7 +71,11 @@ class PlanningProblem:
           dfa_state: scalar.
           subgoal_mask: ``[S]``.
           dead_end_cost: scalar.
+
+        Returns:
+          The problem.
         """
+        # Types alone: values may be traced here, so that nothing can be checked.
         return cls(
             task=task,
             travel=jnp.asarray(travel, jnp.float32),
@@ -107,19 +111,23 @@ class PlanningProblem:
             [0, 1], R_S is not positive, R_F is negative, or ``dead_end_cost`` is not positive. Estimates are checked
             where subgoal and outcome class are real, travel and finish everywhere.
         """
+        # Shapes first: the checks of values below rely on them.
         _check_shapes(self)
         task = self.task
+        # Padding may hold anything: no result depends on it.
         real = np.asarray(self.subgoal_mask)[:, None] & np.asarray(task.class_mask)[None, :]
         travel, finish = np.asarray(self.travel), np.asarray(self.finish)
         _refuse("travel", travel, np.isnan(travel) | (travel < 0), "a cost is not negative, inf where unreachable")
         _refuse("finish", finish, np.isnan(finish) | (finish < 0), "a cost is not negative, inf where unreachable")
         probability = np.asarray(self.success_probability)
         _refuse("success_probability", probability, real & ~((probability >= 0) & (probability <= 1)), "P_S in [0, 1]")
+        # R_S is positive: a success lies at least one move beyond its subgoal.
         success, failure = np.asarray(self.success_cost), np.asarray(self.failure_cost)
         _refuse("success_cost", success, real & ~((success > 0) & (success < np.inf)), "R_S is positive and finite")
         _refuse("failure_cost", failure, real & ~((failure >= 0) & (failure < np.inf)), "R_F is finite, not negative")
         dead_end = np.asarray(self.dead_end_cost)
         _refuse("dead_end_cost", dead_end, ~((dead_end > 0) & (dead_end < np.inf)), "must be positive and finite")
+        # The index is clipped only to look it up; a state out of range is refused all the same.
         state = np.asarray(self.dfa_state)
         known = (state >= 0) & (state < task.state_mask.shape[-1])
         known = known & np.asarray(task.state_mask)[np.clip(state, 0, task.state_mask.shape[-1] - 1)]
@@ -132,9 +140,11 @@ def enumerate_actions(problem: PlanningProblem) -> Bool[Array, "S E"]:
     True where subgoal and edge are real, the subgoal can be reached in state z' through known space, and P_S of the
     edge's condition is not 0. All False where the task is already satisfied.
     """
+    # The conditions of `history.terms_of_all` at a history in which nothing is known.
     task = problem.task
     robot, state = problem.subgoal_count, problem.dfa_state
     reachable = jnp.isfinite(problem.travel[robot, state][:, task.edges[:, 0]])
+    # A condition is possible if any of its cubes is.
     classes = take_rows(task.condition_classes, task.edge_condition)
     chance = take_rows(problem.success_probability.T, classes)
     possible = jnp.any((classes != NO_CLASS)[..., None] & (chance > 0), axis=1).T
@@ -143,19 +153,30 @@ def enumerate_actions(problem: PlanningProblem) -> Bool[Array, "S E"]:
 
 
 def action_index(problem: PlanningProblem, subgoal: int, edge: int) -> int:
-    """Index of the action that tries ``edge`` beyond ``subgoal``."""
+    """Index of an action.
+
+    Args:
+      problem: its shapes alone matter.
+      subgoal: where it is attempted.
+      edge: the transition that it tries.
+
+    Returns:
+      ``s * E + e``.
+    """
     return subgoal * problem.edge_count + edge
 
 
 def take_rows(values: Array, index: Int32[Array, "*N"]) -> Array:
     """``values[index]``: for a negative index the first row, and zeros where there is no row to take (a task without
     conditions)."""
+    # Indexing an array without rows is an error even where no index is used.
     if values.shape[0] == 0:
         return jnp.zeros((*index.shape, *values.shape[1:]), values.dtype)
     return values[jnp.maximum(index, 0)]
 
 
 def _check_shapes(problem: PlanningProblem) -> None:
+    # The mask and the task give the sizes that all other arrays have to have.
     subgoals, task = problem.subgoal_count, problem.task
     states, classes = task.state_mask.shape[-1], task.class_mask.shape[-1]
     expected = {
@@ -181,6 +202,7 @@ def _refuse(name: str, values: np.ndarray, wrong: np.ndarray | np.bool_, rule: s
     """Raise for the first wrong value, if any."""
     if not np.any(wrong):
         return
+    # One example says more than a count of all.
     index = tuple(int(i) for i in np.argwhere(wrong)[0])
     where = f"{name}[{', '.join(map(str, index))}]" if index else name
     raise ProblemError(f"{where} is {values[index]}: {rule}")

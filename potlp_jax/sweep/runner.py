@@ -310,7 +310,7 @@ def _work_in_processes(sweep: Sweep, folder: Path, processes: int, report: Calla
 
 
 def _work(specification: Specification, folder: Path, core: int | None) -> None:
-    """A worker: works until nothing is left, or the process that started it is gone."""
+    """A worker: works until nothing remains, or the process that started it is gone."""
     # An interrupt from the terminal reaches all processes; the one that started this one ends it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if core is not None:

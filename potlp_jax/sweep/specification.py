@@ -90,7 +90,7 @@ def specification_from_store(data: Mapping[str, Any]) -> Specification:
 
 
 def configuration_hash(config: TrialConfig) -> str:
-    """Twelve hexadecimal digits that tell settings apart."""
+    """Twelve hexadecimal digits that differ for different settings."""
     # 48 bits: among a million settings the chance that two share a hash is 0.2 %.
     text = json.dumps(json_copy(dataclasses.asdict(config)), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]

@@ -139,8 +139,10 @@ class Comparison:
             for policy, trials in results.items()
         }
         # One policy's full tree drops the world for all: otherwise policies would be compared over different worlds.
-        lost = [np.array([trial.status & UNRELIABLE != 0 for trial in trials], bool) for trials in results.values()]
-        kept = np.all(list(ended.values()), axis=0) & ~np.any(lost, axis=0)
+        unreliable = [
+            np.array([trial.status & UNRELIABLE != 0 for trial in trials], bool) for trials in results.values()
+        ]
+        kept = np.all(list(ended.values()), axis=0) & ~np.any(unreliable, axis=0)
         # Giving up must not look cheap, so that a trial that stopped early is charged all that it might have spent.
         charged = {policy: np.where(ended[policy], costs[policy], budgets[policy]) for policy in results}
         return cls(
@@ -207,7 +209,7 @@ def attainable_interval(
     if len(ours) < 2:
         return math.nan, math.nan
     with warnings.catch_warnings():
-        # Resamples without attainable savings are told apart below, so SciPy need not warn of them.
+        # Resamples without attainable savings are handled below, so SciPy need not warn of them.
         warnings.simplefilter("ignore", DegenerateDataWarning)
         result = bootstrap(
             (ours, baseline, known_map),

@@ -275,8 +275,8 @@ def _alive(host: str, process: int, started: float, claimed: float) -> bool:
 def process_start(process: int) -> float | None:
     """When a process of this host was started, in the system's own units; None where there is none.
 
-    A number of a process is used again some day; with its start it is not. Where the system does not tell starts, 0
-    stands for any.
+    The system uses the number of a process again after a while, but not with the same start. Where the system does not
+    report starts, 0 stands for any.
     """
     if not Path("/proc/self/stat").exists():
         try:

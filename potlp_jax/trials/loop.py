@@ -110,7 +110,9 @@ def run_robot(
         PotlpError: the policy is ``oracle`` and there is no ``world``.
     """
     policy = named_policy(policy)
+    # Nothing is asked of the robot's map but its shape: the loop observes for itself.
     asked = rules.estimator_of(policy, task.propositions, estimator)
+    # An estimator that remembers where it was needs to know how large the map is.
     height, width = robot.observe()[0].cells.shape
     loop = _Loop(
         robot,

@@ -234,6 +234,7 @@ def _consider(
     setup: Setup, asked: Asked, progress: Progress, scene: Scene
 ) -> tuple[PanoramaMemory | None, Situation, Estimates | None, PRNGKeyArray]:
     """What every policy is given: the situation, and estimates where it asks for them."""
+    # Panorama first: an estimator answers from what can be seen here too.
     running = progress.tally.running
     views = None if setup.network is None else _take_panorama(setup, setup.network, asked, progress, scene)
     situation = _phase(

@@ -95,6 +95,16 @@ def save_animation(
 
     Decisions are thinned out evenly to ``max_frames``; the first one and the end are always shown. If the file would be
     larger than ``max_bytes``, every other frame is left out until it fits.
+
+    Args:
+        trial: finished, with or without decisions.
+        path: the GIF's file.
+        max_frames: at most so many frames, the last one included.
+        max_bytes: size of the file.
+        progress: called after each frame that was drawn.
+
+    Returns:
+        The number of frames that were written.
     """
     steps = frame_steps(trial, max_frames)
     stage = _Stage(trial)
@@ -105,6 +115,7 @@ def save_animation(
             progress(count + 1, len(steps))
     data = _encode(frames)
     while len(data) > max_bytes and len(frames) > 2:
+        # Halving keeps the rhythm even; the end always stays.
         frames = [*frames[:-1:2], frames[-1]]
         data = _encode(frames)
     path.write_bytes(data)
@@ -114,6 +125,7 @@ def save_animation(
 def frame_steps(trial: Trial, max_frames: int) -> list[Decision | None]:
     """The decisions that get a frame, evenly spread; None is the end of the trial."""
     count = len(trial.decisions)
+    # Rounded positions may coincide, hence unique; the first and the last decision are always among them.
     kept = np.unique(np.linspace(0, count - 1, min(count, max(1, max_frames - 1))).round().astype(int)) if count else []
     return [*(trial.decisions[index] for index in kept), None]
 
@@ -124,6 +136,7 @@ class _Stage:
     def __init__(self, trial: Trial) -> None:
         self._trial = trial
         self._figure, self._axes, self._panel, self._scale = _layout(*map_extent(trial.world))
+        # Names are placed once for the whole path, so that they stand still from frame to frame.
         self._labels = place_labels(
             trial.world, trial.propositions, trial.path, inches_per_cell=self._scale, size=LABEL_SIZE
         )
@@ -137,26 +150,32 @@ class _Stage:
         canvas = self._figure.canvas
         assert isinstance(canvas, FigureCanvasAgg)
         self._canvas = canvas
+        # Drawn once and kept as pixels: title, legend and frame of the map are the same in every frame, and laying out
+        # their texts takes most of the time that a frame would.
         canvas.draw()
         self._background = canvas.copy_from_bbox(self._figure.bbox)
 
     def frame(self, decision: Decision | None) -> Image.Image:
         """The belief, path and actions at a decision, or the end of the trial if ``decision`` is None."""
+        # Whatever is drawn from here on belongs to this frame alone and is taken off again.
         still = {axes: set(axes.get_children()) for axes in (self._axes, self._panel)}
         self._draw_map(decision)
         _draw_panel(self._panel, self._trial, decision)
         self._canvas.restore_region(self._background)
         for axes, before in still.items():
             fresh = [artist for artist in axes.get_children() if artist not in before]
+            # draw_artist knows no order of its own: lower layers first, as a full drawing would.
             fresh.sort(key=lambda artist: artist.get_zorder())
             for artist in fresh:
                 axes.draw_artist(artist)
             for artist in fresh:
                 artist.remove()
+        # A copy, for the buffer is drawn over by the next frame.
         return Image.fromarray(np.asarray(self._canvas.buffer_rgba())[..., :3].copy())
 
     def _draw_map(self, decision: Decision | None) -> None:
         trial, axes = self._trial, self._axes
+        # A decision is made after observing from its cell, hence what was first seen at its own step counts as seen.
         step = len(trial.path) - 1 if decision is None else decision.step
         seen = (trial.first_seen != NEVER_SEEN) & (trial.first_seen <= step)
         path, states = trial.path[: step + 1], trial.states[: step + 1]
@@ -171,6 +190,7 @@ class _Stage:
 
 def _layout(rows: int, columns: int) -> tuple[Figure, Axes, Axes, float]:
     """The map beside its panel, or above it if the map is wide; the last value is inches per cell."""
+    # A wide map beside a panel would shrink to a strip.
     if columns >= 1.6 * rows:
         width, panel_height = 9.0, 2.35
         scale = min((width - 0.3) / columns, 4.4 / rows, MAX_INCHES_PER_CELL)
@@ -240,6 +260,7 @@ def _draw_panel(panel: Axes, trial: Trial, decision: Decision | None) -> None:
         textwrap.shorten(f"state {decision.state}: {state_words(task, decision.state)}", letters, placeholder=" ..."),
     ]
     if not decision.actions:
+        # A policy that does not search has no expected cost.
         lines[0] = f"{decision_number(trial, decision)}   step {decision.step}"
         _panel_text(panel, [*lines, *textwrap.wrap(describe_move(trial, decision), letters)])
         return
@@ -276,6 +297,7 @@ def _action_rows(panel: Axes, actions: Sequence[ActionRecord], trial: Trial, dec
             panel.add_patch(bar)
         for value, place in zip(figure_texts(action), _COLUMNS.values(), strict=True):
             panel.text(place, row + 0.1, value, size=8.5, color=colour, weight=weight, ha="right", va="center")
+    # Rows are counted in units of ROW_INCHES from the top of the panel: two for the heading, one for the columns.
     last = 3 + min(len(actions), SHOWN_ACTIONS)
     if len(actions) > SHOWN_ACTIONS:
         rest = f"and {len(actions) - SHOWN_ACTIONS} more"
@@ -287,6 +309,7 @@ def _action_rows(panel: Axes, actions: Sequence[ActionRecord], trial: Trial, dec
 def _encode(frames: Sequence[Image.Image]) -> bytes:
     """A GIF with one palette for all frames, so that only what changes between frames takes space."""
     palette = _palette(frames)
+    # No dithering: noise in flat areas changes from frame to frame, and the file grows severalfold.
     indexed = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     durations = [FRAME_MILLISECONDS] * (len(frames) - 1) + [LAST_FRAME_MILLISECONDS]
     buffer = io.BytesIO()
@@ -297,9 +320,11 @@ def _encode(frames: Sequence[Image.Image]) -> bytes:
 def _palette(frames: Sequence[Image.Image]) -> Image.Image:
     """The colours of the pictures' parts exactly, the rest (rims of letters and lines) as the frames need them."""
     fixed = np.array([rgb(colour) for colour in (*THEME, *STATE_COLOURS, *AREA_COLOURS)], np.uint8)
+    # Every third pixel of three frames has all mixed colours that matter; all of them would take seconds.
     thumbnails = [np.asarray(frame)[::3, ::3] for frame in (frames[0], frames[len(frames) // 2], frames[-1])]
     sample = Image.fromarray(np.concatenate(thumbnails)).quantize(MIXED_COLOURS, method=Image.Quantize.MEDIANCUT)
     mixed = np.array(sample.getpalette(), np.uint8).reshape(-1, 3)[:MIXED_COLOURS]
+    # Entries that hardly differ from an exact colour would win over it for some pixels.
     apart = np.abs(mixed[:, None].astype(int) - fixed[None]).max(axis=-1).min(axis=1) > 10
     colours = np.concatenate([fixed, mixed[apart]])
     palette = Image.new("P", (1, 1))

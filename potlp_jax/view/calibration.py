@@ -70,6 +70,7 @@ def ablation_table(reports: Mapping[str, Report]) -> Table:
     for number, intact in enumerate(skills[INTACT]):
         cells = [_number(intact, 3)]
         for other in others:
+            # A share of a skill that is not there means nothing.
             lost = (intact - skills[other][number]) / intact if intact > 0 else math.nan
             cells += [_number(skills[other][number], 3), "-" if math.isnan(lost) else f"{100 * lost:.0f}%"]
         rows.append(cells)
@@ -88,6 +89,7 @@ def _rows(report: Report) -> list[tuple[str, Figures]]:
 
 def _last_rows(report: Report) -> set[int]:
     """Positions in ``_rows`` after which another group begins."""
+    # Row 0 holds all samples; each group begins after the members before it.
     return set(itertools.accumulate((len(members) for members in report.groups.values()), initial=0))
 
 
@@ -126,6 +128,7 @@ def _draw_bins(axes: Axes, figures: Figures) -> None:
     axes.plot([0, 1], [0, 1], color=FAINT, linewidth=1.0, label="calibrated")
     axes.axhline(figures.success_rate, color=FAINT, linewidth=1.0, linestyle=":", label="mean of all samples")
     said, seen = [entry.predicted for entry in filled], [entry.observed for entry in filled]
+    # Of a proportion. Samples of one world are dependent: the true error is larger, as the legend says.
     errors = [2 * math.sqrt(max(y * (1 - y), 0.0) / entry.samples) for y, entry in zip(seen, filled, strict=True)]
     style = {"color": SERIES_COLOURS[0], "marker": "o", "markersize": 5, "linewidth": 1.5, "capsize": 2}
     axes.errorbar(said, seen, errors, **style, label="± 2 standard errors, as if independent")
@@ -144,6 +147,7 @@ def _draw_bins(axes: Axes, figures: Figures) -> None:
 
 def _draw_counts(axes: Axes, figures: Figures) -> None:
     middle = [(entry.low + entry.high) / 2 for entry in figures.bins]
+    # Bins are equally wide.
     width = 0.9 * (figures.bins[0].high - figures.bins[0].low)
     axes.bar(middle, [entry.samples for entry in figures.bins], width, color=SERIES_COLOURS[3])
     axes.set(xlim=(0, 1))
@@ -174,7 +178,17 @@ def _draw_skills(axes: Axes, reports: Mapping[str, Report]) -> None:
 
 
 def draw_costs(samples: Samples, predictions: Predictions, overall: Figures, title: str) -> Figure:
-    """Predicted over true costs: R_S where it was there, R_F where it was not."""
+    """Predicted over true costs: R_S where it was there, R_F where it was not.
+
+    Args:
+        samples: the true costs.
+        predictions: of the same samples, in the same order.
+        overall: the errors over all samples, which are written into the panels.
+        title: stands above.
+
+    Returns:
+        Two panels of densities with the diagonal and the constant prediction.
+    """
     figure = new_figure(11.5, 5.6)
     figure.text(0.5, 0.975, title, ha="center", va="top", size=9, color=INK)
     unit = samples.metadata.unit
@@ -185,6 +199,7 @@ def draw_costs(samples: Samples, predictions: Predictions, overall: Figures, tit
     errors = (overall.success_cost, overall.failure_cost)
     for column, ((name, share, true, said), figures) in enumerate(zip(panels, errors, strict=True)):
         axes = figure.add_axes((0.06 + 0.49 * column, 0.1, 0.42, 0.77))
+        # A share of successes strictly between 0 and 1 puts the sample into both panels, with that weight.
         known = (share > 0) & np.isfinite(true)
         _draw_cost(axes, true[known], said[known], share[known], figures, unit)
         axes.set_title(f"{name} ({figures.samples} samples; darker: more)", size=10, color=INK)
@@ -198,6 +213,7 @@ def _draw_cost(
     axes.plot([0, limit], [0, limit], color=FAINT, linewidth=1.0, zorder=3)
     if len(true):
         axes.hexbin(true, said, gridsize=48, extent=(0, limit, 0, limit), bins="log", mincnt=1, cmap="Blues", vmin=0.3)
+        # What an estimator that never looks would say at best.
         mean = float(np.average(true, weights=share))
         axes.axhline(mean, color=CHOSEN, linewidth=1.0, linestyle=":")
         note = {"textcoords": "offset points", "ha": "right", "va": "bottom", "size": 8, "color": CHOSEN}
@@ -215,7 +231,17 @@ def _draw_cost(
 def draw_predictions(
     samples: Samples, predictions: Predictions, chosen: Mapping[str, np.ndarray], title: str
 ) -> Figure:
-    """Panoramas of the samples that ``most_confident`` chose, each rolled so that its subgoal is in the centre."""
+    """Panoramas of the samples that ``most_confident`` chose, each rolled so that its subgoal is in the centre.
+
+    Args:
+        samples: with their images.
+        predictions: of the same samples, in the same order.
+        chosen: by kind ("true positives", ...), the indices of the samples to show, the most confident first.
+        title: stands above.
+
+    Returns:
+        One block a kind, with the question and the figures below each panorama.
+    """
     width, picture, words, heading = 11.5, 5.5 / 4, 0.62, 0.42
     rows = {name: max(1, math.ceil(len(members) / _COLUMNS)) for name, members in chosen.items()}
     height = 0.45 + sum(heading + count * (picture + words) for count in rows.values())
@@ -247,6 +273,7 @@ def _draw_prediction(
 ) -> None:
     axes = figure.add_axes(box)
     image = jnp.asarray(decode(samples.images[int(samples.view_of[index])]))
+    # The network sees panoramas rolled in the same manner (docs/estimator.md).
     rolled = np.asarray(roll_to(image, jnp.float32(samples.bearing[index])))
     axes.imshow(rolled, aspect="auto", interpolation="nearest")
     rows, columns = rolled.shape[:2]
@@ -259,7 +286,16 @@ def _draw_prediction(
 
 
 def describe_prediction(samples: Samples, predictions: Predictions, index: int) -> str:
-    """Three lines: what must hold on the way, what is looked for, and the numbers, with the true ones that count."""
+    """Three lines: what must hold on the way, what is looked for, and the numbers, with the true ones that count.
+
+    Args:
+        samples: the questions and true answers.
+        predictions: of the same samples, in the same order.
+        index: which sample.
+
+    Returns:
+        The lines, joined. A true cost is given only where it was paid: R_S after success, R_F after failure.
+    """
     stay, go = class_in_words(samples.phi_stay[index], samples.phi_go[index], samples.metadata.propositions)
     true = float(samples.success[index])
     numbers = [f"P_S {predictions.success[index]:.3f} (true {true:g})"]
@@ -267,6 +303,7 @@ def describe_prediction(samples: Samples, predictions: Predictions, index: int) 
         ("R_S", predictions.success_cost[index], samples.success_cost[index], true > 0),
         ("R_F", predictions.failure_cost[index], samples.failure_cost[index], true < 1),
     )
+    # Costs are shown without digits: their errors are tens.
     numbers += [f"{name} {said:.0f}" + (f" (true {cost:.0f})" if counts else "") for name, said, cost, counts in costs]
     numbers.append(f"distance {samples.distance[index]:.0f} {samples.metadata.unit}")
     return "\n".join((stay, go, "    ".join(numbers)))

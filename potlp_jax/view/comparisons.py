@@ -91,7 +91,7 @@ def remark_lines(comparison: Comparison) -> list[str]:
             lines.append(f"{policy}: {', '.join(others)}")
     lines += loss_lines(comparison)
     if 0 < satisfied.pairs < FEW_WORLDS:
-        lines.append(f"{satisfied.pairs} worlds are few: the interval says how little they settle.")
+        lines.append(f"{satisfied.pairs} worlds are few: the interval says how far the share may be off.")
     return lines
 
 
@@ -107,7 +107,16 @@ def loss_lines(comparison: Comparison) -> list[str]:
 
 
 def draw_scatter(pairs: Sequence[Pair], policies: Sequence[str], title: str) -> Figure:
-    """The picture of `scatter_costs` with a title."""
+    """The picture of ``scatter_costs`` with a title.
+
+    Args:
+        pairs: rows of all policies, by world.
+        policies: in the order of the legend; ``baseline`` is the horizontal axis.
+        title: stands above, broken into lines.
+
+    Returns:
+        The figure.
+    """
     figure = new_figure(6.4, 6.9)
     scatter_costs(figure.add_axes((0.12, 0.1, 0.84, 0.78)), pairs, policies)
     figure.text(0.5, 0.975, textwrap.fill(title, 88), ha="center", va="top", size=8.5, color=INK)
@@ -118,7 +127,13 @@ def scatter_costs(axes: Axes, pairs: Sequence[Pair], policies: Sequence[str]) ->
     """Each policy's cost over the baseline's, world by world, as in the paper; below the diagonal is cheaper.
 
     Trials that did not end satisfied, or whose baseline did not, are crosses.
+
+    Args:
+        axes: where to draw; limits and labels are set.
+        pairs: rows of all policies, by world.
+        policies: in the order of the legend; ``baseline`` is the horizontal axis.
     """
+    # Both axes alike, from 0: distances from the diagonal are savings.
     limit = 1.05 * max((row.cost for pair in pairs for row in pair.values()), default=1.0) or 1.0
     axes.set(xlim=(0, limit), ylim=(0, limit), aspect="equal")
     axes.set(xlabel="cost of the baseline", ylabel="cost of the policy")
@@ -134,6 +149,7 @@ def scatter_costs(axes: Axes, pairs: Sequence[Pair], policies: Sequence[str]) ->
         axes.scatter(
             [pair[BASELINE].cost for pair in good],
             [pair[policy].cost for pair in good],
+            # The bound lies below everything and should not hide it.
             s=12 if policy == KNOWN_MAP else 26,
             marker=style.marker,
             color=style.colour,
@@ -142,6 +158,7 @@ def scatter_costs(axes: Axes, pairs: Sequence[Pair], policies: Sequence[str]) ->
             label=f"{policy} ({len(good)} worlds)",
             zorder=2,
         )
+        # The cost up to the failure: it is no cost of the task, hence another mark.
         failed = [pair[BASELINE].cost for pair in bad], [pair[policy].cost for pair in bad]
         axes.scatter(*failed, s=34, marker="x", color=style.colour, zorder=3)
         unsatisfied = unsatisfied or bool(bad)

@@ -64,6 +64,7 @@ def action_name(action: ActionRecord, task: Task) -> str:
     """``finish``, or the subgoal and the transition that is tried beyond it, such as ``s2: find alarm``."""
     if action.subgoal is None:
         return "finish"
+    # Only the finish action has no transition.
     assert action.from_state is not None
     assert action.to_state is not None
     return f"s{action.subgoal}: {transition_words(task, action.from_state, action.to_state, brief=True)}"
@@ -129,7 +130,9 @@ def describe_move(trial: Trial, decision: Decision) -> str:
     if chosen is None or chosen.subgoal is None:
         move = KINDS.get(decision.kind, decision.kind) + target
     else:
+        # The cell stands after the subgoal's number: "s2 at 11,30: find alarm".
         move = action_name(chosen, task_of(trial)).replace(":", f"{target}:", 1)
+    # Hysteresis: the robot keeps its target unless another is clearly better (docs/model.md, section 8).
     better = decision.overruled
     return move if better is None else f"{move}; kept although {action_name(better, task_of(trial))} is better"
 

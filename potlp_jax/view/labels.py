@@ -75,12 +75,15 @@ def place_labels(
     rows, columns = map_extent(world)
     letters = np.asarray(world.letters)[:rows, :columns]
     labels: list[AreaLabel] = []
+    # From (row, column) to (x, y).
     steps = np.array(path, float)[:, ::-1]
     for letter, cells in _areas(letters)[:MAX_LABELS]:
         name = letter_name(letter, propositions)
+        # Mean width and height of the font's letters, with the box around them: good enough without drawing it first.
         half = np.array([len(name) * size * 0.6 / 72 + 0.1, size * 1.35 / 72 + 0.06]) / 2 / inches_per_cell
         candidates = _candidates(cells, half, MARGIN / inches_per_cell)
         prices = [
+            # The rank breaks ties in favour of near and upper places.
             _price(centre, half, labels, steps, letters, MARK / inches_per_cell) + 0.25 * rank
             for rank, centre in enumerate(candidates)
         ]
@@ -93,8 +96,15 @@ def place_labels(
 
 
 def draw_labels(axes: Axes, labels: Sequence[AreaLabel], *, size: float = 9.0) -> None:
-    """The names, with a thin line to areas that they stand beside."""
+    """The names, with a thin line to areas that they stand beside.
+
+    Args:
+        axes: whose units are those of the labels: cells, or metres.
+        labels: from ``place_labels``.
+        size: of the letters in points, as they were placed.
+    """
     for label in labels:
+        # A name within its area needs no line.
         apart = np.abs(np.subtract(label.anchor, label.centre)) > label.half_size
         if np.any(apart):
             (x, y), (to_x, to_y) = label.centre, label.anchor
@@ -115,6 +125,7 @@ def _areas(letters: Int32[np.ndarray, "h w"]) -> list[tuple[int, Int[np.ndarray,
     """Connected areas of equal letter as (letter, cells), large ones first."""
     areas = []
     for letter in np.unique(letters[letters > 0]).tolist():
+        # Cells that touch at a corner belong together: diagonal rows of cells are one area to the eye.
         labelled = ndimage.label(letters == letter, structure=np.ones((3, 3), int))
         components, count = cast(tuple[np.ndarray, int], labelled)
         areas += [(letter, np.argwhere(components == index)) for index in range(1, count + 1)]

@@ -54,12 +54,24 @@ def cell_image(
     """The map as a raster: seen cells clear, unseen ones grey (with stripes if ``hatch``), labelled areas coloured.
 
     A cell with several propositions has stripes of their colours.
+
+    Args:
+        world: the true map.
+        seen: True for cells that are drawn as known.
+        propositions: names by bit of a letter; only their number matters.
+        hatch: whether unseen cells are striped, so that they differ from walls in grey prints too.
+        pixels: of the image's longer side, at most.
+
+    Returns:
+        The image, row 0 at the top; all cells are squares of the same whole number of pixels.
     """
     rows, columns = map_extent(world)
     seen = seen[:rows, :columns]
     occupied = np.asarray(world.occupied)[:rows, :columns]
     letters = np.asarray(world.letters)[:rows, :columns]
+    # Whole pixels a cell: a raster that is scaled by a fraction loses thin walls.
     scale = int(np.clip(pixels // max(rows, columns), 1, 60))
+    # Index: occupied + 2 * unseen.
     palette = np.array([rgb(FREE_SEEN), rgb(WALL_SEEN), rgb(FREE_UNSEEN), rgb(WALL_UNSEEN)], np.uint8)
     image = _enlarge(palette[occupied + 2 * ~seen], scale)
     line, column = np.indices(image.shape[:2])
@@ -67,11 +79,14 @@ def cell_image(
     for letter in np.unique(letters[letters > 0]):
         colours = [rgb(area_colour(bit)) for bit in range(len(propositions)) if letter >> bit & 1]
         area = _enlarge(letters == letter, scale)
+        # Stripes run diagonally, so that each cell shows every colour whatever its place.
         striped = np.array(colours, np.uint8)[(stripe // max(3, scale // 2)) % len(colours)]
         image[area] = striped[area]
     unseen = _enlarge(~seen, scale)
     area = _enlarge(letters > 0, scale) & unseen
+    # Unseen areas stay recognisable: a reader sees what the robot did not know.
     image[area] = (0.55 * image[area] + 0.45 * np.array(rgb(FREE_UNSEEN))).astype(np.uint8)
+    # Every fourteenth diagonal, two pixels wide: visible, and calmer than the walls.
     if hatch:
         image[unseen & (stripe % 14 < 2)] = rgb(HATCH)
     return image
@@ -86,9 +101,19 @@ def show_cells(
     hatch: bool,
     pixels: int = IMAGE_PIXELS,
 ) -> None:
-    """Put the raster on the axes: x is the column, y the row, row 0 at the top."""
+    """Put the raster of ``cell_image`` on the axes and fit them to it.
+
+    Args:
+        axes: x becomes the column, y the row, row 0 at the top.
+        world: the true map.
+        seen: True for cells that are drawn as known.
+        propositions: names by bit of a letter.
+        hatch: whether unseen cells are striped.
+        pixels: of the raster's longer side, at most.
+    """
     rows, columns = map_extent(world)
     image = cell_image(world, seen, propositions, hatch=hatch, pixels=pixels)
+    # Cell centres are whole numbers.
     axes.imshow(image, extent=(-0.5, columns - 0.5, rows - 0.5, -0.5), interpolation="nearest", zorder=0)
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), aspect="equal")
     for spine in axes.spines.values():
@@ -101,11 +126,21 @@ def draw_path(
     """The path in the colours of the states in which its steps were begun; traffic keeps to the right.
 
     Keeping to the right by half a line's width shows both colours where the robot came back the same way.
+
+    Args:
+        axes: a map.
+        path: cells (row, column), the start first.
+        states: of the automaton, one per cell of the path.
+        inches_per_cell: scale of the map, which turns the line's width into cells.
+
+    Returns:
+        The lines, one segment a step.
     """
     lane = _keep_right(np.array(path, float)[:, ::-1], 0.6 * PATH_WIDTH / 72 / inches_per_cell)
     segments = np.stack([lane[:-1], lane[1:]], axis=1)
     lines = LineCollection(
         list(segments),
+        # The state changes on arrival: a step has the colour of the state in which it was begun.
         colors=[state_colour(state) for state in states[:-1]],
         linewidths=PATH_WIDTH,
         capstyle="round",
@@ -196,6 +231,7 @@ def cell_handles() -> list[Line2D | Patch]:
 
 def area_handles(propositions: Sequence[str], world: World) -> list[Patch]:
     """Legend entries of the propositions that occur in the world."""
+    # A proposition that the world does not have would be searched for in vain.
     present = int(np.bitwise_or.reduce(np.asarray(world.letters), axis=None))
     return [
         Patch(facecolor=to_rgba(area_colour(bit)), edgecolor=FAINT, linewidth=0.5, label=name)
@@ -221,7 +257,16 @@ def subgoal_handles() -> list[Line2D | Patch]:
 
 
 def state_handles(states: Sequence[int], task: Task, *, words: bool = True) -> list[Line2D]:
-    """Legend entries of the automaton states in ``states``, with what each asks for if ``words``."""
+    """Legend entries of automaton states.
+
+    Args:
+        states: in any order, with repetitions.
+        task: says what a state asks for.
+        words: whether that is written after the number.
+
+    Returns:
+        One entry a state, by number.
+    """
     return [
         Line2D(
             [],
@@ -242,8 +287,10 @@ def _keep_right(points: Float[np.ndarray, "N 2"], offset: float) -> Float[np.nda
     """Points moved to the right of the direction of travel (y downward), the direction averaged over a few steps."""
     if len(points) < 2:
         return points
+    # Two steps before and after: staircases of diagonal paths are smoothed, corners stay.
     padded = np.concatenate([points[:1], points[:1], points, points[-1:], points[-1:]])
     heading = padded[4:] - padded[:-4]
     length = np.linalg.norm(heading, axis=1, keepdims=True)
+    # y points down, hence right of (x, y) is (-y, x). A robot that stands still has no direction.
     right = np.stack([-heading[:, 1], heading[:, 0]], axis=1) / np.where(length > 0, length, 1)
     return points + offset * right

@@ -32,14 +32,32 @@ SCALE_BARS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500)
 
 
 def draw_map(image_map: OccupancyMap, clean: CleanMap, title: str) -> Figure:
-    """The map and its cleaned grid, without propositions."""
+    """The map and its cleaned grid, without propositions.
+
+    Args:
+        image_map: the map as it was read.
+        clean: what the planner makes of it.
+        title: stands above.
+
+    Returns:
+        The figure, in metres.
+    """
     figure, axes = _plan(image_map, clean, title, [])
     _finish(figure, axes, clean, [])
     return figure
 
 
 def draw_places(family: RosMap, world: World, title: str) -> Figure:
-    """The same with the propositions of a family of worlds, and the start if its places fix one."""
+    """The same with the propositions of a family of worlds, and the start if its places fix one.
+
+    Args:
+        family: the map, its cleaned grid and its places.
+        world: one of its worlds, whose labels are drawn.
+        title: stands above.
+
+    Returns:
+        The figure, in metres.
+    """
     present: list[Patch | Line2D] = [*area_handles(family.propositions, world)]
     figure, axes = _plan(family.image_map, family.clean, title, _letter_raster(world, len(family.propositions)))
     scale = axes.bbox.width / figure.dpi / float(np.ptp(axes.get_xlim()))
@@ -62,7 +80,9 @@ def _plan(
     figure = new_figure(total_width, total_height)
     axes = figure.add_axes((0.7 / total_width, 1.1 / total_height, width / total_width, height / total_height))
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", facecolor=UNKNOWN)
+    # Rasters that reach beyond the limits must not widen them.
     axes.set_autoscale_on(False)
+    # Walls above cells: a cell is free only if all of its pixels are, but its square reaches over their edges.
     block = _block(image_map.frame)
     _show(axes, _map_raster(image_map, block), image_map.frame, zorder=0, block=block)
     for raster in (_painted(clean.free, REACHED), *letters):
@@ -80,10 +100,13 @@ def _limits(image_map: OccupancyMap, clean: CleanMap) -> tuple[tuple[float, floa
     """Metres (x, y) that hold the reachable part and all free parts but specks, and their walls."""
     frame = image_map.frame
     labels = component_labels(image_map.free)
+    # Specks of free space outside, from stray laser beams, would shrink the building to a corner of the picture.
     shown = (np.bincount(labels.ravel()) * frame.resolution**2 >= SPECK)[labels] & image_map.free
     rows, cols = np.nonzero(shown)
+    # Rows count from the top, metres from the bottom.
     low = (float(cols.min()), float(frame.height - 1 - rows.max()))
     high = (float(cols.max() + 1), float(frame.height - rows.min()))
+    # The map may be turned: limits in metres are those of the turned corners.
     corners = [_corners(frame, low, high), _corners(clean.frame, (0, 0), (clean.frame.width, clean.frame.height))]
     points = np.concatenate(corners)
     least, most = points.min(axis=0), points.max(axis=0)
@@ -134,6 +157,7 @@ def _wall_raster(image_map: OccupancyMap, block: int) -> UInt8[np.ndarray, "h w 
 
 def _any_in_blocks(pixels: Bool[np.ndarray, "H W"], block: int) -> Bool[np.ndarray, "h w"]:
     height, width = (-(-side // block) * block for side in pixels.shape)
+    # The last blocks are filled up with False, which changes no "any".
     padded = np.pad(pixels, ((0, height - pixels.shape[0]), (0, width - pixels.shape[1])))
     return np.asarray(padded.reshape(height // block, block, width // block, block).any(axis=(1, 3)))
 
@@ -182,6 +206,7 @@ def _labels_in_metres(family: RosMap, world: World, inches_per_cell: float) -> l
 def _scale_bar(axes: Axes, scale: float) -> None:
     """A bar of a round length above the right end of the map; ``scale`` is inches a metre."""
     (left, right), pixels = axes.get_xlim(), blended_transform_factory(axes.transData, axes.transAxes)
+    # The longest round length within a quarter of the width.
     length = max((bar for bar in SCALE_BARS if bar <= (right - left) / 4), default=SCALE_BARS[0])
     above = 1 + 0.14 / (axes.bbox.height / axes.figure.dpi)
     axes.plot(

@@ -28,6 +28,9 @@ def draw_panoramas(
         trial: the trial of the decision.
         decision: one whose policy looked (``decision.observations`` is not empty).
         panoramas: by the number of the decision at which they were taken, in the frame of the map.
+
+    Returns:
+        The figure: panoramas on the left, the estimator's answers about each subgoal on the right.
     """
     count = len(decision.subgoals)
     figure = new_figure(12.0, 0.7 + 1.75 * count)
@@ -41,6 +44,7 @@ def draw_panoramas(
         picture, text = figure.add_subplot(grid[subgoal, 0]), figure.add_subplot(grid[subgoal, 1])
         _draw_rolled(picture, panoramas[look], origin, decision.subgoals[subgoal])
         mark = "chosen: " if subgoal in chosen else ""
+        # A subgoal keeps its estimates until it is seen anew, possibly from elsewhere.
         when = "now" if look == decision.index else f"at decision {look}"
         picture.set_title(
             f"{mark}s{subgoal} at {decision.subgoals[subgoal]}, seen {when} from {origin}",
@@ -54,6 +58,7 @@ def draw_panoramas(
 
 
 def _draw_rolled(axes: Axes, panorama: np.ndarray, origin: tuple[int, int], subgoal: tuple[int, int]) -> None:
+    # From where the panorama was taken, not from where the robot is now.
     angle = bearing(jnp.asarray(origin, jnp.int32), jnp.asarray(subgoal, jnp.int32))
     rolled = np.asarray(roll_to(jnp.asarray(panorama), angle))
     axes.imshow(rolled, aspect="auto", interpolation="nearest")

@@ -54,6 +54,7 @@ mountReplay(document.getElementById("replay"), JSON.parse(document.getElementByI
 
 def embed_json(data: Any) -> str:
     """JSON that may stand within a script element, whatever texts it holds."""
+    # "</script" within a text would end the script; "<" as an escape cannot.
     return json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
@@ -75,6 +76,7 @@ def replay_data(trial: Trial, panoramas: Mapping[int, UInt8[np.ndarray, "rows co
     """What ``mountReplay`` shows, JSON-able."""
     task = task_of(trial)
     letters = np.asarray(trial.world.letters)
+    # Labelled cells are few: a list is shorter than a raster.
     labelled = np.argwhere(letters > 0)
     rows, columns = map_extent(trial.world)
     pixels = int(np.clip(min(MAP_PIXELS[0] // columns, MAP_PIXELS[1] // rows), 2, 24))
@@ -86,6 +88,7 @@ def replay_data(trial: Trial, panoramas: Mapping[int, UInt8[np.ndarray, "rows co
         "labels": [{"name": label.name, "x": label.centre[0], "y": label.centre[1]} for label in labels],
         "width": int(letters.shape[1]),
         "occupied": _base64(np.asarray(trial.world.occupied, np.uint8)),
+        # Little-endian, as JavaScript's typed arrays are on every machine that runs a browser.
         "first_seen": _base64(np.asarray(trial.first_seen, "<i4")),
         "letters": [[int(row), int(column), int(letters[row, column])] for row, column in labelled],
         "propositions": list(trial.propositions),

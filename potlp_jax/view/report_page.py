@@ -39,7 +39,18 @@ class Cell:
 
 
 def report_page(title: str, facts: Sequence[tuple[str, str]], policies: Sequence[str], cells: Sequence[Cell]) -> str:
-    """A self-contained page. ``facts`` are pairs of a name and a text that say what was run and with what."""
+    """A self-contained page.
+
+    Args:
+        title: of the page.
+        facts: pairs of a name and a text that say what was run and with what.
+        policies: in the order of tables and legends.
+        cells: one section each.
+
+    Returns:
+        HTML with all styles, scripts, plots and replays.
+    """
+    # Filled by the sections: data of replays stand at the end, so that tables appear before megabytes are read.
     replays: list[str] = []
     sections = [_section(number, cell, policies, replays) for number, cell in enumerate(cells)]
     contents = "".join(
@@ -107,6 +118,7 @@ _COLUMNS = ("policy", "attainable savings", "95 % interval", "net savings", "sav
 
 def _table(table: Table, caption: str) -> str:
     head = "".join(f"<th scope=col>{name}</th>" for name in _COLUMNS)
+    # The known map is a bound, not a competitor.
     best = max((row.attainable_share for row in table.rows if row.policy != KNOWN_MAP), default=math.nan)
     body = ""
     for row in table.rows:
@@ -135,6 +147,7 @@ def _outcome_lines(outcomes: Mapping[str, Mapping[str, int]]) -> list[str]:
     counts = {
         policy: ", ".join(f"{count} {name}" for name, count in found.items()) for policy, found in outcomes.items()
     }
+    # The usual case, every trial satisfied, takes one line.
     if len(set(counts.values())) == 1:
         return [f"Every policy: {next(iter(counts.values()))}."]
     return [f"{policy}: {text}" for policy, text in counts.items()]
@@ -143,9 +156,11 @@ def _outcome_lines(outcomes: Mapping[str, Mapping[str, int]]) -> list[str]:
 def _losses(table: Table) -> str:
     """Where the savings come from, and where they are lost: to the planner, and to the estimator."""
     costs = {row.policy: row.mean_cost for row in table.rows}
+    # Without savings to attain, or without the oracle between, there is nothing to divide.
     if not {ORACLE, LEARNED} <= costs.keys() or not costs[BASELINE] > costs[KNOWN_MAP]:
         return ""
     whole = costs[BASELINE] - costs[KNOWN_MAP]
+    # The oracle plans with true answers: what it loses is the planner's, what is lost beyond it the estimator's.
     planner, estimator = costs[ORACLE] - costs[KNOWN_MAP], costs[LEARNED] - costs[ORACLE]
     saved = costs[BASELINE] - costs[LEARNED]
     return (

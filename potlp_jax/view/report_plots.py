@@ -35,10 +35,12 @@ def savings_by_world(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
     """What each policy saves against the baseline, worlds in order of it: few large savings, or many small ones."""
     figure, axes = _axes(5.2, 4.6)
     axes.axhline(0.0, color=FAINT, linewidth=1.0)
+    # Each world in the middle of its share of the axis.
     share = 100 * (np.arange(len(pairs)) + 0.5) / max(len(pairs), 1)
     for policy, style in policy_styles(policies).items():
         if policy == BASELINE:
             continue
+        # Sorted by policy: a curve shows a distribution, points of one column belong to different worlds.
         saved = np.sort([pair[BASELINE].cost - pair[policy].cost for pair in pairs])[::-1]
         axes.plot(share, saved, style.line, color=style.colour, linewidth=1.6, label=policy)
     axes.set(xlim=(0, 100), xlabel="worlds (%), most saved first", ylabel="saved against the baseline")
@@ -64,8 +66,10 @@ def _svg(figure: Figure) -> str:
     for axes in figure.axes:
         axes.patch.set_alpha(0.0)
     _recolour(figure)
+    # Text stays text and follows the page's font.
     text = figure_bytes(figure, "svg").decode()
     text = text[text.index("<svg") :]
+    # matplotlib writes colours in small letters; INK has none. The variable is that of the page's style sheet.
     return text.replace(INK, "currentColor").replace(FAINT.lower(), "var(--faint)")
 
 

@@ -17,6 +17,9 @@ from matplotlib.figure import Figure
 
 from potlp_jax.errors import PictureError
 
+# States against areas: at least 19 apart in CIELAB in normal sight and in the simulated colour deficiencies of
+# Machado et al. (2009), for lightness alone keeps them apart: 22 to 51 against 69 to 85. Neighbours in each list are
+# farther apart than later ones, because most tasks have few states and propositions.
 STATE_COLOURS: tuple[str, ...] = (
     "#0072B2",
     "#3C3C96",
@@ -48,6 +51,7 @@ QUIET = "#6E6E6E"
 """Small print: axes, captions, explanations."""
 
 FAINT = "#9A9A9A"
+# Magenta stands out from cool states and warm areas alike; nothing else has it.
 CHOSEN = "#E6007E"
 CHOSEN_ROW = "#FCE1F0"
 ROBOT = "#FFD400"
@@ -90,6 +94,7 @@ def policy_styles(policies: Iterable[str]) -> dict[str, PolicyStyle]:
     """
     shown = list(dict.fromkeys(policies))
     names = [*POLICY_COLOURS, *(policy for policy in shown if policy not in POLICY_COLOURS)]
+    # A policy of one's own never looks like a shipped one.
     colours = list(dict.fromkeys([*POLICY_COLOURS.values(), *SERIES_COLOURS]))
     styles = {
         name: PolicyStyle(colours[rank % len(colours)], MARKERS[rank % len(MARKERS)], LINES[rank % len(LINES)])
@@ -117,6 +122,7 @@ def rgb(colour: str) -> tuple[int, int, int]:
 def new_figure(width: float, height: float) -> Figure:
     """An empty white figure of the given size in inches, drawn by Agg."""
     figure = Figure(figsize=(width, height), dpi=DOTS_PER_INCH, facecolor="white")
+    # The canvas registers itself with the figure; without one matplotlib would import pyplot's.
     FigureCanvasAgg(figure)
     return figure
 

@@ -62,6 +62,7 @@ def draw_tree(tree: Mapping[str, Any], task: Task, title: str | None = None, *, 
     root = _Box(text, best=True, children=_children(tree, task, breadth, tree["visits"]))
     rows = _arrange(root, level=0, row=0.0)
     boxes = list(_walk(root))
+    # Wide enough for the key at least.
     width = max(7.0, 0.3 + LEVEL_INCHES * (1 + max(box.level for box in boxes)))
     heading = textwrap.wrap(title, int(width / 0.09)) if title else []
     top, bottom = 1.15 + 0.34 * len(heading), max(rows, 2.0) + 0.15
@@ -87,12 +88,14 @@ def _children(node: Mapping[str, Any], task: Task, breadth: int, simulations: in
             outcome = action[name]
             if outcome is None:
                 continue
+            # Following every action would fill walls: the tree grows by its breadth at each level.
             below = outcome["node"] if rank == 0 else None
             boxes.append(
                 _Box(
                     _outcome_text(action, task, outcome, name == "success"),
                     best=rank == 0,
                     success=name == "success",
+                    # How much of the search went there: probability times the action's share of simulations.
                     share=outcome["probability"] * action["visits"] / max(simulations, 1),
                     children=[] if below is None else _children(below, task, breadth, simulations),
                 )
@@ -115,6 +118,7 @@ def _then(outcome: Mapping[str, Any]) -> str:
     node = outcome["node"]
     if node is not None and node["accepting"]:
         return "done"
+    # Expanded by no simulation: the search has no opinion yet.
     if outcome["value"] is None:
         return "not tried"
     return "a dead end" if node is not None and node["dead_end"] else cost_text(outcome["value"])
@@ -128,6 +132,7 @@ def _arrange(box: _Box, level: int, row: float) -> float:
         return row + 1
     for child in box.children:
         row = _arrange(child, level + 1, row)
+    # Beside the middle of its children, as trees are usually drawn.
     box.height = (box.children[0].height + box.children[-1].height) / 2
     return row
 
@@ -144,6 +149,7 @@ def _draw_branch(axes: Axes, parent: _Box, child: _Box) -> None:
         [start, start + 0.05, end - 0.05, end],
         [parent.height, parent.height, child.height, child.height],
         color=CHOSEN if child.best else FAINT,
+        # The root makes rare branches visible.
         linewidth=0.7 + 4.0 * math.sqrt(child.share),
         linestyle="solid" if child.success else (0, (3, 1.5)),
         solid_capstyle="butt",

@@ -21,7 +21,7 @@ from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.best_first import BEST_FIRST
 from potlp_jax.planning.search.config import SearchConfig, UctConfig
 from potlp_jax.planning.search.graph import Tree
-from potlp_jax.planning.search.lockstep import Search, run_search
+from potlp_jax.planning.search.lockstep import SearchMethod, run_search
 from potlp_jax.planning.search.plan import Plan
 from potlp_jax.planning.search.uct import UCT, UctTree
 
@@ -66,6 +66,7 @@ def search_tree(
     Returns:
       The plan and the tree: ``Tree`` under ``SearchConfig``, ``UctTree`` under ``UctConfig``.
     """
+    # One problem is a batch of one: there is one kernel.
     problems, seeds, trees = jax.tree.map(lambda leaf: leaf[None], (problem, _seed(key), tree))
     return jax.tree.map(lambda leaf: leaf[0], run_search(_search_for(config), config, problems, seeds, trees))
 
@@ -119,6 +120,7 @@ def plan_within(
     _, warm = _first(problem, key, config=config)
     jax.block_until_ready(_more(problem, key, warm, config=config))
     spent, plan, tree = _timed(_first, problem, key, config=config)
+    # A round begins as long as time is left, so the last one may end late by its own length.
     while spent < seconds and float(plan.gap) > 0 and int(tree.size) < config.tree_capacity:
         step, plan, tree = _timed(_more, problem, key, tree, config=config)
         spent += step
@@ -131,7 +133,7 @@ def _timed(function: Any, *arguments: Any, config: SearchConfig | UctConfig) -> 
     return time.perf_counter() - began, plan, tree
 
 
-def _search_for(config: SearchConfig | UctConfig) -> Search:
+def _search_for(config: SearchConfig | UctConfig) -> SearchMethod:
     return UCT if isinstance(config, UctConfig) else BEST_FIRST
 
 

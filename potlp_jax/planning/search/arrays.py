@@ -16,6 +16,7 @@ _PerAction = TypeVar("_PerAction")
 
 def pack_rows(rows: Any) -> UInt32[Array, "A n"]:
     """All that a pytree of per-action arrays says of an action, as one row of bits: one lookup instead of many."""
+    # Floats and integers by their bits, flags as words: a bitcast keeps every value as it is.
     columns = []
     for leaf in jax.tree.leaves(rows):
         values = leaf.astype(jnp.uint32) if leaf.dtype == jnp.bool_ else leaf
@@ -25,7 +26,9 @@ def pack_rows(rows: Any) -> UInt32[Array, "A n"]:
 
 def unpack_rows(packed: UInt32[Array, "B n"], like: _PerAction) -> _PerAction:
     """Inverse of ``pack_rows`` for one action per batch entry; ``like`` is the batch of what was packed."""
+    # Only shapes and types of `like` are used.
     leaves, structure = jax.tree.flatten(like)
+    # In the order of `pack_rows`, which is that of the leaves.
     rows, start = [], 0
     for leaf in leaves:
         shape = leaf.shape[2:]
@@ -38,7 +41,9 @@ def unpack_rows(packed: UInt32[Array, "B n"], like: _PerAction) -> _PerAction:
 
 def uniform(seeds: UInt32[Array, "B 2"], simulation: Int32[Array, "B"], level: Int32[Array, ""]) -> Float32[Array, "B"]:
     """Uniform numbers in [0, 1) from a counter: 24 bits of a twice mixed hash of (seed, simulation, level)."""
+    # Odd constants: at one level every simulation has a counter of its own.
     counter = simulation.astype(jnp.uint32) * jnp.uint32(0x9E3779B9) + level.astype(jnp.uint32) * jnp.uint32(0x85EBCA77)
+    # Mixed twice, with the other half of the seed in between: nearby counters give unrelated bits.
     bits = mix(mix(seeds[:, 0] ^ counter) + seeds[:, 1])
     return (bits >> 8).astype(jnp.float32) * jnp.float32(2.0**-24)
 
@@ -74,6 +79,7 @@ def _combine(
     operation: Callable[[Array, Array], Array], values: Shaped[Array, "B A"], neutral: int | float
 ) -> Shaped[Array, "B w"]:
     """Reduce over actions up to a few columns, slice by slice: on CPU XLA vectorises that, but not whole rows."""
+    # 8 columns for up to 128 actions, so that at most 16 slices are combined.
     width = 8 * max(1, -(-values.shape[1] // 128))
     count = -(-values.shape[1] // width)
     padded = jnp.pad(values, ((0, 0), (0, count * width - values.shape[1])), constant_values=neutral)

@@ -33,7 +33,7 @@ from potlp_jax.planning.search.arrays import first_of_least, least_of_each, stat
 from potlp_jax.planning.search.config import SearchConfig
 from potlp_jax.planning.search.graph import NewNode, NodeValues, Tree, add_node, find, plant_tree
 from potlp_jax.planning.search.guess import Rule, guess_outcomes, make_rule
-from potlp_jax.planning.search.lockstep import Search
+from potlp_jax.planning.search.lockstep import SearchMethod
 from potlp_jax.planning.search.model import FAILURE, SUCCESS, Model, make_model
 from potlp_jax.planning.search.plan import Plan, plan_of_least_score
 from potlp_jax.task.relations import transitive_closure
@@ -74,10 +74,10 @@ class Context:
 
 @struct.dataclass(kw_only=True)
 class Path:
-    """Records of a descent by level, for the way up. Levels that a row did not reach hold the spare node.
+    """Records of a descent by level, for the backup. Levels that a row did not reach hold the spare node.
 
     The value of a node depends on the action taken there by ``Q = base + weight * v``, where ``v`` is the value of the
-    outcome that was followed, and on the others by ``rival``; likewise its bound. So the way up needs no lookup.
+    outcome that was followed, and on the others by ``rival``; likewise its bound. So the backup needs no lookup.
 
     Attributes:
       nodes: node left at each level.
@@ -106,6 +106,7 @@ class Path:
     @staticmethod
     def empty(depth: int, batch: int, spare: int) -> "Path":
         """Nothing recorded."""
+        # Separate arrays: stacked into one, XLA recomputed the step for each part (docs/results/dropped.md, "Search").
         floats = jnp.zeros((depth, batch), jnp.float32)
         return Path(
             nodes=jnp.full((depth, batch), spare, jnp.int32),
@@ -143,7 +144,7 @@ class Descent:
       success: its outcome that was followed.
       expands: True where the row left the graph: the outcome has no node yet.
       accepted: True where the outcome satisfies the task.
-      path: records for the way up.
+      path: records for the backup.
     """
 
     level: Int32[Array, ""]
@@ -185,7 +186,9 @@ def prepare(problems: PlanningProblem, seeds: UInt32[Array, "B 2"], config: Sear
     """
     del seeds
     model = make_model(problems)
+    # From travel and attempts alone: knowledge can only take actions away.
     reach = jax.vmap(_reachable_states)(model.tables)
+    # The rule values successes with the chances of the root, where nothing is known.
     terms = jax.vmap(terms_of_all)(model.tables, model.root)
     rule = make_rule(
         model.tables,
@@ -206,6 +209,7 @@ def prepare(problems: PlanningProblem, seeds: UInt32[Array, "B 2"], config: Sear
 
 def plant(context: Context, config: SearchConfig) -> Tree:
     """Graphs of the roots alone."""
+    # The root is a node like any other: its values are guesses until it is searched.
     root = _new_node(context, context.model.root, config)
     return plant_tree(context.model, root, config)
 
@@ -227,6 +231,7 @@ def simulate(context: Context, tree: Tree, config: SearchConfig) -> Tree:
     Returns:
       The graphs with at most one more node each; rows that are not open are unchanged.
     """
+    # Reads first, writes last: see the module.
     descent = _descend(context, tree, config)
     tree, leaf = _expand(context, tree, descent, config)
     return _count(_back_up(tree, descent, leaf), descent)
@@ -235,11 +240,12 @@ def simulate(context: Context, tree: Tree, config: SearchConfig) -> Tree:
 def choose(context: Context, tree: Tree) -> Plan:
     """The action of least Q at the root."""
     _, bound = _root_value(context, tree)
+    # Q, not the bound: the bound says where to look, Q what is believed. At the root nothing is pending.
     q_values = tree.q_values[:, Tree.ROOT]
     return plan_of_least_score(context.model, q_values, q_values, tree.root_visits, bound, tree.status)
 
 
-BEST_FIRST = Search(tree=Tree, prepare=prepare, plant=plant, is_open=is_open, simulate=simulate, choose=choose)
+BEST_FIRST = SearchMethod(tree=Tree, prepare=prepare, plant=plant, is_open=is_open, simulate=simulate, choose=choose)
 
 
 def _root_value(context: Context, tree: Tree) -> tuple[Float32[Array, "B"], Float32[Array, "B"]]:
@@ -254,6 +260,7 @@ def _descend(context: Context, tree: Tree, config: SearchConfig) -> Descent:
     nowhere = jnp.zeros((batch,), jnp.bool_)
     start = Descent(
         level=jnp.int32(0),
+        # Rows that have converged do not move, so that a row ends alike in any batch.
         active=is_open(context, tree),
         node=jnp.full((batch,), Tree.ROOT, jnp.int32),
         pending_cost=context.model.root.pending_cost,
@@ -261,6 +268,7 @@ def _descend(context: Context, tree: Tree, config: SearchConfig) -> Descent:
         success=nowhere,
         expands=nowhere,
         accepted=nowhere,
+        # Two descents never need each other's records, so their memory is used again by every simulation.
         path=Path.empty(config.max_depth, batch, tree.capacity),
     )
 
@@ -279,13 +287,14 @@ def _descend_once(context: Context, tree: Tree, descent: Descent) -> Descent:
     children = tree.children[rows, node, action]
     accepts = model.accepts[rows, action]
     step = _follow_gap(context, _attempt_at(model, tree, descent, selection), children, accepts, tree)
+    # An outcome that satisfies the task has no node: the descent ends there.
     child = children[rows, step.success.astype(jnp.int32)]
     accepted = moves & step.success & accepts
     expands = moves & ~accepted & (child == Tree.UNVISITED)
     deeper = moves & ~accepted & ~expands
     path = descent.path.record(
         descent.level,
-        # Rows that have ended write to the spare node on the way up.
+        # Rows that have ended write to the spare node during the backup.
         nodes=jnp.where(moves, node, tree.capacity),
         actions=action,
         inside=selection.inside,
@@ -299,6 +308,7 @@ def _descend_once(context: Context, tree: Tree, descent: Descent) -> Descent:
     )
     return Descent(
         level=descent.level + 1,
+        # A row without an action has arrived at a dead end, and ends at its node.
         active=deeper,
         node=jnp.where(deeper, child, node),
         pending_cost=jnp.where(deeper | expands, step.pending_cost, descent.pending_cost),
@@ -339,10 +349,13 @@ def _select_action(model: Model, tree: Tree, descent: Descent) -> _Selection:
         (tree.q_values[rows, node], tree.bounds[rows, node], tree.values[rows, node])
     )
     inside = model.stays_inside(tree.location[rows, node], tree.state[rows, node])
+    # Only actions that leave the unknown region pay the pending cost.
     score = bounds + jnp.where(inside, 0.0, descent.pending_cost[:, None])
     action, least = first_of_least(score)
     goes_inside = inside[rows, action]
     chosen = jnp.arange(score.shape[1], dtype=jnp.int32)[None, :] == action[:, None]
+    # The backup changes the chosen action's Q. With the least of the others of its kind, the new minimum is known
+    # without reading the row again.
     rivals = (inside == goes_inside[:, None]) & ~chosen
     rival, rival_bound = (
         least_of_each(jnp.where(rivals, values_of_actions, jnp.inf), jnp.inf)
@@ -382,6 +395,7 @@ class _Attempt:
 def _attempt_at(model: Model, tree: Tree, descent: Descent, selection: _Selection) -> _Attempt:
     """Look the terms of the selected actions up."""
     rows, node, action = model.rows, descent.node, selection.action
+    # The path costs of a node depend on its product state alone, so that nodes do not keep them.
     path_cost = model.tables.distance[rows, tree.location[rows, node], tree.state[rows, node], action]
     return _Attempt(
         path_cost=jnp.where(selection.inside, 0.0, path_cost),
@@ -426,6 +440,7 @@ def _follow_gap(
     success = chance * (success_value - success_bound) >= (1.0 - chance) * (failure_value - failure_bound)
     # Nothing is to be learnt from satisfying the task, and a certain success cannot fail.
     success = (success & ~accepts) | (chance >= 1.0)
+    # Eq. 3 without the part that the followed outcome contributes: that is added during the backup.
     known = attempt.path_cost + chance * attempt.success_cost + (1.0 - chance) * attempt.failure_cost
     weight, rest = jnp.where(success, chance, 1.0 - chance), jnp.where(success, 1.0 - chance, chance)
     return _Step(
@@ -445,6 +460,7 @@ def _outcome_value(
     pending_cost: Float32[Array, "B"],
 ) -> tuple[Float32[Array, "B"], Float32[Array, "B"]]:
     """Value and bound of an outcome: those of its node, or by the guess where there is none."""
+    # Index 0 where there is no child: read, and not used.
     values = tree.values_at(context.model.rows, jnp.maximum(child, 0))
     value, bound = values.on_arrival(pending_cost, context.model.dead_end_cost)
     new = child == Tree.UNVISITED
@@ -454,13 +470,16 @@ def _outcome_value(
 def _expand(context: Context, tree: Tree, descent: Descent, config: SearchConfig) -> tuple[Tree, Leaf]:
     """Add the node that the descent reached, unless another order of the same events has led there before."""
     model = context.model
+    # Rows that do not expand compute a history too; nothing of it is kept.
     parent = tree.history(model.rows, descent.node, descent.pending_cost)
     history = model.step(parent, descent.action, descent.success)
+    # Computed for all rows in lockstep, also for those that find an existing node.
     node = _new_node(context, history, config)
     lookup = find(tree, history, context.relevant)
     is_new = descent.expands & (lookup.node == Tree.UNVISITED)
     # Where a row ends without a new node: the node that it found, or the last one of a descent that was cut.
     end = jnp.where(descent.expands, jnp.maximum(lookup.node, 0), descent.node)
+    # Read before the new node is written: all reads come before all writes.
     existing = tree.values[model.rows, end]
     tree, values, added = add_node(tree, model, node, history, lookup, is_new)
     values = NodeValues.unpack(jnp.where(is_new[:, None], values.pack(), existing))
@@ -492,6 +511,7 @@ def _new_node(context: Context, history: History, config: SearchConfig) -> NewNo
         terms.success_cost,
         config.guess_failures,
     )
+    # Eq. 3 with guessed values, and the same with the guesses reduced by the optimism.
     known = terms.distance + chance * terms.success_cost + (1.0 - chance) * terms.failure_cost
     guessed = chance * success_values + (1.0 - chance) * failure_values
     return NewNode(
@@ -511,12 +531,14 @@ def _back_up(tree: Tree, descent: Descent, leaf: Leaf) -> Tree:
     def ascend(carry):
         level, value, bound, tree = carry
         step = jax.tree.map(lambda records: records[level], descent.path)
+        # Rows with a shorter descent wait at their leaf until the level of their last action.
         taken = step.nodes < tree.capacity
         q_value, low = step.base + step.weight * value, step.base_bound + step.weight * bound
         values = _with_action(step, q_value, low)
         value = jnp.where(taken, jnp.minimum(step.pending_cost + values.leave, values.stay), value)
         bound = jnp.where(taken, jnp.minimum(step.pending_cost + values.leave_bound, values.stay_bound), bound)
 
+        # One node per row, so that no index occurs twice.
         def write(array: Array, new: Array, *index: Array) -> Array:
             return array.at[rows, step.nodes, *index].set(new, mode="drop", unique_indices=True)
 
@@ -538,6 +560,7 @@ def _back_up(tree: Tree, descent: Descent, leaf: Leaf) -> Tree:
 
 def _with_action(step: Path, q_value: Float32[Array, "B"], bound: Float32[Array, "B"]) -> NodeValues:
     """What a node passes up once the action taken there has this Q and bound; ``step`` is one level of a path."""
+    # The other kind of action is as it was; a descent touches one action of a node.
     before = NodeValues.unpack(step.values)
     least, least_bound = jnp.minimum(step.rival, q_value), jnp.minimum(step.rival_bound, bound)
     return NodeValues(
@@ -553,6 +576,7 @@ def _count(tree: Tree, descent: Descent) -> Tree:
     """Count the descent and its actions, in the rows that took one."""
     rows, first = jnp.arange(tree.size.shape[0], dtype=jnp.int32), descent.path.nodes[0]
     moved = first < tree.capacity
+    # An index behind the last action: the write is dropped.
     action = jnp.where(moved, descent.path.actions[0], tree.root_visits.shape[1])
     return dataclasses.replace(
         tree,
@@ -564,6 +588,7 @@ def _count(tree: Tree, descent: Descent) -> Tree:
 
 def _optimism(problems: PlanningProblem, config: SearchConfig) -> Float32[Array, "B"]:
     """``SearchConfig.optimism`` of each problem; by its number of actions where the configuration names none."""
+    # A Python value of the configuration is known when the search is compiled.
     subgoals = jnp.sum(problems.subgoal_mask, axis=1, dtype=jnp.int32)
     if config.optimism is not None:
         return jnp.full(subgoals.shape, config.optimism, jnp.float32)
@@ -577,6 +602,7 @@ def _reachable_states(tables: ActionTables) -> Bool[Array, "Z Z"]:
     rows, states = tables.actions, tables.accepting.shape[0]
     own = jnp.arange(states, dtype=jnp.int32)
     attempts = rows.from_state[:, None] == own[None, :]
+    # A path that ends where an action is attempted in z' leads from z to z', from whichever node it starts.
     travels = jnp.any(jnp.any(jnp.isfinite(tables.distance), axis=0)[:, :, None] & attempts[None, :, :], axis=1)
     succeeds = jnp.any(attempts[:, :, None] & (rows.to_state[:, None] == own[None, :])[:, None, :], axis=0)
     return transitive_closure(travels | succeeds | (own[:, None] == own[None, :]))
@@ -589,6 +615,7 @@ def _relevant_conditions(tables: ActionTables, reach: Bool[Array, "Z Z"]) -> UIn
     """
     rows = tables.actions
     attempts = rows.from_state[:, None] == jnp.arange(reach.shape[0], dtype=jnp.int32)[None, :]
+    # A condition matters in a state if an action that tries it can still be reached from there.
     useful = jnp.any(reach[:, None, :] & attempts[None, :, :], axis=2)
     bits = jnp.where(useful[:, :, None], rows.condition_bits[None], jnp.uint32(0))
     combined = jax.lax.reduce(bits, jnp.uint32(0), jax.lax.bitwise_or, (1,))

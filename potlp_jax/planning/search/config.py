@@ -84,6 +84,7 @@ class UctConfig:
 
 
 def _check_kind(config: SearchConfig | UctConfig, kind: str) -> None:
+    # A wrong kind would be written to records, and read back as another search.
     if config.kind != kind:
         raise ValueError(f"{type(config).__name__}.kind is {config.kind!r}, must be {kind!r}")
 

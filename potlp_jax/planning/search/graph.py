@@ -24,7 +24,7 @@ from potlp_jax.planning.search.model import Model
 PROBES: int = 8
 """Consecutive slots of the hash table in which a history may be found. Where all are taken the node is not entered: it
 is then not shared between orders, which costs simulations but no correctness. At most half of the slots are taken, so
-that eight in a row are rare; the number was not tuned."""
+that eight in a row are rare. No experiment on the number is recorded."""
 
 KEY_WORDS: int = 2
 """Words of a history's key in the hash table; the node's index follows them. Two of ten thousand histories of one tree
@@ -58,6 +58,7 @@ class NodeValues:
     @staticmethod
     def unpack(row: Float32[Array, "*B 5"]) -> "NodeValues":
         """From rows of ``Tree.values``."""
+        # The one place that knows the order of the columns, with `pack`.
         leave, stay, leave_bound, stay_bound, visits = jnp.moveaxis(row, -1, 0)
         return NodeValues(leave=leave, stay=stay, leave_bound=leave_bound, stay_bound=stay_bound, visits=visits)
 
@@ -67,6 +68,7 @@ class NodeValues:
         """Value and bound of a history that arrives at the node with this pending cost."""
 
         def least(leave: Array, stay: Array) -> Array:
+            # Leaving pays the pending cost, staying inside does not. A node without any action is a dead end.
             best = jnp.minimum(pending_cost + leave, stay)
             return jnp.where(jnp.isinf(best), dead_end_cost, best)
 
@@ -176,6 +178,7 @@ def plant_tree(model: Model, root: NewNode, config: SearchConfig) -> Tree:
     Returns:
       One tree per row.
     """
+    # Nodes beyond `size` are never read, but inf keeps the spare node from ever looking cheap.
     values = least_values(model, root.q_values, root.bounds, model.root)
     batch, actions = root.q_values.shape
 
@@ -262,15 +265,19 @@ def find(tree: Tree, history: History, relevant: UInt32[Array, "B Z W"]) -> Look
       Where it is in the table.
     """
     key = _key(history, relevant)
+    # The number of slots is a power of two: the lowest bits of the key choose one.
     slots = tree.table.shape[1] - PROBES
     first = key[:, 0] & (slots - 1)
+    # One slice per row instead of eight lookups.
     window = jax.vmap(lambda table, start: jax.lax.dynamic_slice(table, (start, 0), (PROBES, KEY_WORDS + 1)))(
         tree.table, first
     )
     keys, nodes = window[:, :, :KEY_WORDS], window[:, :, KEY_WORDS]
+    # An empty slot holds -1 in its key too, which a history's key may equal: the node decides.
     same = jnp.all(keys == key[:, None, :], axis=2) & (nodes != Tree.UNVISITED)
     node = jnp.max(jnp.where(same, nodes, Tree.UNVISITED), axis=1)
     offsets = jnp.arange(PROBES, dtype=jnp.int32)[None, :]
+    # Where no slot is free the index lies behind the table, and the write is dropped.
     empty = jnp.min(jnp.where(nodes == Tree.UNVISITED, offsets, slots + PROBES), axis=1)
     return Lookup(node=node, entry_key=key, slot=first + empty)
 
@@ -286,11 +293,13 @@ def _key(history: History, relevant: UInt32[Array, "B Z W"]) -> Int32[Array, "B 
     # Conditions that no later choice depends on do not tell histories apart.
     usable = relevant[rows, history.state][:, None, :]
     holds, fails = history.holds & usable, history.fails & usable
+    # Each word's position enters its hash: the same bits at another subgoal are other knowledge.
     number = jnp.arange(holds.shape[1] * holds.shape[2], dtype=jnp.uint32).reshape(1, *holds.shape[1:])
     where = jnp.arange(history.visited.shape[1] * history.visited.shape[2], dtype=jnp.uint32)
     visited = mix(history.visited ^ mix(where.reshape(1, *history.visited.shape[1:]) + jnp.uint32(0x51ED270B)))
     position = mix((history.location * 64 + history.state).astype(jnp.uint32) + jnp.uint32(0x2545F491))
     words = []
+    # Two words from the same parts with different salts, so that both must collide.
     for salt in (0x9E3779B9, 0xC2B2AE3D):
         mixed = mix(mix(holds + number * jnp.uint32(salt)) ^ (fails * jnp.uint32(0x85EBCA77) + jnp.uint32(salt)))
         total = jnp.sum(mixed, axis=(1, 2), dtype=jnp.uint32) + jnp.sum(visited, axis=(1, 2), dtype=jnp.uint32)
@@ -340,10 +349,11 @@ def add_node(
         holds=write(tree.holds, history.holds),
         fails=write(tree.fails, history.fails),
         visited=write(tree.visited, history.visited),
+        # Entered in the table only where it was added; elsewhere the index lies behind the table.
         table=write(tree.table, entry, jnp.where(added, lookup.slot, tree.table.shape[1])),
         size=tree.size + added.astype(jnp.int32),
     )
     # Read back what was written: XLA would compute rows that are still to be written anew for each minimum over them,
-    # which made the search up to ten times slower (docs/results/planner.md, "What did not work").
+    # which made the search up to ten times slower (docs/results/dropped.md, "Search").
     values = least_values(model, tree.q_values[rows, index], tree.bounds[rows, index], history)
     return dataclasses.replace(tree, values=write(tree.values, values.pack())), values, added

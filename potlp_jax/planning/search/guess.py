@@ -25,12 +25,12 @@ from potlp_jax.planning.search.arrays import first_of_least
 from potlp_jax.types import NO_STATE
 
 NEGLIGIBLE: float = 1e-3
-"""A chain is cut where the probability of getting there is below this; the rest counts as a dead end. With the default
-dead-end cost, 4 (H + W) cells, the error is a fraction of a cell. Not tuned."""
+"""A chain is cut where the probability of getting there is below this; the rest counts as a dead end. So the error is
+below a thousandth of the dead-end cost. No experiment on it is recorded."""
 
 PASSES: int = 4
 """How often the successes are valued where the automaton has cycles. Without cycles each is valued once, the last
-first, and is then final. Not tuned: a cycle needs two successes, so each pass sees one round more."""
+first, and is then final; in a cycle each pass adds one round. No experiment on the number is recorded."""
 
 
 @struct.dataclass(kw_only=True)
@@ -188,6 +188,7 @@ def guess_outcomes(
       The guess after failure and the guess after success, the costs that are then pending included.
     """
     rows = jnp.arange(product_state.shape[0], dtype=jnp.int32)
+    # What has been learnt enters the chances and costs here. The values after successes stay those of the root.
     attempt_cost = _attempt_cost(rule, rows, chance, success_cost)
     starts = _Starts(
         problem=rows,
@@ -198,6 +199,7 @@ def guess_outcomes(
         attempt_cost=attempt_cost,
     )
     chain = _follow_chain(rule, starts, length)
+    # An action that the chain does not contain leaves it whole.
     whole = jnp.broadcast_to(chain.rest[0][:, None], available.shape)
     without = whole.at[rows[None, :], chain.action].set(_costs_without(chain), mode="drop", unique_indices=True)
     return without + _cost_to_begin_elsewhere(rule, starts, chain), rule.after_success
@@ -207,6 +209,7 @@ def _costs_without(chain: _Chain) -> Float32[Array, "L N"]:
     """Expected cost of each chain with the action of one level left out."""
 
     def skip(carry, level):
+        # What the levels before cost, and then the rest of the chain behind the level that is left out.
         spent, reached = carry
         left_out = spent + reached * chain.rest[level + 1]
         return (spent + reached * chain.cost[level], reached * (1.0 - chain.chance[level])), left_out
@@ -220,6 +223,7 @@ def _cost_to_begin_elsewhere(rule: Rule, starts: _Starts, chain: _Chain) -> Floa
     """How much more the chain's first step costs from where each action fails than from where the history is."""
     rows, actions = starts.problem, starts.available.shape[1]
     first = chain.action[0]
+    # A chain that is empty has the index A; its cost is not used.
     start = jnp.minimum(first, actions - 1)
     cost_here = chain.cost[0] - starts.attempt_cost[rows, start]
     product_states = jnp.maximum(rule.product_states, 0)
@@ -250,6 +254,7 @@ class _Order:
 
 def _order_of_successes(tables: ActionTables, reach: Bool[Array, "R Z Z"], subgoals: int, edges: int) -> _Order:
     rows, count, states = tables.actions, reach.shape[0], reach.shape[1]
+    # Edges have the same ends at every subgoal.
     targets = jnp.max(rows.to_state[:, :-1].reshape(count, subgoals, edges), axis=1)
     is_final = jnp.all(rows.accepts[:, :-1].reshape(count, subgoals, edges), axis=1) | (targets < 0)
     # The fewer states a state can get to, the nearer it is to the end.
@@ -276,21 +281,26 @@ def _value_successes(
     count, actions = rule.product_states.shape
     states, subgoals = reach.shape[1], tables.distance.shape[1] - 1
     edges = (actions - 1) // max(subgoals, 1)
+    # No subgoals or no edges: finish alone.
     if edges == 0:
         return rule
     order = _order_of_successes(tables, reach, subgoals, edges)
+    # The batch runs as long as the problem with most edges to value.
     todo = jnp.max(jnp.sum(~order.is_final, axis=1, dtype=jnp.int32))
+    # One chain per problem and subgoal, all subgoals of one problem side by side.
     problem = jnp.repeat(jnp.arange(count, dtype=jnp.int32), subgoals)
     subgoal = jnp.tile(jnp.arange(subgoals, dtype=jnp.int32), count)
     chances, costs, tried = chance[problem], success_cost[problem], chance[problem] > 0
 
     def value_edge(step, after_success):
+        # Later edges see the values of earlier ones, which lie nearer to acceptance.
         edge = order.edges[problem, step % jnp.maximum(todo, 1)]
         action = subgoal * edges + edge
         now = dataclasses.replace(rule, after_success=after_success)
         starts = _Starts(
             problem=problem,
             product_state=subgoal * states + jnp.maximum(order.targets[problem, edge], 0),
+            # After the success the rollout is beyond the subgoal, in the state that the edge ends in.
             pending_cost=success_cost[problem, action],
             available=tried,
             chance=chances,
@@ -323,6 +333,7 @@ def _follow_chain(rule: Rule, starts: _Starts, length: int) -> _Chain:
         active=jnp.ones((count,), jnp.bool_),
         product_state=starts.product_state,
         pending_cost=starts.pending_cost,
+        # Divided once here instead of at every level.
         inverse_chance=jnp.where(starts.available, 1.0 / starts.chance, jnp.inf),
         reached=jnp.ones((count,), jnp.float32),
         action=jnp.full((length, count), actions, jnp.int32),
@@ -334,9 +345,11 @@ def _follow_chain(rule: Rule, starts: _Starts, length: int) -> _Chain:
     )
 
     def add(rest, level):
+        # From the chain's end backward. Levels that a chain did not reach cost nothing and cannot succeed.
         rest = walk.cost[level] + (1.0 - walk.chance[level]) * rest
         return rest, rest
 
+    # A chain that is cut, or that has no action left, ends at a dead end.
     end = rule.dead_end_cost[starts.problem]
     _, rest = jax.lax.scan(add, end, jnp.arange(length, dtype=jnp.int32), reverse=True)
     return _Chain(action=walk.action, cost=walk.cost, chance=walk.chance, rest=jnp.concatenate([rest, end[None]]))
@@ -349,12 +362,14 @@ def _fail_once(rule: Rule, starts: _Starts, walk: _Walk) -> _Walk:
     product_states = rule.product_states[problem]
     path_cost = rule.path_costs[problem, walk.product_state]
     inside = product_states == walk.product_state[:, None]
+    # D of every action from the chain's head, as in `history.distance_of`.
     distance = jnp.where(inside, 0.0, path_cost + walk.pending_cost[:, None])
     ratio = jnp.where(jnp.isinf(walk.inverse_chance), jnp.inf, (distance + starts.attempt_cost) * walk.inverse_chance)
     # Without the barrier XLA would compute the ratios anew for each minimum over them.
     action, least = first_of_least(jax.lax.optimization_barrier(ratio))
     moves = walk.active & ~jnp.isinf(least)
     chance = starts.chance[number, action]
+    # The chain follows the failure.
     reached = walk.reached * (1.0 - chance)
 
     def record(array: Array, new: Array) -> Array:
@@ -368,6 +383,7 @@ def _fail_once(rule: Rule, starts: _Starts, walk: _Walk) -> _Walk:
         inverse_chance=jnp.where(rule.closes[problem, action], jnp.inf, walk.inverse_chance),
         reached=reached,
         action=record(walk.action, jnp.where(moves, action, actions)),
+        # The ratio times the chance gives the cost back.
         cost=record(walk.cost, jnp.where(moves, least * chance, 0.0)),
         chance=record(walk.chance, jnp.where(moves, chance, 0.0)),
     )

@@ -47,6 +47,7 @@ class _TreeViewer:
         q_values = self._q_values[index]
         if not self._q_includes_pending_cost:
             q_values = q_values + self._paid(history)
+        # Stable, so that ties keep the order of their indices.
         order = [int(a) for a in np.argsort(q_values, kind="stable")[: self._width] if np.isfinite(q_values[a])]
         actions = [self._action(index, a, float(q_values[a]), terms, history, depth) for a in order if depth > 0]
         accepting, dead_end = bool(self._accepting[int(history.state)]), bool(np.isinf(q_values).all())
@@ -82,6 +83,7 @@ class _TreeViewer:
     def _action(
         self, index: int, action: int, q_value: float, terms: ActionTerms, history: History, depth: int
     ) -> dict[str, Any]:
+        # Problems without edges have the finish action alone.
         finish = action == self._problem.action_count - 1
         subgoal, edge = divmod(action, max(self._problem.edge_count, 1))
         ends = [None, None] if finish else np.asarray(self._problem.task.edges)[edge].tolist()
@@ -108,6 +110,7 @@ class _TreeViewer:
         }
 
     def _outcome(self, index: int, action: int, success: bool, history: History, depth: int) -> dict[str, Any]:
+        # An outcome that satisfies the task has no node in the tree; here it gets one, to be drawn.
         after = _step(self._problem, history, jnp.int32(action), jnp.asarray(success))
         if self._accepting[int(after.state)]:
             satisfied = {"value": 0.0, "visits": 0, "accepting": True, "dead_end": False, "actions": []}

@@ -1,7 +1,7 @@
 """How a search runs: in lockstep on all rows of a batch, to which ``jax.vmap`` is routed.
 
-A search is four verbs on a batch of problems (``Search``). The functions here know nothing of what the verbs do, so
-that a test can run them on a search of its own.
+A search is five verbs on a batch of problems (``SearchMethod``). The functions here know nothing of what the verbs do,
+so that a test can run them on a search of its own.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from potlp_jax.planning.search.plan import Plan
 
 
 @dataclasses.dataclass(frozen=True)
-class Search:
+class SearchMethod:
     """A search as verbs. All arrays have a leading batch axis; every verb is pure.
 
     Attributes:
@@ -39,7 +39,7 @@ class Search:
 
 
 def run_search(
-    search: Search, config: Any, problems: PlanningProblem, seeds: UInt32[Array, "B 2"], trees: Any
+    search: SearchMethod, config: Any, problems: PlanningProblem, seeds: UInt32[Array, "B 2"], trees: Any
 ) -> tuple[Plan, Any]:
     """Search a batch of problems; ``jax.vmap`` of this adds its axis to the batch.
 
@@ -61,7 +61,7 @@ def run_search(
 
 
 @functools.lru_cache(maxsize=64)
-def _routed_kernel(search: Search, config: Any, structure: Any, leaf_count: int) -> Callable[..., Any]:
+def _routed_kernel(search: SearchMethod, config: Any, structure: Any, leaf_count: int) -> Callable[..., Any]:
     """The search on flat lists of arrays with a leading batch axis; vmap merges its own axis into that one.
 
     Flat lists, because the rule of a ``custom_vmap`` receives and returns flags in the structure of its arguments, and
@@ -70,6 +70,7 @@ def _routed_kernel(search: Search, config: Any, structure: Any, leaf_count: int)
 
     @jax.custom_batching.custom_vmap
     def kernel(seeds, *arrays):
+        # The problem's leaves, and after them the tree's, where there is one.
         leaves, trees = arrays[:leaf_count], arrays[leaf_count:]
         problems = jax.tree.unflatten(structure, leaves)
         tree = _from_arrays(search.tree, trees) if trees else None
@@ -78,10 +79,12 @@ def _routed_kernel(search: Search, config: Any, structure: Any, leaf_count: int)
 
     @kernel.def_vmap
     def merge_axes(axis_size, in_batched, *arrays):
+        # What is not batched is repeated: the kernel has one batch axis for all of its arguments.
         full = [
             array if batched else jnp.broadcast_to(array[None], (axis_size, *array.shape))
             for array, batched in zip(arrays, in_batched, strict=True)
         ]
+        # Merged with the axis of an outer vmap, if there is one: nesting ends in one kernel all the same.
         rows = full[0].shape[0] * full[0].shape[1]
         results = kernel(*[array.reshape(rows, *array.shape[2:]) for array in full])
         split = [result.reshape(axis_size, rows // max(axis_size, 1), *result.shape[1:]) for result in results]
@@ -92,12 +95,14 @@ def _routed_kernel(search: Search, config: Any, structure: Any, leaf_count: int)
 
 @functools.partial(jax.jit, static_argnames=("search", "config"))
 def _search_batch(
-    problems: PlanningProblem, seeds: UInt32[Array, "B 2"], tree: Any, *, search: Search, config: Any
+    problems: PlanningProblem, seeds: UInt32[Array, "B 2"], tree: Any, *, search: SearchMethod, config: Any
 ) -> tuple[Plan, Any]:
     """Simulate until no row is open or the simulations are spent, then choose."""
+    # Not part of the tree: a search that goes on prepares again, which costs a fraction of a search.
     context = search.prepare(problems, seeds, config)
     tree = search.plant(context, config) if tree is None else tree
 
+    # The loop ends with its slowest row; rows that have ended do nothing in between.
     def unfinished(carry: tuple[Array, Any]) -> Array:
         count, tree = carry
         return (count < config.simulations) & jnp.any(search.is_open(context, tree))

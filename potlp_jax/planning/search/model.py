@@ -85,6 +85,7 @@ def make_model(problems: PlanningProblem) -> Model:
     rows, states = tables.actions, tables.accepting.shape[1]
     # Finish is attempted nowhere: S * Z + NO_STATE would be the last subgoal in the last state.
     where = jnp.where(rows.from_state == NO_STATE, NOWHERE, rows.subgoal * states + rows.from_state)
+    # Bit for bit the same tables twice: by column for the minima over actions, by row for the one that is taken.
     return Model(
         tables=tables,
         packed=jax.vmap(pack_rows)(rows),

@@ -65,13 +65,16 @@ def plan_of_least_score(
     finish = model.finish
     index = jnp.arange(finish + 1, dtype=jnp.int32)[None, :]
     available = jnp.any(jnp.isfinite(q_values), axis=1)
+    # The minimum, then the first index that attains it: ties go to the lowest index.
     action = jnp.min(jnp.where(score <= jnp.min(score, axis=1)[:, None], index, finish), axis=1)
     attempts = available & (action != finish)
     row = model.action_rows(action)
+    # A satisfied root has no action either, but costs nothing.
     accepted = jnp.take_along_axis(model.tables.accepting, model.root.state[:, None], axis=1)[:, 0]
     rows = jnp.arange(action.shape[0], dtype=jnp.int32)
     value = jnp.where(available, q_values[rows, action], model.dead_end_cost)
     value = jnp.where(accepted, 0.0, value)
+    # Relative to the value; where that is 0 nothing is divided.
     gap = (value - root_bound) / jnp.where(value > 0, value, 1.0)
     ended = status_of_rows(accepted, Status.ACCEPTING_ROOT) | status_of_rows(~available & ~accepted, Status.DEAD_END)
     return Plan(

@@ -30,7 +30,7 @@ from potlp_jax.planning.history import ActionTerms, History, terms_of_all
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.arrays import first_of_least, status_of_rows, uniform
 from potlp_jax.planning.search.config import UctConfig
-from potlp_jax.planning.search.lockstep import Search
+from potlp_jax.planning.search.lockstep import SearchMethod
 from potlp_jax.planning.search.model import Model, make_model
 from potlp_jax.planning.search.plan import Plan, plan_of_least_score
 from potlp_jax.types import Status
@@ -47,6 +47,7 @@ class UctTree:
         are none, inf where the action is not available.
       visits: rollouts that took each action.
       node_visits: rollouts that took any.
+      dead_end: True where a node has no action.
       distances: D of each action, the pending cost included.
       chances: P_S of each action.
       success_costs: R_S of each action.
@@ -67,6 +68,7 @@ class UctTree:
     q_values: Float32[Array, "*B N A"]
     visits: Int32[Array, "*B N A"]
     node_visits: Int32[Array, "*B N"]
+    dead_end: Bool[Array, "*B N"]
     distances: Float32[Array, "*B N A"]
     chances: Float32[Array, "*B N A"]
     success_costs: Float32[Array, "*B N A"]
@@ -132,7 +134,7 @@ class Rollout:
       nodes: node left at each level; the spare node where the row had ended.
       actions: action taken at each level.
       costs: sampled cost of each action, ``D + R_S`` or ``D + R_F``.
-      means: Q of each action before the rollout. Recorded on the way down, so that the way up only writes: XLA then
+      means: Q of each action before the rollout. Recorded on the way down, so that the backup only writes: XLA then
         updates the tree in place.
       visits: rollouts that had taken each action before.
     """
@@ -182,6 +184,7 @@ def prepare(problems: PlanningProblem, seeds: UInt32[Array, "B 2"], config: UctC
 def plant(context: Context, config: UctConfig) -> UctTree:
     """Trees of the roots alone."""
     model = context.model
+    # P_S and R_S depend on what is known, so every node keeps its own.
     terms = jax.vmap(terms_of_all)(model.tables, model.root)
     batch, actions = terms.distance.shape
 
@@ -193,6 +196,7 @@ def plant(context: Context, config: UctConfig) -> UctTree:
         q_values=first(_new_q_values(terms), jnp.inf),
         visits=jnp.zeros((batch, config.capacity + 1, actions), jnp.int32),
         node_visits=jnp.zeros((batch, config.capacity + 1), jnp.int32),
+        dead_end=first(~jnp.any(terms.available, axis=1)),
         distances=first(terms.distance),
         chances=first(terms.success_probability),
         success_costs=first(terms.success_cost),
@@ -231,12 +235,13 @@ def choose(context: Context, tree: UctTree) -> Plan:
     """The most visited action at the root."""
     # An action that was never taken has no mean; where there are more actions than rollouts some are not.
     q_values = jnp.where(tree.root_visits > 0, tree.q_values[:, UctTree.ROOT], jnp.inf)
+    # The most visited one, not the one of least mean: a mean over few rollouts may be low by chance.
     score = jnp.where(jnp.isinf(q_values), jnp.inf, -tree.root_visits.astype(jnp.float32))
     no_bound = jnp.full(score.shape[:1], -jnp.inf, jnp.float32)
     return plan_of_least_score(context.model, score, q_values, tree.root_visits, no_bound, tree.status)
 
 
-UCT = Search(tree=UctTree, prepare=prepare, plant=plant, is_open=is_open, simulate=simulate, choose=choose)
+UCT = SearchMethod(tree=UctTree, prepare=prepare, plant=plant, is_open=is_open, simulate=simulate, choose=choose)
 
 
 def _new_q_values(terms: ActionTerms) -> Float32[Array, "B A"]:
@@ -278,8 +283,10 @@ def _descend_once(context: Context, tree: UctTree, rollout: Rollout, config: Uct
     moves = rollout.active & available
     # The simulation's number is the row's own: rows of a batch that end at different times do not share samples.
     success = uniform(context.seeds, tree.simulations, level) < tree.chances[rows, node, action]
+    # What is sampled is the cost of Eq. 3: D, then R_S or R_F.
     costs = tree.success_costs[rows, node, action], model.tables.actions.failure_cost[rows, action]
     cost = tree.distances[rows, node, action] + jnp.where(success, *costs)
+    # An outcome that satisfies the task has no node: the rollout ends there.
     child = tree.children[rows, node, action, success.astype(jnp.int32)]
     accepted = moves & success & model.accepts[rows, action]
     expands = moves & ~accepted & (child == UctTree.UNVISITED)
@@ -290,6 +297,7 @@ def _descend_once(context: Context, tree: UctTree, rollout: Rollout, config: Uct
 
     return Rollout(
         level=level + 1,
+        # A row without an action has arrived at a dead end, and ends at its node.
         active=deeper,
         node=jnp.where(deeper, child, node),
         action=jnp.where(moves, action, rollout.action),
@@ -309,6 +317,7 @@ def _select_action(
 ) -> tuple[Int32[Array, "B"], Bool[Array, "B"]]:
     """UCB1 on costs: the action of least lower confidence bound, and whether there is one."""
     rows = model.rows
+    # Two rows and a number per level: as in the default search, the cost does not depend on the tree's size.
     q_values, visits, total = tree.q_values[rows, node], tree.visits[rows, node], tree.node_visits[rows, node]
     # log(n) with n >= 2: at the first visit every action is untried, and the width does not matter.
     log = jnp.log(jnp.maximum(total.astype(jnp.float32) + 1.0, 2.0))
@@ -325,11 +334,14 @@ def _expand(context: Context, tree: UctTree, rollout: Rollout) -> tuple[UctTree,
     history = model.step(tree.history(model.rows, rollout.node), rollout.action, rollout.success)
     terms = jax.vmap(terms_of_all)(model.tables, history)
     # A rollout that did not leave the tree ends at its last node: a dead end, or the depth limit.
-    q_values = jnp.where(rollout.expands[:, None], _new_q_values(terms), tree.q_values[model.rows, rollout.node])
-    dead = ~jnp.any(jnp.isfinite(q_values), axis=1) & ~rollout.accepted
+    # Kept per node: reading a row of Q values here, before they are written, would make XLA copy them all.
+    is_dead = ~jnp.any(terms.available, axis=1)
+    dead = jnp.where(rollout.expands, is_dead, tree.dead_end[model.rows, rollout.node]) & ~rollout.accepted
+    # A full tree: the rollout still counts, but its last outcome gets no node.
     added = rollout.expands & (tree.size < tree.capacity)
     index = jnp.where(added, tree.size, tree.capacity)
 
+    # Rows without a new node write to the spare one.
     def write(array: Array, new: Array) -> Array:
         return array.at[model.rows, index].set(new, mode="drop", unique_indices=True)
 
@@ -346,6 +358,7 @@ def _expand(context: Context, tree: UctTree, rollout: Rollout) -> tuple[UctTree,
         distances=write(tree.distances, terms.distance),
         chances=write(tree.chances, terms.success_probability),
         success_costs=write(tree.success_costs, terms.success_cost),
+        dead_end=write(tree.dead_end, is_dead),
         size=tree.size + added.astype(jnp.int32),
         status=tree.status | overflow,
         **{name: write(getattr(tree, name), getattr(history, name)) for name in _HISTORY_FIELDS},
@@ -361,6 +374,7 @@ def _back_up(tree: UctTree, rollout: Rollout, leaf: Leaf) -> UctTree:
         level, cost, tree = carry
         at = rows, rollout.nodes[level], rollout.actions[level]
         taken = rollout.nodes[level] < tree.capacity
+        # From the leaf on, what remained to be paid after each action.
         cost = jnp.where(taken, cost + rollout.costs[level], cost)
         visits, mean = rollout.visits[level] + 1, rollout.means[level]
         # Rows that had ended write to the spare node. Its mean is inf, which must not become NaN.
@@ -373,9 +387,11 @@ def _back_up(tree: UctTree, rollout: Rollout, leaf: Leaf) -> UctTree:
         )
         return level - 1, cost, tree
 
+    # Beyond the leaf the rollout costs nothing, or a dead end.
     start = (rollout.level - 1, leaf.value, tree)
     tree = jax.lax.while_loop(lambda carry: carry[0] >= 0, ascend, start)[2]
     moved = rollout.nodes[0] < tree.capacity
+    # The link of a node that was not added goes to the spare node.
     parent = jnp.where(leaf.child == UctTree.UNVISITED, tree.capacity, rollout.node)
     link = (rows, parent, rollout.action, rollout.success.astype(jnp.int32))
     return dataclasses.replace(
