@@ -59,6 +59,7 @@ def json_copy(value: Any) -> Any:
 
 
 def _json_value(value: Any) -> Any:
+    # json knows dict alone among the mappings; configurations hold read-only ones.
     if isinstance(value, Mapping):
         return dict(value)
     return value.value if isinstance(value, Enum) else str(value)
@@ -96,6 +97,7 @@ def read_settings(file: Path) -> Mapping[str, Any]:
     try:
         data = yaml.safe_load(file.read_text("utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
+        # YAML's messages have several lines.
         raise ConfigurationError(f"{file}: not YAML: {' '.join(str(error).split())}") from error
     if not isinstance(data, Mapping):
         raise ConfigurationError(f"{file}: give a mapping of names to values, found {_short(data)}")
@@ -110,6 +112,7 @@ def settings_from_words(words: Sequence[str]) -> dict[str, Any]:
     """
     settings: dict[str, Any] = {}
     for word in words:
+        # At the first "=": values may hold others.
         path, equals, text = word.partition("=")
         if not (path and equals):
             raise ConfigurationError(
@@ -157,6 +160,9 @@ def config_from_dict(kind: type[_Config], data: Any, where: str) -> _Config:
         data: the value of every field, nested mappings for nested configurations.
         where: what is read; begins the message of an error.
 
+    Returns:
+        An equal configuration to the one that was written.
+
     Raises:
         ConfigurationError: a field is missing, unknown, or has a value that does not fit.
     """
@@ -177,6 +183,9 @@ def with_settings(config: _Config, settings: Any, where: str = "settings") -> _C
             in place of such a configuration is its kind.
         where: what the settings are called; begins the message of an error.
 
+    Returns:
+        A configuration of the same class.
+
     Raises:
         ConfigurationError: a field is unknown, or has a value that does not fit.
     """
@@ -190,6 +199,7 @@ def _merged(current: Any, changes: Any) -> Any:
         changes = {KIND: changes}
     if not (isinstance(current, Mapping) and isinstance(changes, Mapping)):
         return changes
+    # A configuration of another kind has other fields: none of the current ones means anything there.
     if KIND in changes and changes[KIND] != current.get(KIND):
         return changes
     return {**current, **{name: _merged(current.get(name), value) for name, value in changes.items()}}
@@ -261,6 +271,7 @@ def _wanted(error: ErrorDetails) -> str:
 def _of_the_kind_meant(errors: Sequence[ErrorDetails]) -> Sequence[ErrorDetails]:
     """Without the errors of classes that could stand in a place but are of another ``kind`` than was given."""
     wrong_kinds = [error for error in errors if error["type"] == "literal_error" and error["loc"][-1] == KIND]
+    # Where the kind of every class is wrong, nothing is left but that.
     others = [error["loc"][:-1] for error in wrong_kinds]
     return [error for error in errors if not any(error["loc"][: len(loc)] == loc for loc in others)] or wrong_kinds
 
@@ -281,6 +292,7 @@ def _hint_at(kind: Any, location: Sequence[str | int]) -> Any:
     for part in location:
         choices = typing.get_args(kind) if isinstance(kind, types.UnionType) else (kind,)
         classes = [choice for choice in choices if dataclasses.is_dataclass(choice)]
+        # A member of a union has its name in the location, a field of a configuration its own.
         named = [choice for choice in choices if getattr(choice, "__name__", "") == part]
         below = typing.get_type_hints(classes[0])[str(part)] if classes and not named else Any
         kind = named[0] if named else below
