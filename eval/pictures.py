@@ -16,6 +16,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 
@@ -73,17 +74,17 @@ def draw_comparison(file: Path) -> list[Trial]:
 
 
 def photograph_replay(file: Path) -> list[Trial]:
-    """The replay of PO-TLP's trial, at the decision with the most actions to weigh."""
+    """The replay of PO-TLP's trial, at a later decision with several actions to weigh."""
     trial = picture_trial("potlp")
-    simple = [decision for decision in trial.decisions if decision.overruled is None]
-    decision = max(simple, key=lambda decision: len(decision.actions))
+    later = trial.decisions[len(trial.decisions) // 3 :]
+    decision = max(later, key=lambda decision: len(decision.actions))
     page = replay_page(trial, panoramas_of(trial))
     # The page's slider moves as if a person had drawn it there.
     move = (
         'const slider = document.querySelector("input");'
         f'slider.value = {decision.step}; slider.dispatchEvent(new Event("input", {{bubbles: true}}));'
     )
-    photograph(page.replace("</body>", f"<script>{move}</script></body>"), file, (1150, 1000))
+    photograph(page.replace("</body>", f"<script>{move}</script></body>"), file, (1150, 900))
     return [trial]
 
 
@@ -163,14 +164,16 @@ def make_pictures(folder: Path, names: Iterable[str]) -> list[str]:
             missing.append(f"{name} stays as it is: {error}")
             continue
         shrink(file)
-        facts[name] = {
-            "command": f"python -m eval.pictures {name}",
-            "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-            "trials": {trial.policy: trial_digest(trial) for trial in trials},
-        }
+        facts[name] = picture_facts(file, {trial.policy: trial_digest(trial) for trial in trials})
         # After each picture, so that a run that is stopped leaves the facts of those it made.
         facts_file.write_text(json.dumps(dict(sorted(facts.items())), indent=1) + "\n")
     return missing
+
+
+def picture_facts(file: Path, trials: dict[str, str]) -> dict[str, Any]:
+    """What is kept of a picture: how to make it, its content's hash, and the digests of the trials that it shows."""
+    content = hashlib.sha256(file.read_bytes()).hexdigest()
+    return {"command": f"python -m eval.pictures {file.name}", "sha256": content, "trials": trials}
 
 
 def shrink(file: Path) -> None:
