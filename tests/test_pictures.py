@@ -26,9 +26,7 @@ def test_every_picture_is_made_by_the_script(facts):
 @pytest.mark.parametrize("name", PICTURES)
 def test_a_picture_is_as_it_was_made_and_not_too_large(name, facts):
     content = (FOLDER / name).read_bytes()
-    assert hashlib.sha256(content).hexdigest() == facts[name]["sha256"], (
-        f"{name} was changed by hand; {REMEDY}"
-    )
+    assert hashlib.sha256(content).hexdigest() == facts[name]["sha256"], f"{name} was changed by hand; {REMEDY}"
     assert len(content) <= MAX_BYTES
 
 
