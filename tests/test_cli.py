@@ -20,7 +20,6 @@ from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.environments.toy import Toy
 from potlp_jax.errors import PotlpError, WorldError
-from potlp_jax.planning import policies
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.search.config import SearchConfig, UctConfig
 from potlp_jax.task.task import Task
@@ -474,7 +473,6 @@ def test_completed_names_are_those_of_the_library():
     assert tuple(Policy) == completion.POLICIES
     assert tuple(Split) == completion.SPLITS
     assert (SearchConfig.kind, UctConfig.kind) == completion.SEARCHES
-    assert policies.GROUP == completion.POLICY_GROUP
     assert {name: tuple(make(name).tasks) for name in NAMED} == dict(completion.TASKS)
 
 

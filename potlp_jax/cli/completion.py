@@ -10,7 +10,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from potlp_jax import plugins
 from potlp_jax.environments.families import NAMED, PREFIXED
 
 TASKS: Mapping[str, tuple[str, ...]] = MappingProxyType(
@@ -31,6 +30,9 @@ SPLITS = ("calibration", "training", "validation", "test")
 
 def complete_environment(incomplete: str) -> list[str]:
     """Names of environments, those that other installed packages declare among them."""
+    # Reading what is installed takes as long as the rest; help, which completes nothing, does without it.
+    from potlp_jax import plugins
+
     return _starting([*NAMED, *PREFIXED, *plugins.entry_points(plugins.ENVIRONMENTS)], incomplete)
 
 
@@ -71,6 +73,8 @@ def complete_split(incomplete: str) -> list[str]:
 
 
 def _policies() -> list[str]:
+    from potlp_jax import plugins
+
     return [*POLICIES, *plugins.entry_points(plugins.POLICIES)]
 
 

@@ -1,7 +1,7 @@
 """``potlp task``: what a formula means."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -11,8 +11,9 @@ from rich.table import Table
 from potlp_jax.cli.group import Command, command_app
 from potlp_jax.cli.options import Formula, Json, Propositions
 from potlp_jax.cli.output import console, print_json
-from potlp_jax.task.task import Task
-from potlp_jax.task.words import transition_words
+
+if TYPE_CHECKING:
+    from potlp_jax.task.task import Task
 
 app = command_app()
 
@@ -67,7 +68,9 @@ def show_task(
         shown.print(f"wrote {out}", markup=False)
 
 
-def _states(task: Task, description: dict[str, Any]) -> Table:
+def _states(task: "Task", description: dict[str, Any]) -> Table:
+    from potlp_jax.task.words import transition_words
+
     table = Table(title="states and transitions", title_justify="left", box=SIMPLE_HEAD)
     table.add_column("state", justify="right")
     table.add_column("role")
