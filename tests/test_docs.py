@@ -47,6 +47,7 @@ KNOWN_PROGRAMS = {
     "python",
     ".",
 }
+FOLDERS = ("docs", "eval", "tests", "notebooks", "examples", "potlp_jax")
 GENERATED = ("api/", "notebooks/", "contributing.md", "changes.md")
 """Pages that docs/site_hooks.py makes; `mkdocs build --strict` checks links to them."""
 
@@ -129,6 +130,9 @@ PAGES_WITH_COMMANDS = [page for page in PAGES if any(_commands(page))]
 @pytest.mark.parametrize("page", PAGES_WITH_COMMANDS, ids=_name)
 def test_command_lines_parse(page, parse):
     for line, words in _commands(page):
+        for word in words:
+            if word.split("/")[0] in FOLDERS and Path(word).suffix:
+                assert (ROOT / word).exists(), f"{line}: {word} does not exist"
         program = Path(words[0]).name
         if program == "potlp":
             if words[1:] and words[1].isupper():
@@ -147,9 +151,6 @@ def test_command_lines_parse(page, parse):
 @pytest.mark.parametrize("line", ["run firefighting --no-such-option", "no-such-command", "run", "run toy --world x"])
 def test_a_wrong_command_line_is_refused(line, parse):
     assert parse(line.split())[0] == 2
-
-
-FOLDERS = ("docs", "eval", "tests", "notebooks", "examples", "potlp_jax")
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_name)
