@@ -10,9 +10,6 @@ from eval.pictures import FACTS, FOLDER, MAX_BYTES, PICTURES, picture_trial, tri
 MADE_BY_HAND = {"map.png"}
 """Needs a map that does not ship (docs/maps.md)."""
 
-OLDER = {"report.png"}
-"""From before the script; `python -m eval.pictures report.png` runs 24 trials and makes it again."""
-
 REMEDY = "make it again: python -m eval.pictures"
 
 
@@ -23,10 +20,10 @@ def facts() -> dict:
 
 def test_every_picture_is_made_by_the_script(facts):
     there = {file.name for file in FOLDER.iterdir() if file.suffix in (".png", ".jpg", ".gif")}
-    assert there - MADE_BY_HAND - OLDER == facts.keys() == PICTURES.keys() - OLDER
+    assert there - MADE_BY_HAND == facts.keys() == PICTURES.keys()
 
 
-@pytest.mark.parametrize("name", sorted(PICTURES.keys() - OLDER))
+@pytest.mark.parametrize("name", PICTURES)
 def test_a_picture_is_as_it_was_made_and_not_too_large(name, facts):
     content = (FOLDER / name).read_bytes()
     assert hashlib.sha256(content).hexdigest() == facts[name]["sha256"], f"{name} was changed by hand; {REMEDY}"
