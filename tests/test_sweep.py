@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -18,6 +19,7 @@ from typer.testing import CliRunner
 
 from eval.savings import decisions_of
 from potlp_jax.cli import app
+from potlp_jax.cli.report import page_title
 from potlp_jax.codec import shipped_settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
@@ -29,7 +31,8 @@ from potlp_jax.sweep.specification import read_specification, specification_from
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store, process_start
 from potlp_jax.task.task import Task
 from potlp_jax.trials.loop import run_trial
-from potlp_jax.view.report_page import Cell, report_page
+from potlp_jax.view.report_page import Cell, Shown, report_page
+from potlp_jax.view.style import policy_styles
 from tests.reference.browser import BROWSER, dump_page
 
 SMALL = {"environments": ["toy"], "tasks": [2], "policies": ["optimistic"], "worlds": 3, "first_world": 5}
@@ -352,6 +355,33 @@ def test_the_report_holds_tables_plots_and_replays_of_the_trials_as_they_were(fi
     paths = {path_text(np.array(json.loads(entry)["path"], np.int32)) for entry in data}
     assert len(data) == 2
     assert paths <= {row.path for row in rows}
+
+
+@pytest.mark.parametrize(
+    ("folder", "title"),
+    [("out/validation", "Sweep validation"), ("out/sweep", "Sweep"), ("sweep-of-halls", "Sweep-of-halls")],
+)
+def test_a_report_is_titled_after_its_folder(folder, title):
+    assert page_title(Path(folder)) == title
+
+
+def test_a_report_of_the_folder_one_stands_in_has_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert page_title(Path()) == f"Sweep {tmp_path.name}"
+
+
+def test_a_report_writes_each_policy_in_its_colour():
+    policies = ["known-map", "baseline", "first", "second"]
+    rows = {policy: _row(Item("toy", "F goal", policy, 0)) for policy in policies}
+    data = {policy: Shown(f"worst {policy}", policy, 0, 1.0, 2.0, {}) for policy in policies}
+    page = report_page("a", [], policies, [Cell("toy", "F goal", [rows], [data["second"]])])
+    styles = policy_styles(policies)
+    for policy in policies[1:]:
+        assert f'style="color: {styles[policy].colour}">{policy}</td>' in page
+    # Once in the table, once among the trials to look at.
+    assert page.count(f'style="color: {styles["second"].colour}"') == 2
+    # The page's own ink, which a dark screen turns.
+    assert "<td>known-map</td>" in page
 
 
 def test_a_report_without_replays_runs_nothing_again(finished, tmp_path, monkeypatch):

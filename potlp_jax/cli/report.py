@@ -69,8 +69,15 @@ def write_report(
                 progress.update(bar, description=f"running world {row.item.world} again")
                 shown.append(_shown(sweep, reason, row, baseline))
             cells.append(Cell(cell.environment, cell.task, pairs, shown))
-    page.write_text(report_page(f"Sweep {folder.name}", _facts(facts, rows), policies, cells), "utf-8")
+    page.write_text(report_page(page_title(folder), _facts(facts, rows), policies, cells), "utf-8")
     console().print(f"wrote {page}", markup=False)
+
+
+def page_title(folder: Path) -> str:
+    """Named after the folder; one that calls itself a sweep is not called so twice."""
+    # Resolved, for "." has no name.
+    name = folder.resolve().name
+    return name[:1].upper() + name[1:] if "sweep" in name.lower() else f"Sweep {name}"
 
 
 def _subject(policies: Sequence[str]) -> str:

@@ -188,7 +188,8 @@ def _draw_states(axes: Axes, task: Task, places: dict[int, np.ndarray]) -> None:
     )
     networkx.draw_networkx_labels(graph, places, ax=axes, font_size=11, font_color=INK)
     for state in np.flatnonzero(task.dfa.trap).tolist():
-        axes.text(*(places[state] + (0.3, 0)), "failed", size=9, color=QUIET, va="center")
+        x, y = places[state]
+        axes.text(x + 0.3, y, "failed", size=9, color=QUIET, va="center")
     x, y = places[task.dfa.initial]
     arrow = {"arrowstyle": "-|>", "color": INK, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", (x - 0.25, y), xytext=(x - 0.85, y), arrowprops=arrow)

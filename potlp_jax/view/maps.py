@@ -169,9 +169,9 @@ def _formula_lines(trial: Trial, width: float) -> list[str]:
 def _add_heading(figure: Figure, lines: Sequence[str]) -> None:
     """The formula in bold, and where and how it went as the last line."""
     for line, text in enumerate(lines):
-        style = {"size": 10} if line == len(lines) - 1 else {"size": 11, "weight": "bold"}
+        size, weight = (10, "normal") if line == len(lines) - 1 else (11, "bold")
         place = 1 - (0.16 + LINE * line) / figure.get_figheight()
-        figure.text(0.5, place, text, ha="center", va="center", color=INK, **style)
+        figure.text(0.5, place, text, ha="center", va="center", color=INK, size=size, weight=weight)
 
 
 def _legend_groups(trials: Sequence[Trial]) -> list[list[Handle]]:

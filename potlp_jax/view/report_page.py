@@ -12,6 +12,7 @@ from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, Table
 from potlp_jax.view.comparisons import loss_lines
 from potlp_jax.view.replay_page import embed_json, page_style, replay_script
 from potlp_jax.view.report_plots import cumulative, savings_by_world, scatter
+from potlp_jax.view.style import INK, PolicyStyle, policy_styles
 
 ORACLE, LEARNED = "oracle", "potlp"
 
@@ -73,7 +74,7 @@ def report_page(title: str, facts: Sequence[tuple[str, str]], policies: Sequence
 <h1>{html.escape(title)}</h1>
 <nav aria-label="tasks"><ul>{contents}</ul></nav>
 {"".join(sections)}
-<section><h2>What was run</h2><div class="scroll"><table>{rows}</table></div></section>
+<section><h2>What was run</h2><div class="scroll"><table class="run">{rows}</table></div></section>
 </main>
 {"".join(replays)}
 <script>{replay_script()}</script>
@@ -92,11 +93,13 @@ def _section(number: int, cell: Cell, policies: Sequence[str], replays: list[str
     if not cell.pairs:
         return f'<section id="cell{number}">{heading}<p>No world has been finished by all policies yet.</p></section>'
     comparison = compare_pairs(cell.pairs, policies)
-    tables = [
-        _table(comparison.satisfied, f"{comparison.satisfied.pairs} worlds in which every policy satisfied the task")
-    ]
+    # Of all policies of the sweep, as the plots ask for them: the colours of policies that are not shipped follow the
+    # order of the list, and a shorter one would give others.
+    styles = policy_styles(policies)
+    caption = f"{comparison.satisfied.pairs} worlds in which every policy satisfied the task"
+    tables = [_table(comparison.satisfied, caption, styles)]
     if comparison.satisfied.dropped:
-        tables.append(_table(comparison.charged, "all worlds, unsatisfied trials charged their budget"))
+        tables.append(_table(comparison.charged, "all worlds, unsatisfied trials charged their budget", styles))
     lines = [*_outcome_lines(comparison.outcomes), *loss_lines(comparison)]
     plots = [
         (scatter(cell.pairs, policies), "Costs world by world; below the line is cheaper than the baseline."),
@@ -109,14 +112,14 @@ def _section(number: int, cell: Cell, policies: Sequence[str], replays: list[str
 {"".join(f'<p class="note">{html.escape(line)}</p>' for line in lines)}
 {_losses(comparison.satisfied)}
 <div class="plots">{figures}</div>
-{_trials(number, cell.shown, replays)}
+{_trials(number, cell.shown, replays, styles)}
 </section>"""
 
 
 _COLUMNS = ("policy", "attainable savings", "95 % interval", "net savings", "savings per trial", "mean cost")
 
 
-def _table(table: Table, caption: str) -> str:
+def _table(table: Table, caption: str, styles: Mapping[str, PolicyStyle]) -> str:
     head = "".join(f"<th scope=col>{name}</th>" for name in _COLUMNS)
     # The known map is a bound, not a competitor.
     best = max((row.attainable_share for row in table.rows if row.policy != KNOWN_MAP), default=math.nan)
@@ -124,19 +127,26 @@ def _table(table: Table, caption: str) -> str:
     for row in table.rows:
         kind = ' class="best"' if row.attainable_share == best else ""
         cells = (
-            row.policy,
             _percent(row.attainable_share),
             f"{_percent(row.attainable_low)} to {_percent(row.attainable_high)}",
             _percent(row.net_savings),
             f"{_percent(row.trial_savings)} ± {_percent(row.trial_savings_error)}",
             "-" if math.isnan(row.mean_cost) else f"{row.mean_cost:.1f}",
         )
-        body += f"<tr{kind}>" + "".join(f"<td>{html.escape(text)}</td>" for text in cells) + "</tr>"
+        figures = "".join(f"<td>{html.escape(text)}</td>" for text in cells)
+        body += f"<tr{kind}>{_policy_cell(row.policy, styles)}{figures}</tr>"
     return (
         f'<div class="scroll"><table><caption class="note">{html.escape(caption)}</caption>'
         f"<thead><tr>{head}</tr></thead>"
         f"<tbody>{body}</tbody></table></div>"
     )
+
+
+def _policy_cell(policy: str, styles: Mapping[str, PolicyStyle]) -> str:
+    """The name in the colour that the policy has in the plots; ink is whatever the page writes in, light or dark."""
+    colour = styles[policy].colour
+    style = "" if colour == INK else f' style="color: {colour}"'
+    return f"<td{style}>{html.escape(policy)}</td>"
 
 
 def _percent(share: float) -> str:
@@ -170,15 +180,16 @@ def _losses(table: Table) -> str:
     )
 
 
-def _trials(number: int, shown: Sequence[Shown], replays: list[str]) -> str:
+def _trials(number: int, shown: Sequence[Shown], replays: list[str], styles: Mapping[str, PolicyStyle]) -> str:
     if not shown:
         return ""
     rows = ""
     for index, trial in enumerate(shown):
         name = f"replay-{number}-{index}"
         replays.append(f'<script type="application/json" id="{name}">{embed_json(trial.data)}</script>\n')
-        cells = (trial.reason, trial.policy, str(trial.world), f"{trial.cost:.1f}", f"{trial.baseline:.1f}")
-        rows += "<tr>" + "".join(f"<td>{html.escape(text)}</td>" for text in cells)
+        cells = (str(trial.world), f"{trial.cost:.1f}", f"{trial.baseline:.1f}")
+        rows += f"<tr><td>{html.escape(trial.reason)}</td>{_policy_cell(trial.policy, styles)}"
+        rows += "".join(f"<td>{text}</td>" for text in cells)
         rows += f'<td><button type="button" data-replay="{name}" aria-expanded="false">replay</button></td></tr>'
     head = "".join(f"<th scope=col>{name}</th>" for name in ("trial", "policy", "world", "cost", "baseline", ""))
     return (

@@ -3,7 +3,9 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import matplotlib.pyplot as plt
+from matplotlib.ticker import MaxNLocator
+
+from potlp_jax.view.style import INK, SERIES_COLOURS, new_figure, save_figure
 
 PANELS: Mapping[str, str] = {
     "loss": "loss",
@@ -22,13 +24,19 @@ def draw_curves(rows: Sequence[Mapping[str, int | float]], path: Path) -> None:
         rows: of the journal (``recipes.journal``), one for each epoch.
         path: the picture's file.
     """
-    figure, axes = plt.subplots(1, len(PANELS), figsize=(4 * len(PANELS), 3.2), layout="constrained")
-    for axis, (key, title) in zip(axes, PANELS.items(), strict=True):
-        for name in ("training", "validation"):
-            axis.plot([row["epoch"] for row in rows], [row[f"{name}_{key}"] for row in rows], ".-", label=name)
-        axis.set_title(title)
-        axis.set_xlabel("epoch")
-        axis.grid(alpha=0.3)
-    axes[0].legend()
-    figure.savefig(path, dpi=90)
-    plt.close(figure)
+    # Drawn anew at each evaluation, beside the thread that makes batches: pyplot's global state has no place here.
+    figure = new_figure(4.0 * len(PANELS), 3.2)
+    figure.set_layout_engine("constrained")
+    panels = figure.subplots(1, len(PANELS))
+    for axes, (key, title) in zip(panels, PANELS.items(), strict=True):
+        # Each scale is its own: a loss, a skill and a cost have no common unit.
+        for name, colour in zip(("training", "validation"), SERIES_COLOURS, strict=False):
+            values = [row[f"{name}_{key}"] for row in rows]
+            axes.plot([row["epoch"] for row in rows], values, ".-", color=colour, label=name)
+        axes.set_title(title, size=11, color=INK)
+        axes.set_xlabel("epoch", color=INK)
+        # Epochs are whole; a tick at 1.5 would name none.
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.grid(alpha=0.3)
+    panels[0].legend()
+    save_figure(figure, path)
