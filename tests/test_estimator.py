@@ -244,7 +244,11 @@ def test_each_subgoal_is_shown_in_the_centre_of_the_panorama_that_its_estimates_
     assert "at decision 0" in pictures[0].get_title(loc="left")
     assert pictures[1].get_title(loc="left").startswith("s1")
     assert "seen now" in pictures[1].get_title(loc="left")
-    told = [axes.texts[0].get_text() for axes in figure.axes if not axes.images]
+    answers = [axes.texts[0] for axes in figure.axes if not axes.images]
+    told = [text.get_text() for text in answers]
+    # Nothing is cut off at the picture's edge, nor written over the panoramas.
+    assert all(text.get_window_extent().x1 <= figure.bbox.x1 for text in [*answers, *figure.texts])
+    assert min(t.get_window_extent().x0 for t in answers) > max(axes.get_window_extent().x1 for axes in pictures)
     assert "0.62" in told[0]
     assert "and 2 more" in told[0]
     assert told[1] == "nothing can be tried here"

@@ -7,6 +7,7 @@ from types import MappingProxyType
 
 import jax.numpy as jnp
 import numpy as np
+from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -15,21 +16,23 @@ from rich.table import Table
 
 from potlp_jax.learning.dataset import Samples, decode
 from potlp_jax.learning.metrics import INTACT, CostErrors, Figures, Predictions, Report, class_in_words
-from potlp_jax.view.style import CHOSEN, FAINT, INK, RIGHT, SERIES_COLOURS, WRONG, new_figure
+from potlp_jax.view.style import CHOSEN, FAINT, INK, QUIET, RIGHT, SERIES_COLOURS, WRONG, new_figure
 from potlp_jax.world.camera import roll_to
 
 VARIANTS: Mapping[str, str] = MappingProxyType({INTACT: "intact", "image": "image blacked out", "phi": "phi shuffled"})
 """What was evaluated, in words."""
 
-_PARTS = {"proposition": "asks for {}", "avoided": "avoids {}", "distance": "distance {}"}
+_PARTS = {"proposition": "asks for {}", "avoided": "propositions avoided: {}", "distance": "distance {}"}
 
 _KINDS = {
-    "true positives": "right: said yes, and it is there",
-    "true negatives": "right: said no, and it is not there",
-    "false positives": "wrong: said yes, but it is not there",
-    "false negatives": "wrong: said no, but it is there",
+    "true positives": "right: success predicted, and the attempt succeeds",
+    "true negatives": "right: failure predicted, and the attempt fails",
+    "false positives": "wrong: success predicted, but the attempt fails",
+    "false negatives": "wrong: failure predicted, but the attempt succeeds",
 }
 _COLUMNS = 2
+
+_QUESTION_KEY = "stay: what must hold on the way; go: what is looked for beyond the subgoal, between the arrows"
 
 
 def probability_table(report: Report, title: str) -> Table:
@@ -110,7 +113,7 @@ def _number(value: float, digits: int) -> str:
 
 
 def draw_reliability(reports: Mapping[str, Report], title: str) -> Figure:
-    """Left, how often it was there over what was predicted, with the numbers of predictions; right, skill by group.
+    """Left, the share of successes over the predicted P_S, with the numbers of predictions; right, skill by group.
 
     ``reports`` has ``intact``, and the ablations that were made; those show up in the right panel.
     """
@@ -133,16 +136,18 @@ def _draw_bins(axes: Axes, figures: Figures) -> None:
     style = {"color": SERIES_COLOURS[0], "marker": "o", "markersize": 5, "linewidth": 1.5, "capsize": 2}
     axes.errorbar(said, seen, errors, **style, label="± 2 standard errors, as if independent")
     axes.set(xlim=(0, 1), ylim=(-0.02, 1.02))
-    axes.set_ylabel("how often it was there", color=INK)
+    axes.set_ylabel("share of attempts that succeed", color=INK)
     axes.tick_params(labelbottom=False)
     axes.grid(color="#EEEEEE", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.legend(loc="upper left", fontsize=8.5, framealpha=0.9)
-    text = (
-        f"Brier score {figures.brier:.4f}\nskill {_number(figures.skill, 3)}\nAUC {_number(figures.auc, 3)}\n"
-        f"calibration error {figures.calibration_error:.3f}\n{figures.samples} samples"
+    # Above the panel: within it, a badly calibrated estimator's points may be anywhere, also below any text.
+    axes.set_title(
+        f"Brier score {figures.brier:.4f}, skill {_number(figures.skill, 3)}, AUC {_number(figures.auc, 3)}, "
+        f"calibration error {figures.calibration_error:.3f}",
+        size=8,
+        color=INK,
     )
-    axes.text(0.97, 0.04, text, transform=axes.transAxes, ha="right", va="bottom", size=8.5, color=INK)
 
 
 def _draw_counts(axes: Axes, figures: Figures) -> None:
@@ -165,7 +170,8 @@ def _draw_skills(axes: Axes, reports: Mapping[str, Report]) -> None:
         marker, colour = styles[name]
         axes.scatter(skills, range(len(rows)), s=34, marker=marker, color=colour, label=VARIANTS[name], zorder=3)
         least = min([least, *(skill for skill in skills if math.isfinite(skill))])
-    for last in _last_rows(reports[INTACT]):
+    # No line after the last group, where the panel ends.
+    for last in sorted(_last_rows(reports[INTACT]))[:-1]:
         axes.axhline(last + 0.5, color="#DDDDDD", linewidth=0.8)
     axes.set_yticks(range(len(rows)), [f"{name} ({figures.samples})" for name, figures in rows], size=8.5)
     axes.axvline(0, color=INK, linewidth=0.8)
@@ -178,12 +184,12 @@ def _draw_skills(axes: Axes, reports: Mapping[str, Report]) -> None:
 
 
 def draw_costs(samples: Samples, predictions: Predictions, overall: Figures, title: str) -> Figure:
-    """Predicted over true costs: R_S where it was there, R_F where it was not.
+    """Predicted over true costs: R_S of attempts that succeed, R_F of those that fail.
 
     Args:
         samples: the true costs.
         predictions: of the same samples, in the same order.
-        overall: the errors over all samples, which are written into the panels.
+        overall: the errors over all samples, which are written above the panels.
         title: stands above.
 
     Returns:
@@ -193,22 +199,24 @@ def draw_costs(samples: Samples, predictions: Predictions, overall: Figures, tit
     figure.text(0.5, 0.975, title, ha="center", va="top", size=9, color=INK)
     unit = samples.metadata.unit
     panels = (
-        ("R_S where it is there", samples.success, samples.success_cost, predictions.success_cost),
-        ("R_F where it is not there", 1 - samples.success, samples.failure_cost, predictions.failure_cost),
+        ("R_S of attempts that succeed", samples.success, samples.success_cost, predictions.success_cost),
+        ("R_F of attempts that fail", 1 - samples.success, samples.failure_cost, predictions.failure_cost),
     )
     errors = (overall.success_cost, overall.failure_cost)
     for column, ((name, share, true, said), figures) in enumerate(zip(panels, errors, strict=True)):
         axes = figure.add_axes((0.06 + 0.49 * column, 0.1, 0.42, 0.77))
         # A share of successes strictly between 0 and 1 puts the sample into both panels, with that weight.
         known = (share > 0) & np.isfinite(true)
-        _draw_cost(axes, true[known], said[known], share[known], figures, unit)
-        axes.set_title(f"{name} ({figures.samples} samples; darker: more)", size=10, color=INK)
+        _draw_cost(axes, true[known], said[known], share[known], unit)
+        told = (
+            f"MAE {_number(figures.mae, 1)}, RMSE {_number(figures.rmse, 1)}, bias {_number(figures.bias, 1)}, "
+            f"R² {_number(figures.r2, 2)}"
+        )
+        axes.set_title(f"{name} ({figures.samples} samples; darker: more)\n{told}", size=9.5, color=INK)
     return figure
 
 
-def _draw_cost(
-    axes: Axes, true: np.ndarray, said: np.ndarray, share: np.ndarray, errors: CostErrors, unit: str
-) -> None:
+def _draw_cost(axes: Axes, true: np.ndarray, said: np.ndarray, share: np.ndarray, unit: str) -> None:
     limit = 1.03 * max([1.0, *true.tolist(), *said.tolist()])
     axes.plot([0, limit], [0, limit], color=FAINT, linewidth=1.0, zorder=3)
     if len(true):
@@ -217,15 +225,12 @@ def _draw_cost(
         mean = float(np.average(true, weights=share))
         axes.axhline(mean, color=CHOSEN, linewidth=1.0, linestyle=":")
         note = {"textcoords": "offset points", "ha": "right", "va": "bottom", "size": 8, "color": CHOSEN}
-        axes.annotate("the constant mean", (limit, mean), (-4, 2), **note)
+        # The rim parts the words from the cells that they may lie on.
+        rim = [patheffects.withStroke(linewidth=2.5, foreground="white")]
+        axes.annotate("the constant mean", (limit, mean), (-4, 2), path_effects=rim, **note)
     axes.set(xlim=(0, limit), ylim=(0, limit))
     axes.set_xlabel(f"true cost [{unit}]", color=INK)
     axes.set_ylabel(f"predicted cost [{unit}]", color=INK)
-    text = (
-        f"MAE {_number(errors.mae, 1)}\nRMSE {_number(errors.rmse, 1)}\nbias {_number(errors.bias, 1)}\n"
-        f"R² {_number(errors.r2, 2)}"
-    )
-    axes.text(0.03, 0.97, text, transform=axes.transAxes, ha="left", va="top", size=8.5, color=INK)
 
 
 def draw_predictions(
@@ -244,10 +249,11 @@ def draw_predictions(
     """
     width, picture, words, heading = 11.5, 5.5 / 4, 0.62, 0.42
     rows = {name: max(1, math.ceil(len(members) / _COLUMNS)) for name, members in chosen.items()}
-    height = 0.45 + sum(heading + count * (picture + words) for count in rows.values())
+    height = 0.68 + sum(heading + count * (picture + words) for count in rows.values())
     figure = new_figure(width, height)
     figure.text(0.5, 1 - 0.1 / height, title, ha="center", va="top", size=9, color=INK)
-    top = height - 0.45
+    figure.text(0.5, 1 - 0.34 / height, _QUESTION_KEY, ha="center", va="top", size=8, color=QUIET)
+    top = height - 0.68
     for name, members in chosen.items():
         colour = RIGHT if name.startswith("true") else WRONG
         label = f"{_KINDS[name]} (most confident first)" if len(members) else f"{_KINDS[name]}: none"

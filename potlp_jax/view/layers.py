@@ -3,6 +3,7 @@
 Axes show the map in cells: x is the column, y the row, row 0 at the top.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -277,6 +278,16 @@ def state_handles(states: Sequence[int], task: Task, *, words: bool = True) -> l
         )
         for state in sorted(set(states))
     ]
+
+
+def legend_columns(handles: Sequence[Line2D | Patch], width: float) -> int:
+    """As many columns of a legend as fit ``width`` inches, such that its rows are equally long if possible."""
+    # matplotlib makes a column as wide as its widest entry; as if all were as wide as the longest, none runs out.
+    longest = max(len(str(handle.get_label())) for handle in handles)
+    # Inches of a legend's letters of 8.5 points, and of the mark and the gap before and after them.
+    fit = max(1, int(width / (0.5 + 0.068 * longest)))
+    # Seven entries in rows of six would leave one alone in the second row.
+    return math.ceil(len(handles) / math.ceil(len(handles) / fit))
 
 
 def _enlarge(cells: np.ndarray, scale: int) -> np.ndarray:

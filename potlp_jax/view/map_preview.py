@@ -17,7 +17,7 @@ from potlp_jax.environments.ros.places import component_labels
 from potlp_jax.environments.ros.ros_map import RosMap
 from potlp_jax.environments.ros.survey import SPECK
 from potlp_jax.view.labels import AreaLabel, draw_labels, place_labels
-from potlp_jax.view.layers import area_handles
+from potlp_jax.view.layers import area_handles, legend_columns
 from potlp_jax.view.style import CHOSEN, FAINT, INK, area_colour, new_figure, rgb
 from potlp_jax.world.grid import World
 
@@ -227,7 +227,6 @@ def _finish(figure: Figure, axes: Axes, clean: CleanMap, handles: list[Patch | L
         x, y = zip(*(part.at for part in clean.cut_off), strict=True)
         axes.plot(x, y, "X", ms=10, mfc=CHOSEN, mec="white", mew=1.0, ls="", zorder=6)
         shown.append(Line2D([], [], marker="X", ls="", ms=9, mfc=CHOSEN, mec="white", label="cut off by the cells"))
-    columns = max(2, int(figure.get_figwidth() / 1.55))
-    figure.legend(
-        handles=[*shown, *handles], loc="lower center", ncols=columns, fontsize=8.5, frameon=False, handlelength=1.4
-    )
+    shown += handles
+    columns = legend_columns(shown, figure.get_figwidth())
+    figure.legend(handles=shown, loc="lower center", ncols=columns, fontsize=8.5, frameon=False, handlelength=1.4)

@@ -21,6 +21,7 @@ from potlp_jax.view.layers import (
     draw_path,
     draw_subgoals,
     end_handles,
+    legend_columns,
     mark_changes,
     mark_decisions,
     show_cells,
@@ -182,15 +183,8 @@ def _legend_groups(trials: Sequence[Trial]) -> list[list[Handle]]:
     return [short, [*state_handles(states, task_of(first))]]
 
 
-def _legend_columns(handles: Sequence[Handle], width: float) -> int:
-    """As many columns as fit: entries are as wide as the longest, and columns differ by one entry at most."""
-    longest = max(len(str(handle.get_label())) for handle in handles)
-    fit = max(1, int(width / (0.5 + 0.068 * longest)))
-    return math.ceil(len(handles) / math.ceil(len(handles) / fit))
-
-
 def _legend_inches(groups: Sequence[Sequence[Handle]], width: float) -> float:
-    return LEGEND_LINE * sum(math.ceil(len(handles) / _legend_columns(handles, width)) for handles in groups)
+    return LEGEND_LINE * sum(math.ceil(len(handles) / legend_columns(handles, width)) for handles in groups)
 
 
 def _add_legend(figure: Figure, groups: Sequence[Sequence[Handle]]) -> None:
@@ -198,7 +192,7 @@ def _add_legend(figure: Figure, groups: Sequence[Sequence[Handle]]) -> None:
     width, height = figure.get_size_inches()
     bottom = 0.06
     for handles in reversed(groups):
-        columns = _legend_columns(handles, width)
+        columns = legend_columns(handles, width)
         figure.legend(
             handles=list(handles),
             loc="lower center",
