@@ -1,5 +1,6 @@
 """``potlp log``: robots' logs inspected, turned into datasets, replayed, and written by the simulator."""
 
+import dataclasses
 import importlib.util
 import logging
 from pathlib import Path
@@ -11,7 +12,7 @@ from rich.table import Table
 
 from potlp_jax.cli.completion import complete_policy
 from potlp_jax.cli.group import Command, command_app
-from potlp_jax.cli.options import EstimatorName, Json, OpenPage, SearchName, Simulations, TrialFile
+from potlp_jax.cli.options import EstimatorName, Json, OpenPage, SearchName, Simulations, TrialFile, spread
 from potlp_jax.cli.output import FAILED, console, fail, make_folder, open_page, print_json, progress_bar
 from potlp_jax.cli.view import PAGE
 
@@ -29,39 +30,56 @@ app = command_app(
     "log", "Use what a robot recorded: ROS 1 bags, ROS 2 bags and MCAP. Needs the extra [cyan]logs[/cyan], no ROS."
 )
 
-# How a log is read. Robots differ in topics, frames and cameras, so that every command that reads one has these.
 _BAG_HELP = "A .bag, .mcap or .db3 file, or the folder of a ROS 2 bag."
 BagFile = Annotated[Path, typer.Argument(metavar="BAG", help=_BAG_HELP)]
 BagFiles = Annotated[list[Path], typer.Argument(metavar="BAG...", help=f"{_BAG_HELP} All with one map frame.")]
 Labels = Annotated[
     Path, typer.Option("--labels", "-l", help="YAML of where the propositions are, in metres of the map's frame.")
 ]
-MapTopic = Annotated[str | None, typer.Option("--map-topic", help="Of nav_msgs/OccupancyGrid; default: /map.")]
-ImageTopic = Annotated[
-    str | None, typer.Option("--image-topic", help="Of sensor_msgs/CompressedImage; default: the only one.")
-]
-BaseFrame = Annotated[
-    str | None, typer.Option("--base-frame", help="The robot's frame; default: the odometry's child, or base_link.")
-]
-# Thresholds of nav_msgs/OccupancyGrid, with the defaults of nav2_map_server: between them a cell is unknown.
-Free = Annotated[int, typer.Option("--free", help="Occupancy, in percent, up to which a cell is free.")]
-Occupied = Annotated[int, typer.Option("--occupied", help="Occupancy, in percent, from which it is an obstacle.")]
 Resolution = Annotated[
     float | None, typer.Option("--resolution", help="Metres a cell of the planner; default: 0.2, or the map's.")
 ]
 Radius = Annotated[float, typer.Option("--radius", help="The robot's radius in metres, by which obstacles grow.")]
-# What a bag may not say: where the camera looks, and how much of the sphere a picture covers.
-CameraYaw = Annotated[
-    float | None,
-    typer.Option(
-        "--camera-yaw",
-        help="Degrees, counter-clockwise, from ahead to where the middle of a picture looks; default: as /tf says.",
-    ),
-]
-VerticalField = Annotated[
-    float | None,
-    typer.Option("--vertical-field", help="Degrees from a picture's lower to its upper edge; default: square pixels."),
-]
+
+
+@dataclasses.dataclass(frozen=True)
+class Reading:
+    """How a log is read: robots differ in topics, frames and cameras, so every command that reads one has these."""
+
+    map_topic: Annotated[str | None, typer.Option("--map-topic", help="Of nav_msgs/OccupancyGrid; default: /map.")] = (
+        None
+    )
+    image_topic: Annotated[
+        str | None, typer.Option("--image-topic", help="Of sensor_msgs/CompressedImage; default: the only one.")
+    ] = None
+    base_frame: Annotated[
+        str | None, typer.Option("--base-frame", help="The robot's frame; default: the odometry's child, or base_link.")
+    ] = None
+    # Thresholds of nav_msgs/OccupancyGrid, with the defaults of nav2_map_server: between them a cell is unknown.
+    free: Annotated[int, typer.Option("--free", help="Occupancy, in percent, up to which a cell is free.")] = 25
+    occupied: Annotated[
+        int, typer.Option("--occupied", help="Occupancy, in percent, from which it is an obstacle.")
+    ] = 65
+    # What a bag may not say: where the camera looks, and how much of the sphere a picture covers.
+    camera_yaw: Annotated[
+        float | None,
+        typer.Option(
+            "--camera-yaw",
+            help="Degrees, counter-clockwise, from ahead to where the middle of a picture looks; default: as /tf says.",
+        ),
+    ] = None
+    vertical_field: Annotated[
+        float | None,
+        typer.Option(
+            "--vertical-field", help="Degrees from a picture's lower to its upper edge; default: square pixels."
+        ),
+    ] = None
+
+    def config(self) -> "LogConfig":
+        """The same for the library."""
+        from potlp_jax.logs.log import LogConfig
+
+        return LogConfig(**dataclasses.asdict(self))
 
 
 @app.command(
@@ -77,30 +95,18 @@ VerticalField = Annotated[
 [dim]Ends with exit code 1 if the log is damaged or cannot be used for anything.[/dim]
 """,
 )
+@spread("reading", Reading)
 def inspect_log(
     bag: BagFile,
-    map_topic: MapTopic = None,
-    image_topic: ImageTopic = None,
-    base_frame: BaseFrame = None,
-    free: Free = 25,
-    occupied: Occupied = 65,
-    vertical_field: VerticalField = None,
+    reading: Reading,
     json: Json = False,
 ) -> None:
     """Show what is in a log: topics, rates, gaps, what it can be used for, and what is wrong with it."""
     _check_rosbags()
     from potlp_jax.logs.inspection import inspect
-    from potlp_jax.logs.log import Log, LogConfig
+    from potlp_jax.logs.log import Log
 
-    config = LogConfig(
-        map_topic=map_topic,
-        image_topic=image_topic,
-        base_frame=base_frame,
-        free=free,
-        occupied=occupied,
-        vertical_field=vertical_field,
-    )
-    log = Log(bag, config)
+    log = Log(bag, reading.config())
     found = inspect(log)
     if json:
         print_json(found)
@@ -125,9 +131,11 @@ def inspect_log(
 files. Needs the extra train, too.[/dim]
 """,
 )
+@spread("reading", Reading)
 def logs_to_dataset(
     bags: BagFiles,
     labels: Labels,
+    reading: Reading,
     out: Annotated[Path, typer.Option("--out", "-o", help="Empty folder for the dataset.")],
     environment: Annotated[
         str | None, typer.Option("--environment", "-e", help="Name of the building; default: that of the labels' file.")
@@ -137,15 +145,8 @@ def logs_to_dataset(
     ] = "training",
     views: Annotated[int, typer.Option("--views", min=1, help="Views of each bag, at most.")] = 200,
     seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="Of the tasks asked about, and the spacing.")] = 0,
-    map_topic: MapTopic = None,
-    image_topic: ImageTopic = None,
-    base_frame: BaseFrame = None,
-    free: Free = 25,
-    occupied: Occupied = 65,
     resolution: Resolution = None,
     radius: Radius = 0.1,
-    camera_yaw: CameraYaw = None,
-    vertical_field: VerticalField = None,
     json: Json = False,
 ) -> None:
     """Turn drives into samples for training an estimator: panoramas, and the true answers from the final map."""
@@ -156,24 +157,14 @@ def logs_to_dataset(
     from potlp_jax.learning.dataset import read_dataset
     from potlp_jax.learning.questions import HELD_OUT
     from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
-    from potlp_jax.logs.log import LogConfig
     from potlp_jax.logs.working_grid import GridConfig
 
     # `office.places.yaml` are the places of office.
     name = labels.name.split(".")[0] if environment is None else environment
     collecting = LogCollectConfig(views_per_world=views, seed=seed, held_out=HELD_OUT.get(name, ()))
-    config = LogConfig(
-        map_topic=map_topic,
-        image_topic=image_topic,
-        base_frame=base_frame,
-        free=free,
-        occupied=occupied,
-        camera_yaw=camera_yaw,
-        vertical_field=vertical_field,
-    )
     with progress_bar() as progress:
         progress.add_task("reading and labelling (the first view compiles)", total=None)
-        drives = [_read_drive(bag, labels, config, GridConfig(resolution, radius)) for bag in bags]
+        drives = [_read_drive(bag, labels, reading.config(), GridConfig(resolution, radius)) for bag in bags]
         counts = collect_drives(drives, load_places(labels), out, name, split, collecting)
     samples = read_dataset(out)
     # Read back rather than counted on the way: what is reported is what a training would read.
@@ -214,9 +205,11 @@ def logs_to_dataset(
 [dim]The path is the one that was driven; the decisions are what the policy would have chosen at each moment.[/dim]
 """,
 )
+@spread("reading", Reading)
 def replay_log(
     bag: BagFile,
     labels: Labels,
+    reading: Reading,
     task: Annotated[
         str, typer.Option("--task", "-t", help="A formula, the name of one in the labels, or a .hoa file.")
     ],
@@ -234,15 +227,8 @@ def replay_log(
     simulations: Simulations = None,
     search: SearchName = None,
     estimator: EstimatorName = None,
-    map_topic: MapTopic = None,
-    image_topic: ImageTopic = None,
-    base_frame: BaseFrame = None,
-    free: Free = 25,
-    occupied: Occupied = 65,
     resolution: Resolution = None,
     radius: Radius = 0.1,
-    camera_yaw: CameraYaw = None,
-    vertical_field: VerticalField = None,
     open_it: OpenPage = False,
     json: Json = False,
 ) -> None:
@@ -251,7 +237,6 @@ def replay_log(
     import jax
 
     from potlp_jax.cli.inputs import RECORD, read_estimator, setting_changes, trial_config
-    from potlp_jax.logs.log import LogConfig
     from potlp_jax.logs.replaying import replay
     from potlp_jax.logs.working_grid import GridConfig
     from potlp_jax.planning.policies import named_policy, policy_name
@@ -260,17 +245,8 @@ def replay_log(
     from potlp_jax.view.replay_page import replay_page
     from potlp_jax.view.style import save_figure
 
-    config = LogConfig(
-        map_topic=map_topic,
-        image_topic=image_topic,
-        base_frame=base_frame,
-        free=free,
-        occupied=occupied,
-        camera_yaw=camera_yaw,
-        vertical_field=vertical_field,
-    )
     trial_settings = trial_config(setting_changes(simulations=simulations, search=search))
-    drive = _read_drive(bag, labels, config, GridConfig(resolution, radius))
+    drive = _read_drive(bag, labels, reading.config(), GridConfig(resolution, radius))
     asked = read_task(drive.tasks.get(task, task), drive.propositions)
     trained = read_estimator(estimator)
     chosen = _default_policy(drive, trained) if policy is None else named_policy(policy)

@@ -1,7 +1,11 @@
 """Options and arguments that several commands share, each written once."""
 
+import dataclasses
+import functools
+import inspect
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -122,3 +126,36 @@ Settings = Annotated[
     ),
 ]
 Processes = Annotated[int, typer.Option("--processes", min=1, help="Collect in so many processes, each on a core.")]
+
+
+def spread(parameter: str, group: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command a group of options: it receives them as one argument, the command line has one each.
+
+    Args:
+        parameter: the command's argument that takes the group.
+        group: a dataclass; each field is an option, ``Annotated`` with ``typer.Option``, and its default.
+
+    Returns:
+        A decorator, to stand below that of typer.
+    """
+    fields = dataclasses.fields(group)
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def spreading(**given: Any) -> None:
+            values = {field.name: given.pop(field.name) for field in fields}
+            command(**given, **{parameter: group(**values)})
+
+        own = [each for each in inspect.signature(command).parameters.values() if each.name != parameter]
+        options = [
+            inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=field.type)
+            for field in fields
+        ]
+        # Typer reads a command's options from its signature and its annotations; by keyword, because an option of the
+        # group may have no default where one before it has.
+        every = [*(each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in own), *options]
+        vars(spreading)["__signature__"] = inspect.Signature(every)
+        spreading.__annotations__ = {each.name: each.annotation for each in every}
+        return spreading
+
+    return decorate
