@@ -1,4 +1,4 @@
-"""Pages of the site that follow from the sources: the API by room, the notebooks, how to contribute, what changed.
+"""Pages of the site that follow from the sources: the API by package, the notebooks, how to contribute, what changed.
 
 mkdocs calls ``on_config``, ``on_files`` and ``on_page_markdown`` (`hooks` in mkdocs.yml). Generated pages never go
 stale when a module moves.
@@ -19,7 +19,7 @@ NOT_FOR_CALLERS = ("cli",)
 def on_config(config: Any) -> Any:
     """Put the generated pages into the navigation, where mkdocs.yml has a bare ``API`` and ``Notebooks``."""
     pages = {
-        "API": [{"By use": "api/index.md"}, *({room: f"api/{room}.md"} for room in rooms())],
+        "API": [{"By use": "api/index.md"}, *({package: f"api/{package}.md"} for package in packages())],
         "Notebooks": [{title_of(notebook): f"notebooks/{notebook.stem}.md"} for notebook in notebooks()],
     }
     config.nav = [{name: pages.get(name, value) for name, value in entry.items()} for entry in config.nav]
@@ -37,7 +37,7 @@ def on_files(files: Any, config: Any) -> Any:
         "contributing.md": (ROOT / "CONTRIBUTING.md").read_text().replace("](docs/", "]("),
         "changes.md": (ROOT / "CHANGELOG.md").read_text().replace("](docs/", "]("),
     }
-    content |= {f"api/{room}.md": api_page(room) for room in rooms()}
+    content |= {f"api/{package}.md": api_page(package) for package in packages()}
     content |= {f"notebooks/{notebook.stem}.md": notebook_page(notebook) for notebook in notebooks()}
     for path, text in content.items():
         files.append(File.generated(config, path, content=text))
@@ -53,7 +53,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     )
 
 
-def rooms() -> list[str]:
+def packages() -> list[str]:
     """Packages and single modules at the top of the library, by name."""
     names = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
     return sorted(names - {"__init__", *NOT_FOR_CALLERS})
@@ -64,10 +64,10 @@ def notebooks() -> list[Path]:
     return sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
-def modules_of(room: str) -> list[str]:
-    """Dotted names of a room's modules, packages before their members; those without a public name are left out."""
-    single = PACKAGE / f"{room}.py"
-    paths = [single] if single.exists() else sorted((PACKAGE / room).rglob("*.py"))
+def modules_of(package: str) -> list[str]:
+    """Dotted names of a package's modules, packages before their members; those without a public name are left out."""
+    single = PACKAGE / f"{package}.py"
+    paths = [single] if single.exists() else sorted((PACKAGE / package).rglob("*.py"))
     names = []
     for path in paths:
         if any(part.startswith("_") and part != "__init__.py" for part in path.relative_to(PACKAGE).parts):
@@ -89,17 +89,17 @@ def _summary(path: Path) -> str:
     return " ".join(text.split("\n\n")[0].split())
 
 
-def api_page(room: str) -> str:
-    """A room's page: what it is for, then every module with its public names."""
-    source = PACKAGE / f"{room}.py" if (PACKAGE / f"{room}.py").exists() else PACKAGE / room / "__init__.py"
-    lines = [f"# {room}", ""]
+def api_page(package: str) -> str:
+    """A package's page: what it is for, then every module with its public names."""
+    source = PACKAGE / f"{package}.py" if (PACKAGE / f"{package}.py").exists() else PACKAGE / package / "__init__.py"
+    lines = [f"# {package}", ""]
     if source.name == "__init__.py":
         lines += [_summary(source), ""]
-    return "\n".join([*lines, *(f"::: {name}\n" for name in modules_of(room))])
+    return "\n".join([*lines, *(f"::: {name}\n" for name in modules_of(package))])
 
 
 def public_names() -> str:
-    """``potlp_jax.__all__`` with its comments as headings, each name linked to the page of its room."""
+    """``potlp_jax.__all__`` with its comments as headings, each name linked to the page of its package."""
     path = PACKAGE / "__init__.py"
     homes = {
         alias.asname or alias.name: f"{node.module}.{alias.name}"
@@ -115,7 +115,7 @@ def public_names() -> str:
             lines += ["", f"## {text.lstrip('# ').rstrip('.')}", ""]
         elif name := text.strip('",'):
             lines.append(f"- [`{name}`][{homes[name]}]" if name in homes else f"- `{name}`")
-    return "\n".join([*lines, "", "The other pages of this section list every module of a room, with types."])
+    return "\n".join([*lines, "", "The other pages of this section list every module of a package, with types."])
 
 
 def title_of(notebook: Path) -> str:

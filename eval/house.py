@@ -1,6 +1,6 @@
 """How readable the library is, in counts: function lengths, annotations, docstrings, Args and Returns, comments.
 
-    python -m eval.house                       # this library, beside its rooms
+    python -m eval.house                       # this library, package by package
     python -m eval.house PACKAGE [PACKAGE ...]  # folders of other packages, for comparison
 
 Comments are those of ``tokenize``, without pragmas (``noqa``, ``type:``, ``pragma``), per 100 lines that hold code. A

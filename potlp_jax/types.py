@@ -1,4 +1,4 @@
-"""Names shared by every room: array dimensions, sentinels and status bits.
+"""Names shared by every package: array dimensions, sentinels and status bits.
 
 Glossary of the dimension names in jaxtyping annotations. ``tests/test_types.py`` compares it with the package: every
 name that is used stands here, and no other. A name with a ``1`` at its end has one entry more than the name without

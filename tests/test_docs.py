@@ -155,12 +155,12 @@ def test_a_wrong_command_line_is_refused(line, parse):
 
 @pytest.mark.parametrize("page", PAGES, ids=_name)
 def test_paths_in_code_exist(page):
-    rooms = {path.name for path in (ROOT / "potlp_jax").iterdir() if path.is_dir()}
+    packages = {path.name for path in (ROOT / "potlp_jax").iterdir() if path.is_dir()}
     for word in re.findall(r"(?<!`)`([\w./*-]+/[\w./*-]+)`(?!`)", _prose(page)):
         first = word.split("/")[0]
         if first in FOLDERS:
             assert list(ROOT.glob(word)), f"{word} does not exist"
-        elif first in rooms and word.endswith((".py", "/")):
+        elif first in packages and word.endswith((".py", "/")):
             assert list((ROOT / "potlp_jax").glob(word)), f"{word} does not exist in potlp_jax"
 
 
@@ -210,12 +210,12 @@ def test_the_navigation_has_every_page():
     assert listed == {str(page.relative_to(ROOT / "docs")) for page in PAGES if page.is_relative_to(ROOT / "docs")}
 
 
-def test_the_picture_of_the_house_has_every_room():
+def test_the_picture_of_the_house_has_every_package():
     picture = (ROOT / "docs" / "architecture.md").read_text().split("```text\n", 1)[1].split("```", 1)[0]
     drawn = set(re.findall(r"^  (\w+)(?:/|\.py)", picture, re.M))
     package = ROOT / "potlp_jax"
-    rooms = {path.stem for path in package.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
-    assert drawn == rooms - {"__init__"}
+    packages = {path.stem for path in package.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    assert drawn == packages - {"__init__"}
 
 
 QUOTED = yaml.safe_load((ROOT / "docs" / "quoted.yaml").read_text())

@@ -1,4 +1,4 @@
-"""Dependencies run one way: a room imports only from itself and from rooms above it (see README)."""
+"""Dependencies run one way: a package imports only from itself and from packages above it (docs/architecture.md)."""
 
 import ast
 from pathlib import Path
@@ -32,7 +32,7 @@ ORDER = (
 PACKAGE = Path(potlp_jax.__file__).parent
 
 
-def _room(module: str) -> str | None:
+def _package(module: str) -> str | None:
     parts = module.split(".")
     return parts[1] if parts[0] == "potlp_jax" and len(parts) > 1 else None
 
@@ -52,23 +52,23 @@ SOURCES = [path for path in sorted(PACKAGE.rglob("*.py")) if path != PACKAGE / "
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_a_room_imports_only_from_rooms_above(path):
+def test_a_package_imports_only_from_packages_above(path):
     own = path.relative_to(PACKAGE).with_suffix("").parts[0]
     for module in _imports(path):
-        room = _room(module)
-        if room is not None:
-            assert ORDER.index(room) <= ORDER.index(own), f"{path.relative_to(PACKAGE)} imports {module}"
+        package = _package(module)
+        if package is not None:
+            assert ORDER.index(package) <= ORDER.index(own), f"{path.relative_to(PACKAGE)} imports {module}"
 
 
 def test_only_one_module_imports_each_heavy_neighbour():
     # Spot is imported where formulas become automata, typer by the command line alone, rosbags where logs are read.
-    for library, rooms in {"spot": {"task"}, "typer": {"cli"}, "matplotlib": {"view"}, "rosbags": {"logs"}}.items():
+    for library, packages in {"spot": {"task"}, "typer": {"cli"}, "matplotlib": {"view"}, "rosbags": {"logs"}}.items():
         users = {
             path.relative_to(PACKAGE).with_suffix("").parts[0]
             for path in SOURCES
             if any(module.split(".")[0] == library for module in _imports(path))
         }
-        assert users <= rooms, f"{library} is imported by {users - rooms}"
+        assert users <= packages, f"{library} is imported by {users - packages}"
 
 
 def test_one_module_imports_orbax_and_one_the_modules_of_flax():
@@ -89,5 +89,5 @@ def test_the_auditor_shares_no_code_with_the_planner():
     allowed = ("task.task", "trials.record", "world.grid", "verify.", "errors.")
     for path in (PACKAGE / "verify").glob("*.py"):
         for module in _imports(path):
-            if _room(module) is not None:
+            if _package(module) is not None:
                 assert module.removeprefix("potlp_jax.").startswith(allowed), f"{path.name} imports {module}"

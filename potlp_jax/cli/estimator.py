@@ -280,5 +280,5 @@ def _rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     return rows
 
 
-def _list(values: list[int]) -> str:
+def _list(values: Sequence[int]) -> str:
     return ", ".join(map(str, values))

@@ -1,6 +1,6 @@
 """Text becomes a checked co-safe formula: propositions, syntax, co-safety, errors with a caret.
 
-Formulas are in Spot's syntax. Spot is imported only when a formula is parsed, so that everything else in this room
+Formulas are in Spot's syntax. Spot is imported only when a formula is parsed, so that everything else in this package
 works without it.
 """
 
