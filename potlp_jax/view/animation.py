@@ -143,6 +143,7 @@ class _Stage:
         self._axes.set(xticks=[], yticks=[])
         self._panel.axis("off")
         _legend(self._axes, trial)
+        # One line: the layout leaves room for two lines of heading, and the second one says how it went.
         formula = trial.task_text if len(trial.task_text) <= 90 else trial.task_text[:87] + "..."
         place = 1 - 0.1 / self._figure.get_figheight()
         heading = f"{formula}\n{describe_outcome(trial)}"
@@ -183,6 +184,7 @@ class _Stage:
         draw_labels(axes, self._labels, size=LABEL_SIZE)
         draw_path(axes, path, states, inches_per_cell=self._scale)
         if decision is None:
+            # The robot stands where the star of the end is.
             draw_ends(axes, path)
         else:
             _draw_intention(axes, decision)
@@ -199,6 +201,7 @@ def _layout(rows: int, columns: int) -> tuple[Figure, Axes, Axes, float]:
         left = (width - columns * scale) / 2
         place = (left / width, (panel_height + 0.45) / height, columns * scale / width, rows * scale / height)
         return figure, figure.add_axes(place), figure.add_axes((0.02, 0.0, 0.96, panel_height / height)), scale
+    # A row of the table in letters of 8.5 points needs 5.6 inches; the map takes what it needs beside them.
     height, panel_width = 6.2, 5.6
     scale = min(5.2 / rows, 5.6 / columns, MAX_INCHES_PER_CELL)
     width = columns * scale + panel_width + 0.4
@@ -232,6 +235,7 @@ def _legend(axes: Axes, trial: Trial) -> None:
         handles=handles,
         loc="upper center",
         bbox_to_anchor=(0.5, -0.005),
+        # Two rows at most: the layout leaves half an inch below the map.
         ncols=min(6, len(handles)) if len(handles) <= 6 else (len(handles) + 1) // 2,
         fontsize=7.0,
         frameon=False,
@@ -292,6 +296,7 @@ def _action_rows(panel: Axes, actions: Sequence[ActionRecord], trial: Trial, dec
         colour, weight = (CHOSEN, "bold") if chosen else (INK, "normal")
         name = textwrap.shorten(action_name(action, task_of(trial)), NAME_LETTERS, placeholder=" ...")
         panel.text(0.0, row + 0.1, name, size=8.5, color=colour, weight=weight, va="center")
+        # The grey bar is a certain success, against which the coloured one is read.
         for share, fill in ((1.0, "#EEEEEE"), (action.success_probability, colour)):
             bar = Rectangle((_BAR, row - 0.15), _BAR_WIDTH * share, 0.5, facecolor=fill, edgecolor="none")
             panel.add_patch(bar)

@@ -76,6 +76,7 @@ def save_automaton(task: Task, path: Path) -> None:
 
 def to_dot(task: Task) -> str:
     """The automaton as a graph that ``dot -Tsvg`` draws."""
+    # An arrow from a point without a name marks the initial state, as in textbooks.
     lines = ["digraph task {", "  rankdir=LR;", '  start [shape=point, label=""];', f"  start -> {task.dfa.initial};"]
     for state in range(task.dfa.num_states):
         shape = "doublecircle" if task.dfa.accepting[state] else "circle"
@@ -91,6 +92,7 @@ def to_mermaid(task: Task) -> str:
     """The automaton as a flow chart that Markdown pages show."""
     lines = ["flowchart LR", f"  start(( )) --> s{task.dfa.initial}"]
     for state in range(task.dfa.num_states):
+        # Three parentheses are Mermaid's double circle.
         left, right = ("(((", ")))") if task.dfa.accepting[state] else ("((", "))")
         lines.append(f"  s{state}{left}{state}{right}")
     for edge in automaton_edges(task):
@@ -111,8 +113,10 @@ def draw_automaton(task: Task) -> Figure:
     places = _places(task, edges)
     if len(edges) > MAX_EDGES:
         edges = [_thinned(edge, places) for edge in edges if edge.source != edge.target]
+    # Labels stand at the middles of the arcs and have to lie within the picture as states do.
     arcs = [_bend(edge, places) * np.array([0.0, _length(edge, places) / 2]) + _middle(edge, places) for edge in edges]
     corners = np.array([*places.values(), *arcs])
+    # Half the width of a broken label on either side, and above the room of a loop with its guard.
     low, high = corners.min(axis=0) - np.array([1.1, 0.5]), corners.max(axis=0) + np.array([1.1, 0.75])
     title = textwrap.wrap(task.text, max(24, int((high - low)[0] / 0.085)))
     width, height, head = *(high - low), 0.3 + 0.18 * len(title)
@@ -154,6 +158,7 @@ def _places(task: Task, edges: list[Edge]) -> dict[int, np.ndarray]:
     """Inches of each state: in layers by the longest path from the start, so that progress reads from left to right."""
     live = networkx.DiGraph((e.source, e.target) for e in edges if not task.dfa.trap[e.target])
     live.add_nodes_from(z for z in range(task.dfa.num_states) if not task.dfa.trap[z])
+    # States that lead back to each other are one node here: what remains has no cycles, hence layers.
     condensed = networkx.condensation(live)
     layers = list(networkx.topological_generations(condensed))
     columns = [sorted(z for part in layer for z in condensed.nodes[part]["members"]) for layer in layers]
@@ -163,6 +168,7 @@ def _places(task: Task, edges: list[Edge]) -> dict[int, np.ndarray]:
         for column, states in enumerate(columns)
         for rank, state in enumerate(states)
     }
+    # Traps stand below all other states and outside the layers, for progress never goes through one.
     lowest = min((place[1] for place in places.values()), default=0.0)
     for rank, state in enumerate(np.flatnonzero(task.dfa.trap).tolist()):
         places[state] = np.array([(rank + 0.5) * ACROSS if places else 0.0, lowest - DOWN - 0.35])
@@ -178,6 +184,7 @@ def _draw_states(axes: Axes, task: Task, places: dict[int, np.ndarray]) -> None:
     )
     accepting = [state for state in graph if task.dfa.accepting[state]]
     networkx.draw_networkx_nodes(
+        # The second ring: a disc of 0.66 of the area lies 2.8 points within the first.
         graph.subgraph(accepting),
         places,
         ax=axes,
@@ -196,6 +203,7 @@ def _draw_states(axes: Axes, task: Task, places: dict[int, np.ndarray]) -> None:
 
 
 def _draw_edge(axes: Axes, task: Task, edge: Edge, places: dict[int, np.ndarray]) -> None:
+    # Edge by edge, because networkx takes one curvature for all that it draws in a call.
     graph = networkx.DiGraph([(edge.source, edge.target)])
     graph.add_nodes_from(places)
     failed = bool(task.dfa.trap[edge.target])

@@ -127,6 +127,7 @@ def draw_reliability(reports: Mapping[str, Report], title: str) -> Figure:
 
 
 def _draw_bins(axes: Axes, figures: Figures) -> None:
+    # An empty bin has no share of successes; a point at 0 would look like an error.
     filled = [entry for entry in figures.bins if entry.samples]
     axes.plot([0, 1], [0, 1], color=FAINT, linewidth=1.0, label="calibrated")
     axes.axhline(figures.success_rate, color=FAINT, linewidth=1.0, linestyle=":", label="mean of all samples")
@@ -163,6 +164,7 @@ def _draw_counts(axes: Axes, figures: Figures) -> None:
 
 def _draw_skills(axes: Axes, reports: Mapping[str, Report]) -> None:
     rows = _rows(reports[INTACT])
+    # By name, so that a variant looks the same whichever others were evaluated.
     styles = {INTACT: ("o", SERIES_COLOURS[0]), "image": ("s", SERIES_COLOURS[1]), "phi": ("D", SERIES_COLOURS[2])}
     least = 0.0
     for name, report in reports.items():
@@ -175,6 +177,7 @@ def _draw_skills(axes: Axes, reports: Mapping[str, Report]) -> None:
         axes.axhline(last + 0.5, color="#DDDDDD", linewidth=0.8)
     axes.set_yticks(range(len(rows)), [f"{name} ({figures.samples})" for name, figures in rows], size=8.5)
     axes.axvline(0, color=INK, linewidth=0.8)
+    # Downward, in the order of the tables.
     axes.set(ylim=(len(rows) - 0.4, -0.6), xlim=(1.05 * least - 0.04, 1.02))
     axes.set_xlabel("Brier skill over the constant prior", color=INK)
     axes.grid(axis="x", color="#EEEEEE", linewidth=0.6)
@@ -217,9 +220,11 @@ def draw_costs(samples: Samples, predictions: Predictions, overall: Figures, tit
 
 
 def _draw_cost(axes: Axes, true: np.ndarray, said: np.ndarray, share: np.ndarray, unit: str) -> None:
+    # At least 1: without samples the axes still need a length.
     limit = 1.03 * max([1.0, *true.tolist(), *said.tolist()])
     axes.plot([0, limit], [0, limit], color=FAINT, linewidth=1.0, zorder=3)
     if len(true):
+        # Logarithmic, because most samples fall into few cells; from 0.3, so that a single sample is not white.
         axes.hexbin(true, said, gridsize=48, extent=(0, limit, 0, limit), bins="log", mincnt=1, cmap="Blues", vmin=0.3)
         # What an estimator that never looks would say at best.
         mean = float(np.average(true, weights=share))
@@ -247,6 +252,7 @@ def draw_predictions(
     Returns:
         One block a kind, with the question and the figures below each panorama.
     """
+    # Inches. Panoramas of the default camera (512 by 128) keep their proportions.
     width, picture, words, heading = 11.5, 5.5 / 4, 0.62, 0.42
     rows = {name: max(1, math.ceil(len(members) / _COLUMNS)) for name, members in chosen.items()}
     height = 0.68 + sum(heading + count * (picture + words) for count in rows.values())
@@ -255,6 +261,7 @@ def draw_predictions(
     figure.text(0.5, 1 - 0.34 / height, _QUESTION_KEY, ha="center", va="top", size=8, color=QUIET)
     top = height - 0.68
     for name, members in chosen.items():
+        # True positives and true negatives: what was said came true.
         colour = RIGHT if name.startswith("true") else WRONG
         label = f"{_KINDS[name]} (most confident first)" if len(members) else f"{_KINDS[name]}: none"
         figure.text(0.2 / width, (top - 0.2) / height, label, va="center", size=11, weight="bold", color=colour)

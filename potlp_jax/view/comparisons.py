@@ -25,6 +25,7 @@ def comparison_table(comparison: Comparison) -> RichTable:
     a last column has the share of attainable savings over all worlds, with unsatisfied trials charged their budget.
     """
     satisfied, charged = comparison.satisfied, comparison.charged
+    # Where the known map costs as much as the baseline, the share of attainable savings is 0 / 0.
     nothing = any(math.isnan(row.attainable_share) for row in satisfied.rows)
     shown = RichTable(
         box=SIMPLE_HEAD,
@@ -61,6 +62,7 @@ def _policy_name(policy: str, styles: Mapping[str, PolicyStyle]) -> Text:
 
 def _cells(row: PolicyRow) -> tuple[str, ...]:
     low, high = (_percent(share, unit="") for share in (row.attainable_low, row.attainable_high))
+    # A single world has no standard error.
     error = "" if math.isnan(row.trial_savings_error) else f" ± {100 * row.trial_savings_error:.1f}%"
     return (
         "-" if math.isnan(row.mean_cost) else f"{row.mean_cost:.1f}",
@@ -86,6 +88,7 @@ def remark_lines(comparison: Comparison) -> list[str]:
             f"({satisfied.dropped} left out); 'all worlds' charges an unsatisfied trial its budget."
         )
     for policy, counts in comparison.outcomes.items():
+        # Trials that ended satisfied have a column of the table.
         others = [f"{count} {name}" for name, count in counts.items() if name != SATISFIED]
         if others:
             lines.append(f"{policy}: {', '.join(others)}")
@@ -153,6 +156,7 @@ def scatter_costs(axes: Axes, pairs: Sequence[Pair], policies: Sequence[str]) ->
             s=12 if policy == KNOWN_MAP else 26,
             marker=style.marker,
             color=style.colour,
+            # Worlds may lie on each other, above all on the diagonal, where a policy does as the baseline does.
             alpha=0.65,
             linewidths=0,
             label=f"{policy} ({len(good)} worlds)",
@@ -163,6 +167,7 @@ def scatter_costs(axes: Axes, pairs: Sequence[Pair], policies: Sequence[str]) ->
         axes.scatter(*failed, s=34, marker="x", color=style.colour, zorder=3)
         unsatisfied = unsatisfied or bool(bad)
     if unsatisfied:
+        # One entry for all policies: the colour of a cross says whose trial it was.
         axes.scatter([], [], s=34, marker="x", color=FAINT, label="not satisfied")
     axes.legend(loc="upper left", fontsize=8.5, frameon=False)
 
@@ -170,6 +175,7 @@ def scatter_costs(axes: Axes, pairs: Sequence[Pair], policies: Sequence[str]) ->
 def _mark_diagonal(axes: Axes, limit: float) -> None:
     axes.plot([0, limit], [0, limit], color=FAINT, linewidth=1.0, zorder=1)
     axes.annotate(
+        # Named where it is: in the legend it would be taken for a policy.
         "as the baseline",
         (0.985 * limit, 0.985 * limit),
         xytext=(-4, -10),

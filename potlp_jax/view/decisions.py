@@ -52,6 +52,7 @@ def task_of(trial: Trial) -> Task:
 
 def rank_actions(decision: Decision) -> list[ActionRecord]:
     """Actions by expected cost, the chosen one first among equals."""
+    # Ties occur, for instance where nothing leads on and all actions cost infinity: the index keeps tables repeatable.
     return sorted(decision.actions, key=lambda action: (action.q_value, action.index != decision.choice, action.index))
 
 
@@ -82,6 +83,7 @@ def action_table(trial: Trial, decision: Decision) -> Table:
     )
     table.add_column("", width=1)
     for name in ("action", "transition", "subgoal"):
+        # Words may wrap; a number that is broken into two lines is misread.
         table.add_column(name, no_wrap=name != "action")
     for name in FIGURES:
         table.add_column(name, justify="right", no_wrap=True)
@@ -106,6 +108,7 @@ def figure_texts(action: ActionRecord, *, digits: int = 2) -> list[str]:
 
 def cost_text(value: float) -> str:
     """A cost with one digit; infinity as a sign."""
+    # Costs are tens to hundreds: a second digit would only widen the columns.
     return f"{value:.1f}" if math.isfinite(value) else "∞"
 
 

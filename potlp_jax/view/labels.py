@@ -27,6 +27,7 @@ DISTANCES: tuple[float, ...] = (1.0, 1.6, 2.4, 3.4)
 SIDES = ((0, -1), (0, 1), (1, 0), (-1, 0), (1, -1), (-1, -1), (1, 1), (-1, 1))
 """Where a name is tried around its area (x, y), the best first: above, below, right, left, then the corners."""
 
+# The others sum up to 68: both ends 30, the path 20, areas 10, and 8 for the last of 33 places.
 FORBIDDEN: float = 100.0
 """Price of a name beyond the map or on another name: above the sum of all other prices."""
 
@@ -77,6 +78,8 @@ def place_labels(
     labels: list[AreaLabel] = []
     # From (row, column) to (x, y).
     steps = np.array(path, float)[:, ::-1]
+    # Greedy, large areas first, for their names are looked for first: the best placement of all names together is
+    # NP-hard (Marks and Shieber, 1991).
     for letter, cells in _areas(letters)[:MAX_LABELS]:
         name = letter_name(letter, propositions)
         # Mean width and height of the font's letters, with the box around them: good enough without drawing it first.
@@ -108,6 +111,7 @@ def draw_labels(axes: Axes, labels: Sequence[AreaLabel], *, size: float = 9.0) -
         apart = np.abs(np.subtract(label.anchor, label.centre)) > label.half_size
         if np.any(apart):
             (x, y), (to_x, to_y) = label.centre, label.anchor
+            # Above the path; the name itself above its line, and below the marks of start and end.
             axes.plot([x, to_x], [y, to_y], color=INK, linewidth=0.7, zorder=4)
         axes.text(
             *label.centre,
@@ -137,6 +141,7 @@ def _candidates(
 ) -> list[Float[np.ndarray, "2"]]:
     """Centres (x, y) to try, the best first: within an area that is large enough, then around it."""
     low, high = cells.min(axis=0)[::-1], cells.max(axis=0)[::-1]
+    # Half a cell more than from centre to centre: cells are squares around whole numbers.
     centre, reach = (low + high) / 2, (high - low) / 2 + 0.5
     around = [centre + np.array(side) * (reach + grow * half + margin) for grow in DISTANCES for side in SIDES]
     return [centre, *around] if np.all(reach > half) else around
@@ -151,6 +156,7 @@ def _price(
     mark: float,
 ) -> float:
     """What a name would hide: another name (forbidden), the ends of the path, cells of the path and of areas."""
+    # The picture ends half a cell beyond the centres of the outermost cells.
     last = np.array(letters.shape)[::-1] - 0.5
     outside = np.any(centre - half < -0.5) or np.any(centre + half > last)
     covers = any(np.all(np.abs(centre - other.centre) < half + other.half_size) for other in placed)

@@ -36,6 +36,8 @@ from potlp_jax.view.style import (
 )
 from potlp_jax.world.grid import World
 
+# What covers what (zorder): the raster 0, path 3, decisions and the lines of names 4, names and the intended path 5,
+# subgoals and the start 6, the end 7, changes of state and the robot 8, numbers of subgoals 9.
 IMAGE_PIXELS: int = 1400
 """Longer side of the raster below the lines; cells become squares of whole pixels."""
 
@@ -71,7 +73,7 @@ def cell_image(
     occupied = np.asarray(world.occupied)[:rows, :columns]
     letters = np.asarray(world.letters)[:rows, :columns]
     # Whole pixels a cell: a raster that is scaled by a fraction loses thin walls.
-    scale = int(np.clip(pixels // max(rows, columns), 1, 60))
+    scale = int(np.clip(pixels // max(rows, columns), 1, MAX_CELL_PIXELS))
     # Index: occupied + 2 * unseen.
     palette = np.array([rgb(FREE_SEEN), rgb(WALL_SEEN), rgb(FREE_UNSEEN), rgb(WALL_UNSEEN)], np.uint8)
     image = _enlarge(palette[occupied + 2 * ~seen], scale)
@@ -137,6 +139,7 @@ def draw_path(
     Returns:
         The lines, one segment a step.
     """
+    # Points to inches to cells. Slightly more than half a line's width, so that a gap parts the two directions.
     lane = _keep_right(np.array(path, float)[:, ::-1], 0.6 * PATH_WIDTH / 72 / inches_per_cell)
     segments = np.stack([lane[:-1], lane[1:]], axis=1)
     lines = LineCollection(
@@ -199,6 +202,7 @@ def draw_subgoals(axes: Axes, decision: Decision, *, size: float = 8.0) -> None:
         axes.scatter(columns, rows, s=52, marker="^", facecolors="white", edgecolors=CHOSEN, linewidths=1.6, zorder=6)
     if decision.target is not None:
         row, column = decision.target
+        # Larger than an open triangle, which it covers where the target is one of the subgoals.
         axes.scatter([column], [row], s=60, marker="^", facecolors=CHOSEN, edgecolors="white", linewidths=0.8, zorder=6)
     # A white rim keeps a number readable on walls and on the path.
     rim = [patheffects.withStroke(linewidth=2.5, foreground="white")]
@@ -226,6 +230,7 @@ def cell_handles() -> list[Line2D | Patch]:
     return [
         Patch(facecolor=FREE_SEEN, edgecolor=FAINT, label="seen free"),
         Patch(facecolor=WALL_SEEN, label="seen wall"),
+        # matplotlib hatches in the colour of the edge; a width of 0 leaves out the edge itself.
         Patch(facecolor=FREE_UNSEEN, edgecolor=QUIET, hatch="////", linewidth=0, label="never seen"),
     ]
 

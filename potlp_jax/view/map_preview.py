@@ -21,6 +21,7 @@ from potlp_jax.view.layers import area_handles, legend_columns
 from potlp_jax.view.style import CHOSEN, FAINT, INK, area_colour, new_figure, rgb
 from potlp_jax.world.grid import World
 
+# Reachable space is of a light blue, which neither states (dark) nor areas (warm) have.
 OBSTACLE, UNREACHED, UNKNOWN, REACHED = "#3A3A3A", "#FFFFFF", "#D2D2D2", "#D7E8F7"
 LONGEST: float = 10.0
 """Inches of the longer side of the map."""
@@ -28,6 +29,7 @@ LONGEST: float = 10.0
 RASTER: int = 1050
 """Pixels of the longer side of the raster: below those of the picture, so that no thin wall is lost in drawing."""
 
+# Metres: 1, 2 and 5 of each decade, as cartographers draw them.
 SCALE_BARS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500)
 
 
@@ -76,6 +78,7 @@ def _plan(
     (left, right), (bottom, top) = _limits(image_map, clean)
     scale = LONGEST / max(right - left, top - bottom)
     width, height = (right - left) * scale, (top - bottom) * scale
+    # However narrow the map, its title and its legend must fit.
     total_width, total_height = max(width, 4.6) + 0.95, height + 1.75
     figure = new_figure(total_width, total_height)
     axes = figure.add_axes((0.7 / total_width, 1.1 / total_height, width / total_width, height / total_height))
@@ -131,6 +134,7 @@ def _show(axes: Axes, raster: UInt8[np.ndarray, "h w C"], frame: GridFrame, zord
     """Put a raster whose pixels are blocks of the frame's cells, from the top left on, where it lies in metres."""
     axes.imshow(
         raster,
+        # An extent is always upright; what turns the raster is the transform.
         extent=(0, raster.shape[1] * block, frame.height - raster.shape[0] * block, frame.height),
         transform=_to_metres(frame) + axes.transData,
         interpolation="nearest",
@@ -163,6 +167,7 @@ def _any_in_blocks(pixels: Bool[np.ndarray, "H W"], block: int) -> Bool[np.ndarr
 
 
 def _painted(where: Bool[np.ndarray, "H W"], colour: str) -> UInt8[np.ndarray, "H W 4"]:
+    # Alpha 0: where nothing is painted, lower layers show.
     raster = np.zeros((*where.shape, 4), np.uint8)
     raster[where] = (*rgb(colour), 255)
     return raster
@@ -190,6 +195,8 @@ def _labels_in_metres(family: RosMap, world: World, inches_per_cell: float) -> l
         return float(x), float(y)
 
     start = tuple(np.asarray(world.start).tolist())
+    # Names are placed on the upright grid and keep clear of each other there; on a map that is turned they may come
+    # nearer, because their boxes stay level.
     placed = place_labels(world, family.propositions, [start], inches_per_cell=inches_per_cell)
     half = frame.resolution
     return [

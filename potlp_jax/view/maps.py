@@ -51,11 +51,14 @@ def draw_trial(trial: Trial) -> Figure:
     A trial that did not satisfy its task also shows the subgoals of its last decision: what was left to try.
     """
     rows, columns = map_extent(trial.world)
+    # The figure is made to fit the map, not the map to the figure: cells stay square, and no border is left over.
     width, height = _map_size(rows, columns, LONGEST)
+    # 0.55 inches on the left are for the numbers of the rows.
     total_width = width + 0.9
     heading = [*_formula_lines(trial, total_width), *textwrap.wrap(describe_outcome(trial), _letters(total_width))]
     groups = _legend_groups([trial])
     if trial.decisions:
+        # A trial whose task is infeasible from the start has decided nothing.
         groups[0].append(Line2D([], [], marker="o", ls="", ms=3.5, color=INK, label="decision"))
     head, foot = LINE * len(heading) + 0.2, 0.5 + _legend_inches(groups, total_width)
     total = height + head + foot
@@ -91,9 +94,11 @@ def draw_side_by_side(trials: Sequence[Trial], titles: Sequence[str] | None = No
         PictureError: the trials have different tasks or maps.
     """
     first = trials[0]
+    # Tasks are compared as automata: their states are what the colours of the paths mean.
     if any(trial.task_hoa != first.task_hoa or map_extent(trial.world) != map_extent(first.world) for trial in trials):
         raise PictureError("trials that are drawn side by side must have the same world and task")
     rows, columns = map_extent(first.world)
+    # Beside another a map has half the page's width, which would make a strip of a wide one.
     stacked = columns > rows
     width, height = _map_size(rows, columns, LONGEST if stacked else LONGEST / 2)
     across, down = (1, len(trials)) if stacked else (len(trials), 1)
@@ -118,6 +123,7 @@ def draw_side_by_side(trials: Sequence[Trial], titles: Sequence[str] | None = No
             left / total_width,
             (top + 0.06) / total,
             text,
+            # The policy's colour, as in plots and tables; colours of the path say states.
             color=styles[trial.policy].colour,
             va="bottom",
             size=11,
@@ -135,6 +141,8 @@ def describe_outcome(trial: Trial) -> str:
 
 def _world_in_words(trial: Trial) -> str:
     """The environment and which of its worlds it was; of a path only the name is kept."""
+    # Environments made from files are named KIND:PATH,SETTINGS/SPLIT. The heading has no room for folders and settings;
+    # the record has them.
     environment = re.sub(r"^(map|floorplan|parcels):(?:[^,]*/)?([^/,]+)/?(,.*)?(/\w+)$", r"\1:\2\4", trial.environment)
     return environment if trial.seed is None else f"{environment}, world {trial.seed}"
 
@@ -151,12 +159,15 @@ def _draw_walk(axes: Axes, trial: Trial, *, inches_per_cell: float) -> None:
 
 def _map_size(rows: int, columns: int, longest: float) -> tuple[float, float]:
     """Inches of the map: at most ``longest`` wide and 0.75 of it high, small maps smaller."""
+    # With heading and legend a picture of these proportions still fits a landscape screen.
     scale = min(longest / columns, 0.75 * longest / rows, MAX_INCHES_PER_CELL)
     return columns * scale, rows * scale
 
 
 def _letters(width: float, points: float = 10.0) -> int:
     """How many letters of a line fit ``width`` inches, from the mean width of the sans-serif font's letters."""
+    # 0.58 of the size: DejaVu Sans, which matplotlib brings along. Measuring needs a figure, and the figure's size
+    # depends on the number of lines.
     return max(20, int(width / (0.58 * points / 72)))
 
 
@@ -164,6 +175,7 @@ def _formula_lines(trial: Trial, width: float) -> list[str]:
     """The formula in lines that fit ``width`` inches, four at most."""
     # Bold letters are wider.
     formula = textwrap.wrap(trial.task_text, _letters(width, 11.5))
+    # The record has the formula whole; more lines would push the map off the screen.
     return formula if len(formula) <= 4 else [*formula[:3], formula[3] + " ..."]
 
 
@@ -179,6 +191,7 @@ def _legend_groups(trials: Sequence[Trial]) -> list[list[Handle]]:
     """Two legends for trials of one world and task: short entries, and the states that any trial visited in words."""
     first = trials[0]
     states = [state for trial in trials for state in trial.states]
+    # Apart, for the words of states are long: in one legend they would widen its columns and scatter the short entries.
     short = [*cell_handles(), *area_handles(first.propositions, first.world), *end_handles()]
     return [short, [*state_handles(states, task_of(first))]]
 
@@ -191,6 +204,7 @@ def _add_legend(figure: Figure, groups: Sequence[Sequence[Handle]]) -> None:
     """The groups below each other at the bottom of the figure, the last one lowest."""
     width, height = figure.get_size_inches()
     bottom = 0.06
+    # Upward from the bottom, by the same number of lines as ``_legend_inches`` made room for.
     for handles in reversed(groups):
         columns = legend_columns(handles, width)
         figure.legend(

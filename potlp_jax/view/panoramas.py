@@ -19,8 +19,8 @@ _NAME_LETTERS = 24
 """Of what is tried; longer words are cut."""
 
 WIDTH: float = 12.0
-PICTURE_WIDTH: float = 8.2
 # What is left holds the 50 letters of a line of answers: 3.2 inches in the monospaced font.
+PICTURE_WIDTH: float = 8.2
 ROW_HEIGHT: float = 1.75
 TITLE_HEIGHT: float = 0.28
 """Inches of the figure, of a panorama, of a row, and of the line above a panorama."""

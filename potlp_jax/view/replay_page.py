@@ -26,6 +26,7 @@ MAP_PIXELS: tuple[int, int] = (1100, 640)
 PIXELS_PER_INCH: int = 96
 """Of a browser, by definition of CSS."""
 
+# A page embeds a panorama for each observation; as PNG they would be three times as large.
 _JPEG_QUALITY: int = 80
 
 
@@ -79,6 +80,7 @@ def replay_data(trial: Trial, panoramas: Mapping[int, UInt8[np.ndarray, "rows co
     # Labelled cells are few: a list is shorter than a raster.
     labelled = np.argwhere(letters > 0)
     rows, columns = map_extent(trial.world)
+    # Whole pixels a cell, so that no thin wall vanishes; where a map is too large the browser scales it.
     pixels = int(np.clip(min(MAP_PIXELS[0] // columns, MAP_PIXELS[1] // rows), 2, 24))
     labels = place_labels(trial.world, trial.propositions, trial.path, inches_per_cell=pixels / PIXELS_PER_INCH)
     return {
@@ -118,6 +120,7 @@ def _decision(trial: Trial, decision: Decision) -> dict[str, Any]:
         "state": decision.state,
         "cell": list(decision.cell),
         "text": f"Decision {decision.index}: {describe_move(trial, decision)}",
+        # JSON has no infinity; the script then leaves the expected cost out.
         "value": decision.value if math.isfinite(decision.value) else None,
         "subgoals": [list(cell) for cell in decision.subgoals],
         "observations": list(decision.observations),
@@ -128,6 +131,7 @@ def _decision(trial: Trial, decision: Decision) -> dict[str, Any]:
                 "meaning": _meaning(task_of(trial), action),
                 "subgoal": action.subgoal,
                 "chosen": action.index == decision.choice,
+                # As texts: rounded once, here, as the table of ``potlp explain`` has them.
                 "figures": figure_texts(action, digits=3),
             }
             for action in rank_actions(decision)

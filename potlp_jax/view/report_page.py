@@ -125,6 +125,7 @@ def _table(table: Table, caption: str, styles: Mapping[str, PolicyStyle]) -> str
     best = max((row.attainable_share for row in table.rows if row.policy != KNOWN_MAP), default=math.nan)
     body = ""
     for row in table.rows:
+        # NaN equals nothing: where nothing can be attained, no row is marked.
         kind = ' class="best"' if row.attainable_share == best else ""
         cells = (
             _percent(row.attainable_share),
@@ -150,6 +151,7 @@ def _policy_cell(policy: str, styles: Mapping[str, PolicyStyle]) -> str:
 
 
 def _percent(share: float) -> str:
+    # Adding zero turns a rounded -0.0 into 0.0.
     return "-" if math.isnan(share) else f"{100 * share + 0.0:.1f} %"
 
 

@@ -26,6 +26,7 @@ def cumulative(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
         total = np.cumsum([pair[policy].cost for pair in pairs])
         axes.plot(np.arange(1, len(pairs) + 1), total, style.line, color=style.colour, linewidth=1.6, label=policy)
     axes.set(xlim=(0, max(len(pairs), 1)), xlabel="worlds", ylabel="cost of all of them")
+    # From 0: only then are lengths in the plot in proportion to costs.
     axes.set_ylim(bottom=0)
     _legend(axes)
     return _svg(figure)
@@ -38,6 +39,7 @@ def savings_by_world(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
     # Each world in the middle of its share of the axis.
     share = 100 * (np.arange(len(pairs)) + 0.5) / max(len(pairs), 1)
     for policy, style in policy_styles(policies).items():
+        # Against itself the baseline saves nothing: it is the line at 0.
         if policy == BASELINE:
             continue
         # Sorted by policy: a curve shows a distribution, points of one column belong to different worlds.
@@ -49,6 +51,7 @@ def savings_by_world(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
 
 
 def _axes(width: float, height: float) -> tuple[Figure, Axes]:
+    # Made for three beside each other on a wide page (``.plots`` in report.css).
     figure = new_figure(width, height)
     axes = figure.add_axes((0.14, 0.11, 0.83, 0.86))
     axes.grid(color=FAINT, linewidth=0.3)

@@ -54,12 +54,15 @@ FAINT = "#9A9A9A"
 # Magenta stands out from cool states and warm areas alike; nothing else has it.
 CHOSEN = "#E6007E"
 CHOSEN_ROW = "#FCE1F0"
+# Warm like areas, but only small marks have it, and they have a rim of ink.
 ROBOT = "#FFD400"
 
+# What was seen has the stronger contrast; a wall is darker than free space whether it was seen or not.
 FREE_SEEN, WALL_SEEN = "#FFFFFF", "#4A4A4A"
 FREE_UNSEEN, WALL_UNSEEN = "#E4E4E4", "#C6C6C6"
 HATCH = "#B4B4B4"
 
+# Okabe and Ito's green and vermilion, which readers with a red-green deficiency tell apart.
 RIGHT, WRONG = "#009E73", "#D55E00"
 """Predictions that came true, and those that did not."""
 
@@ -74,6 +77,7 @@ POLICY_COLOURS: Mapping[str, str] = MappingProxyType(
 MARKERS = "osD^vP*X"
 LINES = ("-", "--", "-.", ":")
 
+# A map of the full 11 inches (maps.LONGEST) has about 1200 pixels: as wide as most pages show a picture.
 DOTS_PER_INCH: int = 110
 
 
@@ -97,6 +101,7 @@ def policy_styles(policies: Iterable[str]) -> dict[str, PolicyStyle]:
     # A policy of one's own never looks like a shipped one.
     colours = list(dict.fromkeys([*POLICY_COLOURS.values(), *SERIES_COLOURS]))
     styles = {
+        # There are ten colours; the eleventh policy has the first again, but neither its marker nor its line.
         name: PolicyStyle(colours[rank % len(colours)], MARKERS[rank % len(MARKERS)], LINES[rank % len(LINES)])
         for rank, name in enumerate(names)
     }
@@ -148,6 +153,7 @@ def figure_bytes(figure: Figure, suffix: str) -> bytes:
     # Dates and random identifiers would make equal pictures differ from run to run.
     date = {"svg": "Date", "pdf": "CreationDate"}.get(suffix)
     buffer = io.BytesIO()
+    # Text that stays text is searched, copied and set in the page's font; outlines are not.
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "potlp"}):
         figure.savefig(buffer, format=suffix, metadata=None if date is None else {date: None})
     return buffer.getvalue()

@@ -40,6 +40,7 @@ class _Box:
     success: bool = True
     share: float = 1.0
     children: list["_Box"] = dataclasses.field(default_factory=list)
+    # Filled in by ``_arrange``, which needs the whole tree.
     level: int = 0
     height: float = 0.0
 
@@ -68,6 +69,7 @@ def draw_tree(tree: Mapping[str, Any], task: Task, title: str | None = None, *, 
     top, bottom = 1.15 + 0.34 * len(heading), max(rows, 2.0) + 0.15
     figure = new_figure(width, ROW_INCHES * (top + bottom))
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    # Rows count downward, so that the action of least expected cost stands on top.
     axes.set(xlim=(-0.1, (width - 0.3) / LEVEL_INCHES), ylim=(bottom, -top))
     axes.axis("off")
     for box in boxes:
@@ -86,6 +88,7 @@ def _children(node: Mapping[str, Any], task: Task, breadth: int, simulations: in
     for rank, action in enumerate(node["actions"][:breadth]):
         for name in ("success", "failure"):
             outcome = action[name]
+            # An outcome that cannot occur: finishing in known space never fails.
             if outcome is None:
                 continue
             # Following every action would fill walls: the tree grows by its breadth at each level.
@@ -146,6 +149,7 @@ def _walk(box: _Box) -> Iterator[_Box]:
 def _draw_branch(axes: Axes, parent: _Box, child: _Box) -> None:
     start, end = parent.level + BOX_WIDTH, child.level
     axes.plot(
+        # Short level ends: where lines of several children begin, they still meet their boxes at a right angle.
         [start, start + 0.05, end - 0.05, end],
         [parent.height, parent.height, child.height, child.height],
         color=CHOSEN if child.best else FAINT,
