@@ -5,6 +5,7 @@ import importlib.metadata
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 # Nearly all of the suite's time is compilation. XLA's optimiser takes half of it, and the newer emitters of fused loops
@@ -46,3 +47,10 @@ def external_data() -> Path:
     if not folder:
         pytest.skip("POTLP_EXTERNAL_DATA is not set: data made by others is not part of the repository")
     return Path(folder)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forget_programs() -> Iterator[None]:
+    """Compiled programs go when their module is done: a worker's memory would grow to several gigabytes."""
+    yield
+    jax.clear_caches()
