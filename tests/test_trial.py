@@ -173,7 +173,10 @@ def test_damaged_records_are_refused(tmp_path):
     with pytest.raises(RecordError, match="not a trial record"):
         load_trial(path)
     path.write_text(json.dumps({"format": "potlp-trial-1"}))
-    with pytest.raises(RecordError, match="damaged"):
+    with pytest.raises(RecordError, match=r"found 'potlp-trial-1'\); run `potlp run` again"):
+        load_trial(path)
+    path.write_text(json.dumps({"format": "potlp-trial-2"}))
+    with pytest.raises(RecordError, match="the trial record is damaged"):
         load_trial(path)
     world = ROOMS.generate(world_key(Split.VALIDATION, 0, "rooms"))
     data = _run(world, TASKS[0], Policy.ORACLE, 0).to_dict()

@@ -29,7 +29,7 @@ from potlp_jax.world.grid import (
 )
 from potlp_jax.world.moves import Cell
 
-FORMAT = "potlp-trial-1"
+FORMAT = "potlp-trial-2"
 NEVER_SEEN: int = -1
 """Entry of ``first_seen`` for a cell that was never observed."""
 LOG_PREFIX: str = "log:"
