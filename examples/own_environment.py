@@ -6,6 +6,8 @@ The command line takes it by ``module:attribute``; so do ``potlp compare``, swee
 is installed may declare it instead as an entry point in the group ``potlp_jax.environments``.
 """
 
+from types import MappingProxyType
+
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
@@ -19,7 +21,7 @@ class Corridor(potlp_jax.Generator):
 
     name = "corridor"
     propositions = ("fire", "exit")
-    tasks = {"1": "!fire U exit"}  # noqa: RUF012 - read only
+    tasks = MappingProxyType({"1": "!fire U exit"})
 
     def draw(self, key: PRNGKeyArray) -> potlp_jax.World:
         """The corridor of this key."""

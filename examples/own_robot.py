@@ -49,8 +49,8 @@ class Rover:
         return potlp_jax.belief_from_numpy(self._cells, np.where(seen, letters, 0)), self._cell
 
     def panorama(self) -> UInt8[Array, "rows columns 3"]:
-        """Asked by policies that look; this robot has no camera."""
-        raise NotImplementedError("the rover has no camera: choose a policy that does not look")
+        """Asked by the policy potlp alone; this robot has no camera."""
+        raise RuntimeError("the rover has no camera: choose a policy other than potlp")
 
     def advance(self, path: KnownPath, stop: Stop) -> Leg:
         """Drive along the path, a few cells at a time. ``stop`` would tell when it is worth to stop earlier."""

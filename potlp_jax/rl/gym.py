@@ -27,8 +27,6 @@ class GymTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
     ``TaskEnv``. ``info`` holds ``action_mask``, the ``cost`` travelled and the ``outcome``.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - gymnasium's own declaration
-
     def __init__(
         self,
         environment: str | Generator,
