@@ -33,10 +33,10 @@ if TYPE_CHECKING:
     from potlp_jax.planning.policies import decide as decide
     from potlp_jax.planning.problem import PlanningProblem as PlanningProblem
     from potlp_jax.planning.problem import enumerate_actions as enumerate_actions
-    from potlp_jax.planning.search.api import Plan as Plan
     from potlp_jax.planning.search.api import plan_actions as plan_actions
     from potlp_jax.planning.search.config import SearchConfig as SearchConfig
     from potlp_jax.planning.search.config import UctConfig as UctConfig
+    from potlp_jax.planning.search.plan import Plan as Plan
     from potlp_jax.planning.situation import DecisionConfig as DecisionConfig
     from potlp_jax.rl.episodes import TaskEnv as TaskEnv
     from potlp_jax.task.task import Task as Task
@@ -160,8 +160,9 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "planning.policies": ("Policy", "PolicyFunction", "decide"),
     "planning.problem": ("PlanningProblem", "enumerate_actions"),
     "planning.situation": ("DecisionConfig",),
-    "planning.search.api": ("Plan", "plan_actions"),
+    "planning.search.api": ("plan_actions",),
     "planning.search.config": ("SearchConfig", "UctConfig"),
+    "planning.search.plan": ("Plan",),
     "rl.episodes": ("TaskEnv",),
     "task.task": ("Task", "TaskArrays", "TaskSizes", "stack_tasks"),
     "trials.batch": ("Finished", "Start", "run_batch"),

@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from potlp_jax.task import Task, TaskError
+from potlp_jax.errors import TaskError
 from potlp_jax.task.automaton import Dfa, canonical_dfa
 from potlp_jax.task.hoa import read_hoa, write_hoa
+from potlp_jax.task.task import Task
 from potlp_jax.verify.semantics import satisfies_lasso, word_satisfies, word_violates
 
 HEADER = 'HOA: v1\nStates: 2\nStart: 0\nAP: 2 "a" "b"\nacc-name: Buchi\nAcceptance: 1 Inf(0)\n'
@@ -340,7 +341,7 @@ def test_hoa_writing_is_exact():
 def test_hoa_needs_no_spot():
     code = (
         "import sys; sys.modules['spot'] = None\n"
-        "from potlp_jax.task import Task, shipped_tasks\n"
+        "from potlp_jax.task.task import Task, shipped_tasks\n"
         "print({n: Task.from_hoa(Task.shipped(n).to_hoa()).dfa.num_states for n in shipped_tasks()})"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from potlp_jax.planning.exact.api import ProblemTooLargeError, solve_exact
+from potlp_jax.errors import ProblemTooLargeError
+from potlp_jax.planning.exact.api import solve_exact
 from potlp_jax.planning.history import action_terms, initial_history, step, unpack_bits
 from potlp_jax.types import NO_ACTION
 from tests.reference.problems import FORMULAS, SIZES, padded_problem, random_fields, random_problem, task_of

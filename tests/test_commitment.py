@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from potlp_jax.planning.commitment import SAME_WITHIN, Intention, apply_commitment, intention_of
-from potlp_jax.planning.search.api import Plan
+from potlp_jax.planning.search.plan import Plan
 from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task
 from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL

@@ -6,8 +6,9 @@ from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 
 from potlp_jax.bench.problems import FAMILIES, family_problem
+from potlp_jax.errors import ProblemTooLargeError
 from potlp_jax.planning.exact import exploration
-from potlp_jax.planning.exact.api import ProblemTooLargeError, bound_exact, solve_exact
+from potlp_jax.planning.exact.api import bound_exact, solve_exact
 from potlp_jax.types import NO_ACTION, Status
 from tests.reference.planning import Recursion, ReferenceProblem
 from tests.reference.problems import FORMULAS, problem_of, random_fields, random_problem, task_of

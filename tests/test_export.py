@@ -18,8 +18,9 @@ from potlp_jax.planning.decision import frontier_subgoals
 from potlp_jax.planning.move import MoveKind
 from potlp_jax.planning.policies import Policy, decide_jit
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.search.api import Plan, plan_actions
+from potlp_jax.planning.search.api import plan_actions
 from potlp_jax.planning.search.config import SearchConfig
+from potlp_jax.planning.search.plan import Plan
 from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task
 from potlp_jax.types import Status

@@ -9,10 +9,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from potlp_jax.task import Task, TaskError
+from potlp_jax.errors import TaskError
 from potlp_jax.task.automaton import canonical_dfa
 from potlp_jax.task.guards import MAX_PRIMES_EXACT, cube_letters, hull, minimal_cover, prime_implicants
 from potlp_jax.task.outcomes import find_outcomes
+from potlp_jax.task.task import Task
 from tests.reference import covers
 from tests.reference.make_golden_covers import GOLDEN_COVERS
 

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from potlp_jax.task import Task, TaskError, TaskSizes, shipped_tasks, stack_tasks
-from potlp_jax.task.task import UNNAMED
+from potlp_jax.errors import TaskError
+from potlp_jax.task.task import UNNAMED, Task, TaskSizes, shipped_tasks, stack_tasks
 from potlp_jax.types import NO_CLASS
 from train.write_shipped_tasks import SHIPPED_TASKS, shipped_hoa
 

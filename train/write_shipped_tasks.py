@@ -8,7 +8,7 @@
 from pathlib import Path
 
 import potlp_jax.task
-from potlp_jax.task import Task
+from potlp_jax.task.task import Task
 
 FIREFIGHTING = ("fire", "alarm", "extinguisher", "exit")
 DELIVERY = ("professor", "grad", "undergrad")

@@ -32,7 +32,8 @@ import numpy as np
 
 from eval.bench.opponents import installed
 from potlp_jax.bench.problems import FAMILIES, SUBGOAL_COUNTS, Split, family_problem
-from potlp_jax.planning.exact.api import ProblemTooLargeError, bound_exact, solve_exact
+from potlp_jax.errors import ProblemTooLargeError
+from potlp_jax.planning.exact.api import bound_exact, solve_exact
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions
 from potlp_jax.planning.search.best_first import BEST_FIRST

@@ -40,7 +40,7 @@ from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.results import Pair, pair_rows
 from potlp_jax.sweep.rows import read_path, source_commit
 from potlp_jax.trials.loop import versions
-from potlp_jax.view.maps import draw_ends
+from potlp_jax.view.layers import draw_ends
 from potlp_jax.view.style import ROBOT, new_figure, save_figure
 
 MAPS = ("uma_rooms", "gdc_3ne", "gdc_floor2", "intel_lab")

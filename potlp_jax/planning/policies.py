@@ -34,7 +34,8 @@ from potlp_jax.planning.estimates import Estimates, Estimator, ask
 from potlp_jax.planning.history import action_terms, initial_history
 from potlp_jax.planning.move import Move, MoveKind, Search, move_to
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.search.api import Plan, plan_actions
+from potlp_jax.planning.search.api import plan_actions
+from potlp_jax.planning.search.plan import Plan
 from potlp_jax.planning.situation import (
     DecisionConfig,
     Situation,

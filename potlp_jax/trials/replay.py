@@ -14,8 +14,9 @@ from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.estimates import Estimator, ask
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.search.api import Plan, search_tree
+from potlp_jax.planning.search.api import search_tree
 from potlp_jax.planning.search.graph import Tree
+from potlp_jax.planning.search.plan import Plan
 from potlp_jax.planning.search.uct import UctTree
 from potlp_jax.planning.situation import DecisionConfig, assess, planning_problem
 from potlp_jax.task.task import Task, TaskArrays

@@ -6,7 +6,7 @@ python -m tests.reference.make_golden_covers
 import json
 from pathlib import Path
 
-from potlp_jax.task import Task
+from potlp_jax.task.task import Task
 from tests.reference.covers import canonical_cover
 
 GOLDEN_COVERS = Path(__file__).parent / "golden_covers.json"
