@@ -1,7 +1,7 @@
-"""Calibrate what the paper leaves open about the fire-fighting building, on the seeds kept for that.
+"""Calibrate what the paper leaves open about the fire-fighting building, on worlds kept for that.
 
-The seeds are those of ``Split.CALIBRATION``. Mean costs of the known-map planner and the baseline, over worlds that are
-possible for each task, are compared with Table I of Bradley et al. 2021. Nothing learned is involved: this was run
+The worlds are those of ``Split.CALIBRATION``. Mean costs of the known-map planner and the baseline, over worlds that
+are possible for each task, are compared with Table I of Bradley et al. 2021. Nothing learned is involved: this was run
 before any learned planner existed, and the result is frozen in ``FirefightingConfig``'s defaults and by a hash in
 ``tests/test_firefighting.py``.
 

@@ -36,9 +36,8 @@ from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.learning.questions import HELD_OUT
 from potlp_jax.planning.policies import Policy
-from potlp_jax.sweep.rows import source_commit
+from potlp_jax.sweep.rows import provenance
 from potlp_jax.sweep.store import Row
-from potlp_jax.trials.loop import versions
 
 POLICIES = [Policy.KNOWN_MAP.value, Policy.BASELINE.value, Policy.ORACLE.value, Policy.POTLP.value]
 WITHOUT_ORACLE = [policy for policy in POLICIES if policy != Policy.ORACLE]
@@ -157,7 +156,7 @@ def main() -> None:
         formulas = options.out / "formulas"
         rows = run_group(formulas, "delivery", tasks, WITHOUT_ORACLE, options.formula_worlds, options.processes)
         found["other formulas"] = results_of(rows, "delivery", tasks)
-    results = {"groups": found, "versions": versions(), "reported_at": source_commit()}
+    results = {"groups": found, "provenance": provenance()}
     print(markdown(results))
     for group in found.values():
         print("\n".join(group["problems"]))

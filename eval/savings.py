@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 
 from potlp_jax.environments.base import Generator
-from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.environments.splits import Split
 from potlp_jax.planning.policies import Policy
+from potlp_jax.sweep.audit import audit_rows
 from potlp_jax.sweep.results import compare_pairs, pair_rows
-from potlp_jax.sweep.rows import read_path
 from potlp_jax.sweep.runner import RESULTS
 from potlp_jax.sweep.statistics import PolicyRow
 from potlp_jax.sweep.store import Row, Store
 from potlp_jax.types import Status
-from potlp_jax.verify.audit import problems_of_path
 
 SWEEP_COMMAND = (sys.executable, "-c", "from potlp_jax.cli import main; main()", "sweep")
 """``potlp sweep``, by the interpreter that runs."""
@@ -72,17 +71,7 @@ def compare_first(
 
 def audit(rows: Sequence[Row], generator: Generator, split: Split) -> list[str]:
     """What is wrong with any trial. Violations of the task among it begin with 'violates'."""
-    problems, number, world = [], None, None
-    for row in sorted(rows, key=lambda row: row.item.world):
-        if row.item.world != number:
-            number = row.item.world
-            world = generator.generate(world_key(split, number, generator.name))
-        assert world is not None
-        found = problems_of_path(
-            world, read_path(row.path), row.cost, row.outcome, row.item.task, generator.propositions
-        )
-        problems += [f"{problem}: {row.item}" for problem in found]
-    return problems
+    return [f"{problem}: {row.item}" for row, problem in audit_rows(rows, split, generator_of=lambda _: generator)]
 
 
 def table_lines(table: Mapping[str, Any], policies: Sequence[str]) -> list[str]:

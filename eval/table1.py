@@ -29,11 +29,10 @@ from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.results import compare_pairs, pair_rows
-from potlp_jax.sweep.rows import source_commit
+from potlp_jax.sweep.rows import provenance
 from potlp_jax.sweep.runner import RESULTS
 from potlp_jax.sweep.statistics import PolicyRow
 from potlp_jax.sweep.store import Row, Store
-from potlp_jax.trials.loop import versions
 from potlp_jax.view.comparisons import scatter_costs
 from potlp_jax.view.style import new_figure, save_figure
 
@@ -113,9 +112,8 @@ def results(folder: Path) -> dict[str, Any]:
     return {
         "specification": specification,
         "estimator": facts["estimator"],
-        "versions": versions(),
+        "provenance": provenance(),
         "commits": sorted({row.commit for row in rows}),
-        "reported_at": source_commit(),
         "tables": tables,
         "audited": len(rows),
         "violations": sum(problem.startswith("violates") for problem in problems),

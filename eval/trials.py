@@ -39,6 +39,7 @@ from potlp_jax.environments.ros.places import Disc, Places
 from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.planning.policies import Policy
+from potlp_jax.sweep.rows import provenance
 from potlp_jax.task.task import Task, TaskSizes
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
@@ -79,25 +80,23 @@ MAP_TASKS = ["F a & F b", "!b U a", "F(a & F b)", "(!b U a) & F b"]
 
 
 def possible_world(item: dict[str, Any]) -> Iterator[tuple[World, Task, str, int, TrialConfig]]:
-    """Candidate worlds of an item, until the caller finds one that is possible for its task."""
+    """Candidate worlds of an item with their numbers, until the caller finds one that is possible for its task."""
     suite, number = item["suite"], item["number"]
-    for attempt in range(50):
-        seed = number + 1000 * attempt
+    for world_number in range(number, number + 50_000, 1000):
         if suite == "rooms":
-            generator = Rooms()
-            task = rooms_tasks()[number]
-            yield generator.generate(world_key(Split.VALIDATION, seed, "rooms")), task, "rooms", seed, rooms_config()
+            generator, task, config = Rooms(), rooms_tasks()[number], rooms_config()
+            environment = family = generator.name
         elif suite == "maps":
             name = sorted(MAPS)[number % len(MAPS)]
-            generator, task = map_generator(name, seed), Task.from_formula(item["task"], propositions=("a", "b"))
-            config = rooms_config()
-            yield generator.generate(world_key(Split.VALIDATION, seed, "map")), task, f"map:{name}", seed, config
+            generator, config = map_generator(name, world_number), rooms_config()
+            task = Task.from_formula(item["task"], propositions=("a", "b"))
+            environment, family = f"map:{name}", "map"
         else:
-            generator = Firefighting()
+            generator, config = Firefighting(), TrialConfig(revealed=suite == "revealed")
             task = Task.from_formula(generator.tasks[item["task"]], propositions=generator.propositions)
-            config = TrialConfig(revealed=suite == "revealed")
-            world = generator.generate(world_key(Split.VALIDATION, seed, generator.name))
-            yield world, task, generator.name, seed, config
+            environment = family = generator.name
+        world = generator.generate(world_key(Split.VALIDATION, world_number, family))
+        yield world, task, environment, world_number, config
 
 
 @functools.cache
@@ -111,12 +110,12 @@ def rooms_config() -> TrialConfig:
     return TrialConfig(sensor=SensorConfig(range_cells=30.0))
 
 
-def map_generator(name: str, seed: int) -> RosMap:
-    """A real map with one place for ``a`` and two for ``b``, drawn by the seed among its free cells."""
+def map_generator(name: str, number: int) -> RosMap:
+    """A real map with one place for ``a`` and two for ``b``, drawn by the world's number among its free cells."""
     folder = Path(os.environ["POTLP_EXTERNAL_DATA"]) / "maps"
     resolution, radius = MAPS[name]
     clean = clean_map(load_map(folder / f"{name}.yaml"), resolution, radius)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(number)
     cells = np.argwhere(clean.free)
     points = [clean.frame.cell_to_metres(*(int(v) for v in cells[rng.integers(len(cells))])) for _ in range(3)]
     discs = [Disc(point, 2.0 * resolution) for point in points]
@@ -132,15 +131,15 @@ def policies_of(item: dict[str, Any]) -> tuple[str, ...]:
 
 def run_item(item: dict[str, Any]) -> list[dict[str, Any]]:
     """One row per policy, on the first world that is possible for the item's task; one row if none of 50 is."""
-    for world, task, environment, seed, config in possible_world(item):
+    for world, task, environment, world_number, config in possible_world(item):
         run = functools.partial(
             run_trial,
             world,
             task,
-            key=jax.random.fold_in(jax.random.key(seed), 7),
+            key=jax.random.fold_in(jax.random.key(world_number), 7),
             config=config,
             environment=environment,
-            seed=seed,
+            world_number=world_number,
             arrays=task.padded(ROOMS_SIZES) if item["suite"] == "rooms" else None,
         )
         known = run(policy=Policy.KNOWN_MAP)
@@ -150,7 +149,7 @@ def run_item(item: dict[str, Any]) -> list[dict[str, Any]]:
         for policy in policies_of(item):
             begun = time.perf_counter()
             trial = known if policy == Policy.KNOWN_MAP else run(policy=policy)
-            found = problems_of(trial, task)
+            found = problems_of(trial, task, world)
             if item["suite"] == "revealed" and abs(trial.cost - known.cost) > 1e-6 * known.cost:
                 found.append(f"costs {trial.cost} on a revealed map, the known-map planner {known.cost}")
             rows.append(
@@ -162,6 +161,7 @@ def run_item(item: dict[str, Any]) -> list[dict[str, Any]]:
                     "traits": traits(task),
                     "problems": found,
                     "seconds": time.perf_counter() - begun,
+                    "provenance": provenance(),
                 }
             )
         return rows

@@ -36,7 +36,7 @@ class Corridor(potlp_jax.Generator):
         letters = np.zeros(occupied.shape, np.int32)
         fire, way_out = rng.permutation(middles)[:2]
         letters[5, fire], letters[5, way_out] = 0b01, 0b10
-        return potlp_jax.make_world(occupied, letters, (1, 2 * DOORS))
+        return potlp_jax.make_world(occupied, letters, (1, 2 * DOORS), propositions=self.propositions)
 
 
 def main() -> None:

@@ -22,6 +22,7 @@ FLOOR = """
   #......#.....e#
   ###############
 """
+PROPOSITIONS = ("fire", "exit")
 REACH = 3
 LONGEST_DRIVE = 3
 
@@ -43,10 +44,12 @@ class Rover:
 
     def observe(self) -> tuple[potlp_jax.BeliefMap, tuple[int, int]]:
         """The map as the robot has it, and its cell."""
-        # Bit 0 is the first proposition of the task, bit 1 the second.
+        # Bit 0 is the first of the propositions, bit 1 the second. The map carries their names, so that a task over
+        # other ones, or in another order, is refused.
         letters = np.where(self._floor == "f", 0b01, 0) | np.where(self._floor == "e", 0b10, 0)
         seen = self._cells != potlp_jax.BeliefMap.UNKNOWN
-        return potlp_jax.belief_from_numpy(self._cells, np.where(seen, letters, 0)), self._cell
+        letters = np.where(seen, letters, 0)
+        return potlp_jax.belief_from_numpy(self._cells, letters, propositions=PROPOSITIONS), self._cell
 
     def panorama(self) -> UInt8[Array, "rows columns 3"]:
         """Asked by the policy potlp alone; this robot has no camera."""
@@ -64,7 +67,7 @@ class Rover:
 
 def main() -> None:
     """Find the exit without driving through the fire."""
-    task = potlp_jax.Task.from_formula("!fire U exit", ["fire", "exit"])
+    task = potlp_jax.Task.from_formula("!fire U exit", PROPOSITIONS)
     run = potlp_jax.run_robot(Rover(FLOOR, (1, 1)), task, "baseline", jax.random.key(0))
     print(f"{run.outcome} after {len(run.decisions)} decisions and {len(run.path) - 1} cells, cost {run.cost:.1f}")
     print(f"the robot ended at {run.path[-1]}; states of the automaton: {sorted(set(run.states))}")

@@ -26,13 +26,14 @@ def read_belief(text: str) -> tuple[potlp_jax.BeliefMap, tuple[int, int]]:
     cells = np.array([[codes.get(sign, potlp_jax.BeliefMap.FREE) for sign in row.ljust(width, "?")] for row in rows])
     row = next(number for number, line in enumerate(rows) if "R" in line)
     # No proposition has been seen yet: the letter of every observed cell is 0.
-    return potlp_jax.belief_from_numpy(cells, np.zeros_like(cells)), (row, rows[row].index("R"))
+    belief = potlp_jax.belief_from_numpy(cells, np.zeros_like(cells), propositions=("fire", "exit"))
+    return belief, (row, rows[row].index("R"))
 
 
 def main() -> None:
     """Two frontiers, and an estimator that takes the farther one for more promising."""
-    task = potlp_jax.Task.from_formula("!fire U exit", ["fire", "exit"])
     belief, robot = read_belief(MAP)
+    task = potlp_jax.Task.from_formula("!fire U exit", belief.propositions)
     cell, state = jnp.array(robot, jnp.int32), jnp.int32(task.dfa.initial)
 
     # Both parts of a decision are pure: compiled once, they serve every decision on maps of this size.
@@ -40,7 +41,7 @@ def main() -> None:
     decide = jax.jit(potlp_jax.decide_from_estimates, static_argnames="config")
 
     subgoals = find(belief, cell, state, task.arrays)
-    count, classes = subgoals.mask.shape[0], len(task.classes)
+    count, classes = subgoals.mask.shape[0], task.sizes.classes
     # P_S, R_S and R_F of Eq. 3: the chance that the exit is beyond a frontier, the cost to it, and the cost to find
     # out that it is not. Here they only depend on which frontier it is.
     promising = subgoals.cells[:, 0] < 3

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from potlp_jax.planning.problem import PlanningProblem as PlanningProblem
     from potlp_jax.planning.problem import enumerate_actions as enumerate_actions
     from potlp_jax.planning.search.api import plan_actions as plan_actions
-    from potlp_jax.planning.search.config import SearchConfig as SearchConfig
+    from potlp_jax.planning.search.config import BestFirstConfig as BestFirstConfig
     from potlp_jax.planning.search.config import UctConfig as UctConfig
     from potlp_jax.planning.search.plan import Plan as Plan
     from potlp_jax.planning.situation import DecisionConfig as DecisionConfig
@@ -109,7 +109,7 @@ __all__ = [  # noqa: RUF022 - by use, not by the alphabet
     "decide",
     "PlanningProblem",
     "enumerate_actions",
-    "SearchConfig",
+    "BestFirstConfig",
     "UctConfig",
     "Plan",
     "plan_actions",
@@ -161,7 +161,7 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "planning.problem": ("PlanningProblem", "enumerate_actions"),
     "planning.situation": ("DecisionConfig",),
     "planning.search.api": ("plan_actions",),
-    "planning.search.config": ("SearchConfig", "UctConfig"),
+    "planning.search.config": ("BestFirstConfig", "UctConfig"),
     "planning.search.plan": ("Plan",),
     "rl.episodes": ("TaskEnv",),
     "task.task": ("Task", "TaskArrays", "TaskSizes", "stack_tasks"),

@@ -23,6 +23,7 @@ import yaml
 from pydantic_core import ErrorDetails
 
 from potlp_jax.errors import ConfigurationError
+from potlp_jax.files import parse_yaml, read_yaml, require_mapping, short
 
 KIND: str = "kind"
 """The field that tells configurations apart where one of several classes can stand."""
@@ -94,14 +95,7 @@ def read_settings(file: Path) -> Mapping[str, Any]:
     Raises:
         ConfigurationError: the file is no YAML, or holds something else than entries by name.
     """
-    try:
-        data = yaml.safe_load(file.read_text("utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        # YAML's messages have several lines.
-        raise ConfigurationError(f"{file}: not YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(data, Mapping):
-        raise ConfigurationError(f"{file}: give a mapping of names to values, found {_short(data)}")
-    return data
+    return require_mapping(file, read_yaml(file, ConfigurationError), ConfigurationError, "a file of settings")
 
 
 def settings_from_words(words: Sequence[str]) -> dict[str, Any]:
@@ -125,9 +119,11 @@ def settings_from_words(words: Sequence[str]) -> dict[str, Any]:
             if not isinstance(inner, dict):
                 raise ConfigurationError(f"setting {word!r}: {part} has got a value already, so it holds no {name}")
         try:
-            inner[name] = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise ConfigurationError(f"setting {word!r}: {text!r} is no value as in YAML") from error
+            inner[name] = parse_yaml(text)
+        # Beside YAML's own errors: a date that does not exist, a number with 5,000 digits.
+        except (yaml.YAMLError, ValueError) as error:
+            raise ConfigurationError(f"setting {short(word)}: {short(text)} is no value as in YAML") from error
+        require_mapping(f"setting {short(word)}", settings, ConfigurationError, "a setting")
     return settings
 
 

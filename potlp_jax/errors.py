@@ -9,6 +9,11 @@ from pathlib import Path
 class PotlpError(ValueError):
     """Base of all errors about what was given: a task, a map, a file, a setting."""
 
+    @classmethod
+    def of_file(cls, file: Path | str, message: str) -> "PotlpError":
+        """An error about a file as a whole, whatever else errors of this class are made of."""
+        return cls(f"{file}: {message}")
+
 
 class PotlpWarning(UserWarning):
     """Base of all remarks on what was given: it can be used, and something about it should be known."""
@@ -20,6 +25,22 @@ class ConfigurationError(PotlpError):
 
 class TaskError(PotlpError):
     """What is wrong with a task: its formula, its automaton or its propositions."""
+
+
+class UnsatisfiableError(TaskError):
+    """No word satisfies a task: its parts contradict each other."""
+
+
+class TaskWarning(PotlpWarning):
+    """A task can be used but asks for nothing."""
+
+
+class SpotMissingError(TaskError):
+    """A formula must be translated and the library Spot is not there; the message says how to install it."""
+
+
+class PropositionsError(TaskError):
+    """Two things that are to be joined are of other propositions, or of another order; the message names both."""
 
 
 class WorldError(PotlpError):
@@ -36,6 +57,11 @@ class MapError(PotlpError):
     def __init__(self, file: Path | str, field: str, message: str) -> None:
         super().__init__(f"{file}: {field}: {message}" if field else f"{file}: {message}")
 
+    @classmethod
+    def of_file(cls, file: Path | str, message: str) -> "MapError":
+        """An error about a file as a whole."""
+        return cls(file, "", message)
+
 
 class MapWarning(PotlpWarning):
     """A map can be used but probably does not mean what it says."""
@@ -43,6 +69,10 @@ class MapWarning(PotlpWarning):
 
 class ProblemError(PotlpError):
     """A planning problem holds a value that the model does not allow; the message names field, index and value."""
+
+
+class EstimatesError(PotlpError):
+    """What an estimator answered, or a caller gave, is not an array of estimates; the message names it and what is."""
 
 
 class ProblemTooLargeError(PotlpError):
@@ -62,7 +92,15 @@ class TrainingError(PotlpError):
 
 
 class CheckpointError(PotlpError):
-    """A checkpoint or an estimator cannot be read or is not of this training; the message names what differs."""
+    """A training cannot resume from a checkpoint: damaged, or of another training; the message names what differs."""
+
+
+class EstimatorError(PotlpError):
+    """An estimator cannot be read, or does not fit what it is asked; the message names what differs."""
+
+
+class ExportError(PotlpError):
+    """An exported program cannot be read or called; the message names the file or the inputs."""
 
 
 class EvaluationError(PotlpError):

@@ -18,6 +18,7 @@ A program is called with its inputs by position and returns a tuple:
 
 import dataclasses
 import datetime
+import hashlib
 import importlib.metadata
 import importlib.util
 import json
@@ -29,13 +30,16 @@ import jax
 import jax.export
 from jaxtyping import Array, UInt32
 
+from potlp_jax.errors import ExportError
+from potlp_jax.files import MIB, MOST_TEXT, one_line, read_bytes, read_json, reading
 from potlp_jax.planning.decision import decide_from_estimates, frontier_subgoals, subgoals_at
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.move import Move, MoveKind
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions
-from potlp_jax.planning.search.config import SearchConfig, UctConfig
+from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
 from potlp_jax.planning.situation import DecisionConfig
+from potlp_jax.task.propositions import check_propositions, in_order, require_same_propositions
 from potlp_jax.task.task import Task
 from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL, Status
 from potlp_jax.world.grid import BeliefMap
@@ -48,10 +52,16 @@ PLATFORMS: tuple[str, ...] = ("cpu", "cuda")
 ANY_BATCH: str = "any"
 _BATCH_DIMENSION = "b"
 
+_MOST_PROGRAM = 1024 * MIB
+"""Bytes of a program; those of a large map have some 10 MiB."""
+
 # Named, because a caller without this package has to make the same kind of key from two words.
 _KEY_IMPLEMENTATION = "threefry2x32"
 
-_SEARCH_NAMES = {"best-first": "Best-first search on bounds", "uct": "PO-UCT"}
+_SEARCH_NAMES = {
+    "best-first": "Best-first search on bounds (deterministic, of the family of AO*)",
+    "uct": "PO-UCT (sampled, the search of Bradley et al. 2021)",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,10 +148,11 @@ def export_planner(task: Task, folder: Path, config: ExportConfig = ExportConfig
     files, functions = [], {}
     for program in programs:
         exported = export_program(program, config)
-        file = folder / f"{program.name}.jaxexport"
-        file.write_bytes(exported.serialize())
+        file, contents = folder / f"{program.name}.jaxexport", exported.serialize()
+        file.write_bytes(contents)
         files.append(file)
-        functions[program.name] = _describe_program(program, exported, file.name)
+        described = _describe_program(program, exported, file.name)
+        functions[program.name] = {**described, "sha256": hashlib.sha256(contents).hexdigest()}
     automaton = folder / "task.hoa"
     automaton.write_text(task.to_hoa(), "utf-8")
     manifest = folder / MANIFEST
@@ -165,29 +176,58 @@ def batch_shape(batch: int | str | None) -> tuple[Any, ...]:
     return tuple(jax.export.symbolic_shape(_BATCH_DIMENSION)) if batch == ANY_BATCH else (batch,)
 
 
-def load_program(folder: Path, name: str) -> Callable[..., dict[str, Array]]:
+def load_program(folder: Path, name: str, propositions: Sequence[str]) -> Callable[..., dict[str, Array]]:
     """A program of an exported folder as a function from named inputs to named outputs.
 
     For use where this package is installed; elsewhere the module's docstring shows the lines that it takes.
 
+    Args:
+      folder: written by ``export_planner``.
+      name: of the program.
+      propositions: names of the bits of the letters that it will be given, in order, such as ``World.propositions``.
+
+    Returns:
+      The function. Its inputs are plain arrays, so that nothing can be checked of their meaning any more.
+
     Raises:
-      ValueError: the folder holds no such program, or a call does not name exactly the program's inputs.
+      PropositionsError: the program was exported for a task over other propositions.
+      ExportError: the folder holds no such program, a file of it is missing or damaged, or a call does not name exactly
+        the program's inputs.
     """
-    manifest = json.loads((folder / MANIFEST).read_text("utf-8"))
-    if name not in manifest["functions"]:
-        raise ValueError(f"{folder} holds no program {name!r}; it has: {', '.join(manifest['functions'])}")
-    entry = manifest["functions"][name]
-    # `deserialize` is annotated for a bytearray.
-    program = jax.export.deserialize(bytearray((folder / entry["file"]).read_bytes()))
-    names = [value["name"] for value in entry["inputs"]]
-    results = [value["name"] for value in entry["outputs"]]
+    manifest = read_json(folder / MANIFEST, ExportError, "a manifest", MOST_TEXT)
+    with reading(folder / MANIFEST, ExportError, "a manifest"):
+        require_same_propositions(
+            check_propositions(manifest["task"]["propositions"]),
+            propositions,
+            asker=f"the planner in {folder}",
+            knower="what is to call it",
+            remedy="write the letters in the former's order, or export the task over the latter",
+        )
+        functions = manifest["functions"]
+        if name not in functions:
+            raise ExportError(f"{folder} holds no program {name!r}; it has: {one_line(', '.join(functions))}")
+        entry = functions[name]
+        file, digest = folder / Path(entry["file"]).name, entry["sha256"]
+        names = [value["name"] for value in entry["inputs"]]
+        results = [value["name"] for value in entry["outputs"]]
+    program = _load(file, digest)
 
     def call(**inputs: Any) -> dict[str, Array]:
         if set(inputs) != set(names):
-            raise ValueError(f"{name} takes exactly {', '.join(names)}; found {', '.join(inputs)}")
+            raise ExportError(f"{name} takes exactly {', '.join(names)}; found {', '.join(inputs)}")
         return dict(zip(results, program.call(*[inputs[each] for each in names]), strict=True))
 
     return call
+
+
+def _load(file: Path, digest: str) -> jax.export.Exported:
+    contents = read_bytes(file, ExportError, _MOST_PROGRAM)
+    # Before jax sees it: a damaged program can end the process within the compiler, where nothing catches it.
+    if hashlib.sha256(contents).hexdigest() != digest:
+        raise ExportError(f"{file}: is not the program that the manifest names, or is damaged: export it again")
+    with reading(file, ExportError, "an exported program of this version of jax"):
+        # `deserialize` is annotated for a bytearray.
+        return jax.export.deserialize(bytearray(contents))
 
 
 def _programs(task: Task, config: ExportConfig) -> list[_Program]:
@@ -197,7 +237,7 @@ def _programs(task: Task, config: ExportConfig) -> list[_Program]:
     return [search, _subgoals_program(task, config.grid, config), _decide_program(task, config.grid, config)]
 
 
-def _plan_program(task: Task, subgoals: int, search: SearchConfig | UctConfig) -> _Program:
+def _plan_program(task: Task, subgoals: int, search: BestFirstConfig | UctConfig) -> _Program:
     arrays, states, classes = task.arrays, task.sizes.states, task.sizes.classes
     # The task's arrays are concrete here, and constants of the program. The names are those of `PlanningProblem`, so
     # that inputs by position become fields by name.
@@ -205,8 +245,9 @@ def _plan_program(task: Task, subgoals: int, search: SearchConfig | UctConfig) -
     names = (*names, "dfa_state", "subgoal_mask", "dead_end_cost")
 
     def plan(*inputs: Array) -> tuple[Array, ...]:
-        problem = PlanningProblem.from_arrays(arrays, **dict(zip(names, inputs[:-1], strict=True)))
-        found = plan_actions(problem, _key(inputs[-1]), search)
+        fields, key = inputs[: len(names)], inputs[len(names) :]
+        problem = PlanningProblem.from_arrays(arrays, **dict(zip(names, fields, strict=True)))
+        found = plan_actions(problem, _key(key), search)
         return tuple(getattr(found, name) for name in _PLAN_OUTPUTS)
 
     return _Program(
@@ -237,7 +278,7 @@ def _plan_program(task: Task, subgoals: int, search: SearchConfig | UctConfig) -
                 "float32",
                 "cost of a history in which no action is available and the task is not satisfied, positive",
             ),
-            _KEY_INPUT,
+            *_key_inputs(search),
         ),
         outputs=_PLAN_OUTPUTS,
     )
@@ -248,14 +289,14 @@ def _subgoals_program(task: Task, grid: tuple[int, int], config: ExportConfig) -
 
     def subgoals(*inputs: Array) -> tuple[Array, ...]:
         # `Subgoals` calls them `cells` and `mask`; `decide` has an input `cells` already, the map's.
-        found = frontier_subgoals(*_belief_and_robot(inputs), arrays, settings)
+        found = frontier_subgoals(*_belief_and_robot(inputs, task), arrays, settings)
         return tuple(getattr(found, name.removeprefix("subgoal_")) for name in _SUBGOAL_OUTPUTS)
 
     return _Program(
         name="subgoals",
         meaning="Frontiers of known space and their subgoals: where estimates are wanted",
         function=subgoals,
-        inputs=_map_inputs(grid),
+        inputs=_map_inputs(grid, task),
         outputs=_SUBGOAL_OUTPUTS,
     )
 
@@ -263,11 +304,11 @@ def _subgoals_program(task: Task, grid: tuple[int, int], config: ExportConfig) -
 def _decide_program(task: Task, grid: tuple[int, int], config: ExportConfig) -> _Program:
     arrays, settings = task.arrays, config.settings
     # Three groups of inputs, in this order: the map and the robot, the subgoals and their estimates, the key.
-    map_inputs = _map_inputs(grid)
+    map_inputs = _map_inputs(grid, task)
 
     def decide(*inputs: Array) -> tuple[Array, ...]:
-        belief, cell, state = _belief_and_robot(inputs[: len(map_inputs)])
-        cells, mask, probability, success_cost, failure_cost, key = inputs[len(map_inputs) :]
+        belief, cell, state = _belief_and_robot(inputs[: len(map_inputs)], task)
+        cells, mask, probability, success_cost, failure_cost, *key = inputs[len(map_inputs) :]
         estimates = Estimates(success_probability=probability, success_cost=success_cost, failure_cost=failure_cost)
         subgoals = subgoals_at(cells, mask, *grid)
         move = decide_from_estimates(belief, subgoals, estimates, arrays, cell, state, _key(key), settings)
@@ -287,19 +328,24 @@ def _decide_program(task: Task, grid: tuple[int, int], config: ExportConfig) -> 
             ),
             _Value("subgoal_mask", (config.subgoals,), "bool", "True where a subgoal is real, False on padding"),
             *_estimate_inputs(config.subgoals, task.sizes.classes),
-            _KEY_INPUT,
+            *_key_inputs(settings.search),
         ),
         outputs=_MOVE_OUTPUTS,
     )
 
 
-def _belief_and_robot(inputs: Sequence[Array]) -> tuple[BeliefMap, Array, Array]:
+def _belief_and_robot(inputs: Sequence[Array], task: Task) -> tuple[BeliefMap, Array, Array]:
     cells, letters, resolution, extent, cell, state = inputs
-    return BeliefMap(cells=cells, letters=letters, resolution=resolution, extent=extent), cell, state
+    # Plain arrays have no names. Whoever loads the program states them instead (``load_program``).
+    belief = BeliefMap(
+        cells=cells, letters=letters, resolution=resolution, extent=extent, propositions=task.propositions
+    )
+    return belief, cell, state
 
 
-def _key(words: UInt32[Array, "2"]) -> Array:
-    return jax.random.wrap_key_data(words, impl=_KEY_IMPLEMENTATION)
+def _key(words: Sequence[UInt32[Array, "2"]]) -> Array:
+    """The key of an optional input; any key where the program has no such input, because its search draws nothing."""
+    return jax.random.wrap_key_data(words[0], impl=_KEY_IMPLEMENTATION) if words else jax.random.key(0)
 
 
 def _move_outputs(move: Move) -> tuple[Array, ...]:
@@ -325,7 +371,7 @@ def _move_outputs(move: Move) -> tuple[Array, ...]:
     return tuple(values[name] for name in _MOVE_OUTPUTS)
 
 
-def _map_inputs(grid: tuple[int, int]) -> tuple[_Value, ...]:
+def _map_inputs(grid: tuple[int, int], task: Task) -> tuple[_Value, ...]:
     return (
         _Value(
             "cells",
@@ -333,7 +379,12 @@ def _map_inputs(grid: tuple[int, int]) -> tuple[_Value, ...]:
             "int8",
             f"{BeliefMap.UNKNOWN} not observed, {BeliefMap.FREE} free, {BeliefMap.OCCUPIED} occupied; row 0 on top",
         ),
-        _Value("letters", grid, "int32", "bit i: proposition i is true in the cell; 0 where it is not observed"),
+        _Value(
+            "letters",
+            grid,
+            "int32",
+            f"bit i: proposition i of {in_order(task.propositions)} is true in the cell; 0 where it is not observed",
+        ),
         _Value("resolution", (), "float32", "length of a cell's side in the unit of cost"),
         _Value("extent", (2,), "int32", "rows and columns of the map without padding"),
         _Value("cell", (2,), "int32", "the robot's row and column"),
@@ -350,7 +401,12 @@ def _estimate_inputs(subgoals: int, classes: int) -> tuple[_Value, ...]:
     )
 
 
-_KEY_INPUT = _Value("key", (2,), "uint32", "two random words: jax.random.key_data of a threefry2x32 key")
+def _key_inputs(search: BestFirstConfig | UctConfig) -> tuple[_Value, ...]:
+    # Best-first search is deterministic: an input that changes nothing would only mislead.
+    if isinstance(search, BestFirstConfig):
+        return ()
+    return (_Value("key", (2,), "uint32", "two random words: jax.random.key_data of a threefry2x32 key"),)
+
 
 _PLAN_OUTPUTS = {
     "action": "s * E + e for edge e at subgoal s, S * E for finish, or NO_ACTION",
@@ -360,7 +416,8 @@ _PLAN_OUTPUTS = {
     "value": "expected cost to go",
     "q_values": "expected cost of each action, inf where it is not available",
     "visits": "simulations that began with each action",
-    "gap": "fraction by which value would fall if its guesses were too high by the optimism; 0: converged",
+    "optimism_gap": "fraction by which value would fall if its guesses were too high by the optimism, no bound on the "
+    "error; 0: more simulations change nothing",
     "status": "bits, see status_bits",
 }
 

@@ -56,6 +56,9 @@ Costs are ``float32`` in the unit of ``World.resolution`` (cells where it is 1).
 Masks are True where an entry is real, False where it is padding.
 """
 
+import functools
+import operator
+from collections.abc import Iterable
 from enum import IntFlag
 
 import jax.numpy as jnp
@@ -75,7 +78,8 @@ NO_SUBGOAL: int = -1
 """Cell that belongs to no kept subgoal."""
 
 NO_ACTION: int = -1
-"""Index of the chosen action where there is none (accepting root or dead end, told apart in ``status``)."""
+"""Index of the chosen action where there is none (accepting root, dead end or invalid input, told apart in
+``status``)."""
 
 
 class Status(IntFlag):
@@ -102,11 +106,19 @@ class Status(IntFlag):
     """No action, no finish and no frontier that can be reached without violation."""
     VIEW_OVERFLOW = 256
     """The memory of panoramas was full; one was dropped that still showed a frontier."""
+    INVALID = 512
+    """An input held a value that the model does not allow, such as an estimate that is NaN: nothing was planned with
+    it."""
 
 
 def status_names(status: int) -> tuple[str, ...]:
     """The bits that are set, by name: what people and programs are shown instead of a number."""
     return tuple(str(flag.name).lower() for flag in Status(status))
+
+
+def status_of(names: Iterable[str]) -> int:
+    """The bits of names that ``status_names`` gave. Raises KeyError for a name that is none."""
+    return int(functools.reduce(operator.or_, (Status[name.upper()] for name in names), Status.OK))
 
 
 def status_array(status: Status = Status.OK) -> UInt32[Array, ""]:

@@ -2,8 +2,10 @@
 
 import json
 import random
+import re
 import subprocess
 import sys
+import warnings
 from functools import cache
 
 import numpy as np
@@ -11,8 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from potlp_jax.errors import TaskError
-from potlp_jax.task.automaton import Dfa, canonical_dfa
+from potlp_jax.errors import TaskError, TaskWarning, UnsatisfiableError
+from potlp_jax.task.automaton import Dfa, canonical_dfa, translate
+from potlp_jax.task.formula import parse_formula
 from potlp_jax.task.hoa import read_hoa, write_hoa
 from potlp_jax.task.task import Task
 from potlp_jax.verify.semantics import satisfies_lasso, word_satisfies, word_violates
@@ -36,8 +39,14 @@ OWN_FORMULAS = [
 
 
 @pytest.fixture(scope="module")
-def reference(external_data):
+def all_references(external_data):
     return json.loads((external_data / "reference" / "spot_dfas.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def reference(all_references):
+    """The automata that accept something: the others are no tasks."""
+    return [entry for entry in all_references if entry["accepting"]]
 
 
 @cache
@@ -84,8 +93,16 @@ def check_semantics(formula: str, propositions, dfa: Dfa, rng: random.Random, wo
         assert dfa.accepting[final] == satisfies_lasso(formula, propositions, prefix, loop), (formula, prefix, loop)
 
 
-def test_all_reference_automata_are_reproduced(reference):
-    assert len(reference) == 206
+def test_a_reference_that_accepts_nothing_is_no_task(all_references):
+    empty = [entry for entry in all_references if not entry["accepting"]]
+    assert empty
+    for entry in empty:
+        with pytest.raises(UnsatisfiableError, match=re.escape(entry["formula"])):
+            compiled(entry["formula"])
+
+
+def test_all_reference_automata_are_reproduced(all_references, reference):
+    assert len(all_references) == 206
     for entry in reference:
         task = compiled(entry["formula"])
         assert task.propositions == tuple(entry["ap"])
@@ -185,11 +202,24 @@ def test_propositions_that_do_not_matter_change_no_move():
     assert np.array_equal(wide.transitions[:, letters], wide.transitions[:, letters ^ 2])
 
 
-def test_a_formula_that_nothing_satisfies_is_a_trap():
-    dfa = Task.from_formula("F(a & !a)", ("a",)).dfa
-    assert dfa.transitions.tolist() == [[0, 0]]
-    assert (dfa.accepting.tolist(), dfa.trap.tolist()) == ([False], [True])
-    assert Task.from_formula("0").dfa.transitions.tolist() == [[0]]
+@pytest.mark.parametrize("text", ["F(a & !a)", "0", "X a & X !a", "(!a U b) & a & !b", "F (b & (a & !b))"])
+def test_a_formula_that_nothing_satisfies_is_refused_by_name(text):
+    with pytest.raises(UnsatisfiableError, match=re.escape(f"no robot can satisfy '{text}'")):
+        Task.from_formula(text, ("a", "b"))
+    # The same where an automaton is read: as Spot gives it, before the task is made.
+    hoa = translate(parse_formula(text, ("a", "b")))
+    with pytest.raises(UnsatisfiableError, match="no robot can satisfy"):
+        Task.from_hoa(hoa)
+
+
+@pytest.mark.parametrize("text", ["1", "F(a | !a)", "a | X X 1", "F a | !a"])
+def test_a_formula_that_asks_for_nothing_is_named(text):
+    with pytest.warns(TaskWarning, match=re.escape(f"'{text}' is satisfied by every word")):
+        task = Task.from_formula(text, ("a",))
+    assert task.dfa.accepting.tolist() == [True]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", TaskWarning)
+        Task.from_formula("F a | X a")
 
 
 @settings(max_examples=60, deadline=None)
@@ -341,10 +371,12 @@ def test_hoa_writing_is_exact():
 def test_hoa_needs_no_spot():
     code = (
         "import sys; sys.modules['spot'] = None\n"
-        "from potlp_jax.task.task import Task, shipped_tasks\n"
+        "from potlp_jax.task.shipped import shipped_tasks\n"
+        "from potlp_jax.task.task import Task\n"
         "print({n: Task.from_hoa(Task.shipped(n).to_hoa()).dfa.num_states for n in shipped_tasks()})"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    # Three to be found in any order: a state for each set that has been.
+    # Those found in any order have a state for each set that has been found.
     fire = {f"firefighting-{number}": states for number, states in zip("1234", (4, 4, 5, 3), strict=True)}
-    assert done.stdout.strip() == str({"delivery-1": 2**3, **fire, "toy-1": 2, "toy-2": 3})
+    rooms = {"parcels-1": 2**2, "parcels-2": 3, "rooms-1": 2**3, "rooms-2": 4}
+    assert done.stdout.strip() == str({"delivery-1": 2**3, **fire, **rooms, "toy-1": 2, "toy-2": 3})

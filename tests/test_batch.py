@@ -12,7 +12,7 @@ from potlp_jax.errors import BatchError
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.policies import Policy
-from potlp_jax.planning.search.config import SearchConfig
+from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task
 from potlp_jax.trials import batch
@@ -29,7 +29,7 @@ TASKS = [Task.from_formula(text, propositions=TOY.propositions) for text in TOY.
 SIZES = TASKS[0].sizes.union(TASKS[-1].sizes)
 CONFIG = TrialConfig(
     sensor=SensorConfig(range_cells=5.0),
-    decision=DecisionConfig(frontiers=FrontierConfig(max_subgoals=4), search=SearchConfig(simulations=50)),
+    decision=DecisionConfig(frontiers=FrontierConfig(max_subgoals=4), search=BestFirstConfig(simulations=50)),
 )
 
 

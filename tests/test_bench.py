@@ -25,12 +25,12 @@ from potlp_jax.environments.toy import Toy
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.search.api import search_tree
-from potlp_jax.planning.search.config import SearchConfig
+from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task
 from potlp_jax.world.frontiers import FrontierConfig
 
-QUICK = SearchConfig(simulations=12)
+QUICK = BestFirstConfig(simulations=12)
 
 
 def _potlp(*arguments):
@@ -232,9 +232,9 @@ from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.bench.problems import family_problem
 from potlp_jax.planning.search.api import plan_actions
-from potlp_jax.planning.search.config import SearchConfig
+from potlp_jax.planning.search.config import BestFirstConfig
 problem = family_problem("find", 2, "tuning", 0)
-plan = jax.jit(plan_actions, static_argnums=2)(problem, jax.random.key(0), SearchConfig(simulations=12))
+plan = jax.jit(plan_actions, static_argnums=2)(problem, jax.random.key(0), BestFirstConfig(simulations=12))
 print(json.dumps({"folder": str(folder), "hits": sum(hits), "q": repr(plan.q_values.tolist())}))
 """
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from potlp_jax.errors import CheckpointError
+from potlp_jax.errors import CheckpointError, EstimatorError, PropositionsError
 from potlp_jax.learning import serialization as estimator_files
 from potlp_jax.learning.checkpoints import checkpoint_steps, load_checkpoint, save_checkpoint
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
@@ -136,7 +136,7 @@ def test_the_default_network_is_shipped_in_under_ten_megabytes(tmp_path):
 
 def test_estimators_that_are_not_whole_or_not_ours_are_refused(tmp_path, params):
     path = tmp_path / "e.npz"
-    with pytest.raises(CheckpointError, match="there is no estimator"):
+    with pytest.raises(EstimatorError, match="there is no estimator"):
         load_estimator(path)
     save_estimator(path, params, CONFIG, {})
     whole = path.read_bytes()
@@ -144,34 +144,57 @@ def test_estimators_that_are_not_whole_or_not_ours_are_refused(tmp_path, params)
     flipped[len(whole) // 3] ^= 0x10
     for damaged in (b"", b"not a zip", whole[: len(whole) // 2], bytes(flipped)):
         path.write_bytes(damaged)
-        with pytest.raises(CheckpointError, match=r"e\.npz"):
+        with pytest.raises(EstimatorError, match=r"e\.npz"):
             load_estimator(path)
     np.savez(path, weights=np.zeros(3))
-    with pytest.raises(CheckpointError, match="not an estimator"):
+    with pytest.raises(EstimatorError, match="not an estimator"):
         load_estimator(path)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_parameters_that_are_no_numbers_are_refused_by_name(tmp_path, params, value):
+    """One of them reaches most estimates: every decision of a trial would be invalid."""
+    leaves, structure = jax.tree.flatten(params)
+    broken = jax.tree.unflatten(structure, [leaves[0].at[0].set(value), *leaves[1:]])
+    save_estimator(tmp_path / "e.npz", broken, CONFIG, {})
+    name = next(iter(estimator_files.named_leaves(broken)))
+    with pytest.raises(CheckpointError, match=rf"e\.npz: the parameter {name} holds .* NaN or infinite"):
+        load_estimator(tmp_path / "e.npz")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_checkpoint_with_parameters_that_are_no_numbers_is_refused(tmp_path, value):
+    """But a best loss of inf belongs to every training that has not been evaluated yet."""
+    state = {"params": {"kernel": jnp.ones(3)}, "best_loss": jnp.float32(np.inf)}
+    save_checkpoint(tmp_path, 1, state, IDENTITY, {})
+    load_checkpoint(tmp_path, 1, state, IDENTITY)
+    state["params"]["kernel"] = state["params"]["kernel"].at[1].set(value)
+    save_checkpoint(tmp_path, 2, state, IDENTITY, {})
+    with pytest.raises(CheckpointError, match=r"params\.kernel holds 1 values that are NaN or infinite, of 3"):
+        load_checkpoint(tmp_path, 2, state, IDENTITY)
 
 
 def test_an_estimator_of_another_format_or_network_is_refused_by_name(tmp_path, params, monkeypatch):
     path = tmp_path / "e.npz"
     wider = dataclasses.replace(CONFIG, dense_widths=(4, 4, 4, 5))
     save_estimator(path, params, wider, {})
-    with pytest.raises(CheckpointError, match=r"array\.second\.Dense_4\.bias was .*float32\[4\].*float32\[5\]"):
+    with pytest.raises(EstimatorError, match=r"array\.second\.Dense_4\.bias was .*float32\[4\].*float32\[5\]"):
         load_estimator(path)
     monkeypatch.setattr(estimator_files, "ESTIMATOR_FORMAT", "potlp-estimator-99")
     save_estimator(path, params, CONFIG, {})
     monkeypatch.undo()
-    with pytest.raises(CheckpointError, match="'potlp-estimator-99'"):
+    with pytest.raises(EstimatorError, match="'potlp-estimator-99'"):
         load_estimator(path)
     with np.load(path) as file:
         arrays = {name: file[name] for name in file.files if name != "header"}
     header = {"format": estimator_files.ESTIMATOR_FORMAT, "network": {"propositions": ["a"]}, "metadata": {}}
     np.savez(path, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
-    with pytest.raises(CheckpointError, match="image_shape"):
+    with pytest.raises(EstimatorError, match="image_shape"):
         load_estimator(path)
 
 
 def test_other_propositions_or_another_order_are_refused():
     require_propositions(CONFIG, ("fire", "exit"), "the estimator")
     for other in (("exit", "fire"), ("fire", "exit", "alarm")):
-        with pytest.raises(CheckpointError, match=f"fire, exit.*{', '.join(other)}"):
+        with pytest.raises(PropositionsError, match=rf"task.*\({', '.join(other)}\), the estimator \(fire, exit\)"):
             require_propositions(CONFIG, other, "the estimator")

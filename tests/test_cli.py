@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import gzip
 import json
+import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -21,12 +22,16 @@ from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.environments.toy import Toy
 from potlp_jax.errors import PotlpError, WorldError
 from potlp_jax.planning.policies import Policy
-from potlp_jax.planning.search.config import SearchConfig, UctConfig
+from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
 from potlp_jax.task.task import Task
 from potlp_jax.trials.record import Outcome, load_trial
 from potlp_jax.trials.run import run
+from tests.reference.command_line import all_commands
 
 ROOT = Path(__file__).parents[1]
+
+# Beyond the Basic Multilingual Plane there are pictograms, and no letter that the project uses.
+PICTOGRAM = re.compile("[\U00010000-\U0010ffff]")
 
 # Few simulations: what is tested is the command line, not the planner.
 FAST = ("--simulations", "20")
@@ -103,6 +108,10 @@ def test_max_positive_literals_reaches_the_task():
         (("task", "G a"), "co-safe"),
         (("task", "F (a &"), "^"),
         (("task", "F b", "--propositions", "a"), "unknown proposition"),
+        (("task", "F (a & !a)"), "no robot can satisfy 'F (a & !a)'"),
+        (("run", "toy", "--task", "F goal & G !goal"), "co-safe"),
+        (("run", "toy", "--task", "X goal & X !goal"), "no robot can satisfy 'X goal & X !goal'"),
+        (("compare", "toy", "--task", "F (goal & !goal)"), "no robot can satisfy 'F (goal & !goal)'"),
         (("task", "missing.hoa"), "missing.hoa"),
         (("task", "F a", "--out", "picture.docx"), "docx"),
         (("run", "castle"), ", ".join(FAMILIES)),
@@ -130,6 +139,56 @@ def test_bad_input_is_one_message_and_exit_code_2(arguments, message):
     assert result.stdout == ""
 
 
+NAME = "[bold]:office:[/x]"
+"""A user's own name, in which Rich would read a style and a pictogram."""
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("run", f"map:{NAME}.yaml"),
+        ("run", f"floorplan:{NAME}/plans:office:x"),
+        ("explain", f"{NAME}/first"),
+        ("explain", f"{NAME}/trial.json:0"),
+        ("task", f"F {NAME}"),
+        ("run", "toy", "--task", f"F {NAME}"),
+        ("run", "toy", "--policy", NAME),
+        ("run", "toy", f"--{NAME}"),
+        ("sweep", "show", NAME),
+        (NAME,),
+    ],
+)
+def test_messages_show_what_was_typed(arguments):
+    result = _potlp(*arguments)
+    assert result.exit_code in (1, 2)
+    # Errors about options stand in a box, which breaks lines.
+    assert NAME in re.sub(r"[\s│]", "", result.stderr)
+    assert not PICTOGRAM.search(result.output)
+
+
+def test_results_show_names_as_they_are():
+    formula = f'!"{NAME}" U ":house:"'
+    result = _potlp("task", formula)
+    assert result.exit_code == 0, result.output
+    # The heading, the list of propositions, and the table.
+    assert result.stdout.count(NAME) >= 3
+    assert result.stdout.count(":house:") >= 3
+    assert not PICTOGRAM.search(result.stdout)
+
+
+def test_help_has_no_pictograms():
+    for words in all_commands():
+        result = _potlp(*words, "--help")
+        assert result.exit_code == 0
+        assert not PICTOGRAM.search(result.stdout), words
+
+
+def test_one_place_makes_consoles():
+    for file in (ROOT / "potlp_jax").rglob("*.py"):
+        if file.name != "output.py":
+            assert not re.search(r"\bConsole\(|from_markup|rich import print", file.read_text()), file
+
+
 def test_bad_options_have_exit_code_2():
     assert _potlp("run", "toy", "--world", "-1").exit_code == 2
     assert _potlp("compare", "toy", "--trials", "0").exit_code == 2
@@ -140,7 +199,7 @@ def test_bad_options_have_exit_code_2():
 def test_run_writes_record_picture_and_animation(recorded):
     trial = load_trial(recorded / "trial.json")
     assert trial.outcome is Outcome.SATISFIED
-    assert (trial.environment, trial.seed, trial.policy) == ("toy/validation", 3, "oracle")
+    assert (trial.environment, trial.world_number, trial.policy) == ("toy/validation", 3, "oracle")
     world = make("toy").generate(world_key("validation", 3, "toy"))
     assert trial.path[0] == tuple(int(entry) for entry in world.start)
     assert trial.config["decision"]["search"]["simulations"] == 20
@@ -243,6 +302,12 @@ def test_a_task_that_no_world_allows_is_to_be_checked(monkeypatch):
     monkeypatch.setattr("potlp_jax.cli.run.WORLDS_TRIED", 2)
     result = _potlp("run", "toy", "--task", "!hazard U (goal & hazard)", "--policy", "baseline")
     assert "as in the 2 worlds that follow: check the task" in result.stderr
+
+
+def test_a_task_that_asks_for_nothing_is_named():
+    result = _potlp("run", "toy", "--task", "F (goal | !goal)", "--policy", "baseline")
+    assert result.exit_code == 0
+    assert "'F (goal | !goal)' is satisfied by every word: there is nothing to do" in result.stderr
 
 
 def test_out_that_is_a_file_is_refused(tmp_path):
@@ -472,7 +537,7 @@ def test_completion_loads_nothing_of_the_library():
 def test_completed_names_are_those_of_the_library():
     assert tuple(Policy) == completion.POLICIES
     assert tuple(Split) == completion.SPLITS
-    assert (SearchConfig.kind, UctConfig.kind) == completion.SEARCHES
+    assert (BestFirstConfig.kind, UctConfig.kind) == completion.SEARCHES
     assert {name: tuple(make(name).tasks) for name in NAMED} == dict(completion.TASKS)
 
 

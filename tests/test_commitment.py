@@ -47,7 +47,7 @@ def _plan(q_values, action=None):
         value=jnp.float32(table[chosen]),
         q_values=jnp.asarray(table),
         visits=jnp.zeros(len(table), jnp.int32),
-        gap=jnp.float32(0),
+        optimism_gap=jnp.float32(0),
         status=jnp.uint32(0),
     )
 

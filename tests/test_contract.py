@@ -84,7 +84,7 @@ def test_a_problem_is_made_from_arrays_and_planned_inside_jit():
             dead_end_cost=jnp.float32(100.0),
         )
         assert potlp_jax.enumerate_actions(problem).shape == (subgoals, len(task.edges))
-        return potlp_jax.plan_actions(problem, key, potlp_jax.SearchConfig(simulations=50))
+        return potlp_jax.plan_actions(problem, key, potlp_jax.BestFirstConfig(simulations=50))
 
     result = plan(jnp.array([[0.2], [0.9]]), jax.random.key(0))
     assert int(result.action) == 1 * len(task.edges) + 0

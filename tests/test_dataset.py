@@ -157,7 +157,7 @@ def test_a_truncated_file_is_named(tmp_path, file):
     _write(tmp_path, [0, 1])
     path = file(tmp_path, 1)
     path.write_bytes(path.read_bytes()[:-40])
-    with pytest.raises(DatasetError, match=f"{path.name} cannot be read"):
+    with pytest.raises(DatasetError, match=f"{path.name}: is not a shard of a dataset, or is damaged"):
         read_dataset(tmp_path)
 
 

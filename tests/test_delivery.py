@@ -24,7 +24,8 @@ from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import WorldError
 from potlp_jax.planning.policies import Policy
-from potlp_jax.task.task import Task, shipped_tasks
+from potlp_jax.task.shipped import shipped_tasks
+from potlp_jax.task.task import Task
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import Outcome
 
@@ -255,7 +256,7 @@ def _grid_costs(occupied: np.ndarray, initial: dict[tuple[int, int], float], sid
 
 def test_known_map_finds_the_shortest_round():
     generator = Delivery.toy()
-    task = Task.of_formula(generator.tasks["1"], generator.propositions)
+    task = Task.from_formula(generator.tasks["1"], generator.propositions)
     for index in range(2):
         world, _, placement = generator.generate_with_layout(_key(index))
         occupied, letters = np.asarray(world.occupied), np.asarray(world.letters)

@@ -55,7 +55,7 @@ def test_once_something_is_found_it_is_not_asked_for():
 def test_an_estimator_is_asked_for_what_is_ahead():
     task = task_of("F a & F b & F c")
     empty = np.zeros((4, 5), bool)
-    belief = BeliefMap.revealed(make_world(empty, empty.astype(int), (1, 1)))
+    belief = BeliefMap.revealed(make_world(empty, empty.astype(int), (1, 1), propositions=task.propositions))
     subgoals = find_subgoals(belief, belief.free, jnp.zeros(belief.free.shape), FrontierConfig(max_subgoals=1))
     asked = []
 

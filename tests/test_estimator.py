@@ -11,7 +11,7 @@ import pytest
 from potlp_jax.cli.explain import explain_decision
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
-from potlp_jax.errors import CheckpointError
+from potlp_jax.errors import EstimatorError, PropositionsError
 from potlp_jax.learning.estimator import (
     SURE,
     estimator_for,
@@ -106,7 +106,7 @@ def test_answers_equal_the_network_asked_pair_by_pair(world, task, trained, reso
     world = dataclasses.replace(world, resolution=jnp.float32(resolution))
     belief = observe(BeliefMap.unobserved(world), world, world.start, NEAR.sensor)
     subgoals = find_subgoals(belief, belief.free, jnp.zeros(world.shape), FrontierConfig())
-    eyes = observe_panorama(trained.start(*world.shape), render(world, world.start), belief, world.start)
+    eyes = observe_panorama(trained.start(*world.shape, 4), render(world, world.start), belief, world.start)
     estimates = eyes(belief, subgoals, task.arrays)
     network = EstimatorNetwork(trained.config)
     features = network.encode(trained.params, render(world, world.start))
@@ -165,7 +165,7 @@ def test_a_saved_trial_replays_its_decisions(trial, trained, tmp_path):
 
 def test_a_replay_wants_the_same_estimator(trial, trained):
     other = dataclasses.replace(trained, digest="another")
-    with pytest.raises(CheckpointError, match="give that one"):
+    with pytest.raises(EstimatorError, match="give that one"):
         replay_decision(trial, 0, other)
 
 
@@ -185,9 +185,9 @@ def test_a_disturbed_camera_changes_what_is_estimated(world, task, trained, tria
 
 def test_which_estimator_is_used(trained, generator):
     assert estimator_for(generator.propositions, trained) is trained
-    with pytest.raises(CheckpointError, match="knows the propositions"):
+    with pytest.raises(PropositionsError, match=r"task has the propositions \(other\), estimator"):
         estimator_for(("other",), trained)
-    with pytest.raises(CheckpointError, match="no estimator is shipped"):
+    with pytest.raises(EstimatorError, match="no estimator is shipped"):
         estimator_for(("other",))
     assert shipped_estimator(("other",)) is None
 

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from potlp_jax.cli import app
 from potlp_jax.codec import config_from_dict
-from potlp_jax.errors import CheckpointError, EvaluationError
+from potlp_jax.errors import EvaluationError, PropositionsError
 from potlp_jax.learning.dataset import DatasetMetadata, Samples, decode, encode, view_id, write_shard
 from potlp_jax.learning.metrics import (
     BINS,
@@ -301,7 +301,7 @@ def test_an_estimator_is_evaluated_on_data_of_its_own_kind_only():
     check_fit(CONFIG, learned, samples, "net", "data")
     check_fit(CONFIG, {}, samples, "net", "data")
     other = dataclasses.replace(CONFIG, propositions=("alarm", "fire", "exit"))
-    with pytest.raises(CheckpointError, match="alarm, fire, exit"):
+    with pytest.raises(PropositionsError, match=r"^data has .* net \(alarm, fire, exit\)"):
         check_fit(other, learned, samples, "net", "data")
     with pytest.raises(EvaluationError, match=r"\(64, 128\).*\(64, 192\)"):
         check_fit(dataclasses.replace(CONFIG, image_shape=(64, 192)), learned, samples, "net", "data")

@@ -21,6 +21,8 @@ from potlp_jax.world.grid import (
     world_to_dict,
 )
 
+NAMES = tuple(f"p{bit}" for bit in range(16))
+
 
 def closed(height: int = 5, width: int = 7) -> np.ndarray:
     occupied = np.ones((height, width), bool)
@@ -47,7 +49,7 @@ def assert_same(left: World, right: World) -> None:
 def test_a_closed_world_is_taken_as_it_is():
     letters = np.zeros((5, 7), np.int64)
     letters[2, 3] = 5
-    world = make_world(closed(), letters, (1, 1), resolution=0.25)
+    world = make_world(closed(), letters, (1, 1), resolution=0.25, propositions=NAMES[:3])
     np.testing.assert_array_equal(world.occupied, closed())
     np.testing.assert_array_equal(world.letters, letters)
     assert world.start.tolist() == [1, 1]
@@ -61,7 +63,7 @@ def test_an_open_border_gets_a_ring_of_obstacles(opening):
     occupied[opening] = False
     letters[2, 3] = 1
     look = coloured(5, 7)
-    world = make_world(occupied, letters, (2, 3), appearance=look)
+    world = make_world(occupied, letters, (2, 3), appearance=look, propositions=NAMES[:1])
     assert world.shape == (7, 9)
     assert np.asarray(world.occupied)[[0, -1]].all()
     assert np.asarray(world.occupied)[:, [0, -1]].all()
@@ -77,7 +79,7 @@ def test_an_open_border_gets_a_ring_of_obstacles(opening):
 
 def test_letters_on_obstacles_are_dropped():
     letters = np.full((5, 7), 3)
-    world = make_world(closed(), letters, (1, 1))
+    world = make_world(closed(), letters, (1, 1), propositions=NAMES[:2])
     np.testing.assert_array_equal(world.letters, np.where(closed(), 0, 3))
 
 
@@ -89,8 +91,8 @@ def test_letters_on_obstacles_are_dropped():
         ({"start": (-1, 1)}, "lies outside"),
         ({"letters": np.zeros((5, 6), np.int32)}, "must have one shape"),
         ({"occupied": np.ones((5, 8), bool)}, "must have one shape"),
-        ({"letters": np.full((5, 7), -1)}, "letters must lie in"),
-        ({"letters": np.full((5, 7), 2**16)}, "letters must lie in"),
+        ({"letters": np.full((5, 7), -1)}, r"letters of \(\) must lie in 0..0"),
+        ({"letters": np.full((5, 7), 4), "propositions": NAMES[:2]}, r"letters of \(p0, p1\) must lie in 0..3"),
         ({"resolution": 0.0}, "resolution must be a positive number"),
         ({"resolution": float("nan")}, "resolution must be a positive number"),
         ({"resolution": float("inf")}, "resolution must be a positive number"),
@@ -106,7 +108,7 @@ def test_bad_worlds_are_refused(change, message):
 def test_padding_adds_obstacles_below_and_to_the_right():
     letters = np.zeros((5, 7), np.int32)
     letters[1, 2] = 2
-    world = make_world(closed(), letters, (3, 5), 0.5, coloured(5, 7))
+    world = make_world(closed(), letters, (3, 5), 0.5, coloured(5, 7), NAMES[:2])
     padded = pad_world(world, 6, 11)
     assert padded.shape == (6, 11)
     assert padded.extent.tolist() == [5, 7]
@@ -123,7 +125,7 @@ def test_padding_adds_obstacles_below_and_to_the_right():
 def test_beliefs_at_both_ends_of_knowledge():
     letters = np.zeros((5, 7), np.int32)
     letters[2, 2] = 4
-    world = make_world(closed(), letters, (1, 1), 0.1)
+    world = make_world(closed(), letters, (1, 1), 0.1, propositions=NAMES[:3])
     nothing, everything = BeliefMap.unobserved(world), BeliefMap.revealed(world)
     assert bool(nothing.unknown.all())
     assert int(nothing.letters.sum()) == 0
@@ -137,7 +139,10 @@ def test_beliefs_at_both_ends_of_knowledge():
 
 def test_beliefs_from_host_arrays():
     cells = np.array([[-1, 0, 1], [0, 0, -1]])
-    belief = belief_from_numpy(cells, np.array([[0, 7, 0], [0, 0, 0]], np.int64), 2.0)
+    letters = np.array([[0, 7, 0], [0, 0, 0]], np.int64)
+    belief = belief_from_numpy(cells, letters, 2.0, propositions=NAMES[:3])
+    with pytest.raises(WorldError, match="name every bit"):
+        belief_from_numpy(cells, letters, 2.0, propositions=NAMES[:2])
     np.testing.assert_array_equal(belief.cells, cells)
     assert belief.cells.dtype == jnp.int8
     assert belief.letters.dtype == jnp.int32
@@ -154,13 +159,14 @@ def test_a_world_is_read_back_bit_for_bit(seed, height, width, resolution):
     occupied = rng.random((height, width)) < 0.4
     occupied[height // 2, width // 2] = False
     letters = rng.integers(0, 2**16, (height, width))
-    world = make_world(occupied, letters, (height // 2, width // 2), resolution, coloured(height, width, seed))
+    world = make_world(occupied, letters, (height // 2, width // 2), resolution, coloured(height, width, seed), NAMES)
     world = pad_world(world, 12, 13)
     again = world_from_dict(json.loads(json.dumps(world_to_dict(world), allow_nan=False)))
     assert_same(world, again)
+    assert again.propositions == NAMES
 
 
-@pytest.mark.parametrize("name", ["occupied", "letters", "start", "resolution", "extent", "appearance"])
+@pytest.mark.parametrize("name", ["occupied", "letters", "start", "resolution", "extent", "appearance", "propositions"])
 @pytest.mark.parametrize("value", [None, {}, "x", [1], {"shape": [1], "dtype": "<i4", "zlib": "AAAA"}])
 def test_damaged_worlds_are_refused(name, value):
     data = world_to_dict(make_world(closed(), np.zeros((5, 7), int), (1, 1)))
@@ -173,7 +179,7 @@ def test_damaged_worlds_are_refused(name, value):
 
 
 def test_worlds_stack_and_map():
-    worlds = [make_world(closed(), np.full((5, 7), value), (1, 1)) for value in (1, 2)]
+    worlds = [make_world(closed(), np.full((5, 7), value), (1, 1), propositions=NAMES[:2]) for value in (1, 2)]
     stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *worlds)
     beliefs = jax.vmap(BeliefMap.revealed)(stack)
     for index, world in enumerate(worlds):

@@ -19,7 +19,8 @@ SIZES = TaskSizes(states=6, propositions=2, edges=12, classes=12, compound=2, cu
 SHAPE = (10, 13)
 FRONTIERS = FrontierConfig(max_subgoals=5, min_size=1)
 
-tasks = {text: Task.from_formula(text, propositions=("a", "b")) for text in FORMULAS}
+SIGMA = ("a", "b")
+tasks = {text: Task.from_formula(text, SIGMA) for text in FORMULAS}
 
 
 @jax.jit
@@ -39,12 +40,12 @@ def _case(seed, density, known):
     start = (int(rng.integers(1, SHAPE[0] - 1)), int(rng.integers(1, SHAPE[1] - 1)))
     occupied[start] = False
     letters = np.where(rng.random(SHAPE) < 0.15, rng.integers(1, 4, SHAPE), 0)
-    world = make_world(occupied, letters, start)
+    world = make_world(occupied, letters, start, propositions=SIGMA)
     rows, columns = np.indices(SHAPE)
     seen = np.hypot(rows - start[0], columns - start[1]) < known
     seen |= rng.random(SHAPE) < 0.05
     cells = np.where(seen, np.where(occupied, BeliefMap.OCCUPIED, BeliefMap.FREE), BeliefMap.UNKNOWN)
-    return world, belief_from_numpy(cells, np.where(seen, np.asarray(world.letters), 0))
+    return world, belief_from_numpy(cells, np.where(seen, np.asarray(world.letters), 0), propositions=SIGMA)
 
 
 @settings(max_examples=60, deadline=None)
@@ -81,9 +82,9 @@ def _picture(rows):
     letters = np.isin(art, ["a", "A"]).astype(np.int32)
     seen = np.isin(art, ["#", ".", "a", "s"])
     start = tuple(int(entry) for entry in np.argwhere(art == "s")[0])
-    world = make_world(occupied, letters, start)
+    world = make_world(occupied, letters, start, propositions=SIGMA)
     cells = np.where(seen, np.where(occupied, BeliefMap.OCCUPIED, BeliefMap.FREE), BeliefMap.UNKNOWN)
-    return world, belief_from_numpy(cells, np.where(seen, letters, 0))
+    return world, belief_from_numpy(cells, np.where(seen, letters, 0), propositions=SIGMA)
 
 
 def _picture_labels(rows):

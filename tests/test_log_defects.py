@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import re
 import shutil
 import sqlite3
 import struct
@@ -152,7 +153,7 @@ def test_thresholds_say_what_is_free_and_what_is_in_between(bags, tmp_path):
             message.data = np.where(message.data == 100, 70, np.where(message.data == 0, 40, -1)).astype(np.int8)
 
     bag = rewrite(bags, tmp_path / "x.bag", fade)
-    with pytest.raises(LogError, match=r"leave nothing free in the last map, whose values are .*40.*--free PERCENT"):
+    with pytest.raises(LogError, match=r"leave nothing free in the last map.*40, 70.*--free 50 --occupied 60"):
         drive_of(bag, places_of(bags))
     with pytest.raises(LogError, match=r"leave no obstacle"):
         drive_of(bag, places_of(bags), LogConfig(free=40, occupied=71))
@@ -162,6 +163,30 @@ def test_thresholds_say_what_is_free_and_what_is_in_between(bags, tmp_path):
         )
     with pytest.raises(LogError, match="0 <= free < occupied"):
         LogConfig(free=60, occupied=50)
+
+
+@pytest.mark.parametrize("values", [(40, 70), (0, 10), (80, 100), (26, 64), (99, 100)])
+def test_advice_on_thresholds_can_be_followed(bags, tmp_path, values):
+    def shift(topic, message, time):
+        if topic == "/map":
+            message.data = np.where(message.data == 100, values[1], np.where(message.data == 0, values[0], -1))
+            message.data = message.data.astype(np.int8)
+
+    bag = rewrite(bags, tmp_path / "x.bag", shift)
+    with pytest.raises(LogError, match="the thresholds leave") as told:
+        drive_of(bag, places_of(bags))
+    advice = re.search(r"--free (\d+) --occupied (\d+)", str(told.value))
+    drive = drive_of(bag, places_of(bags), LogConfig(free=int(advice[1]), occupied=int(advice[2])))
+    np.testing.assert_array_equal(drive.first_seen, first_seen_along(WORLD, tour()))
+
+
+def test_no_thresholds_are_advised_where_none_help(bags, tmp_path):
+    def flatten(topic, message, time):
+        if topic == "/map":
+            message.data = np.where(message.data >= 0, 50, -1).astype(np.int8)
+
+    with pytest.raises(LogError, match="it holds the value 50 and unknown cells only; drive further"):
+        drive_of(rewrite(bags, tmp_path / "x.bag", flatten), places_of(bags))
 
 
 def test_gaps_in_the_pose_are_bridged_and_told(bags, tmp_path):

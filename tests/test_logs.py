@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from potlp_jax.cli import app
 from potlp_jax.environments.ros.places import Places, load_places
-from potlp_jax.errors import LogError, MapError, RecordError
+from potlp_jax.errors import LogError, MapError, PropositionsError, RecordError
 from potlp_jax.learning.dataset import decode, encode, finished_shards, read_dataset, samples_file, views_file
 from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.recording import Pose, Recorder, RecordingConfig, is_answered, record_views, survey
@@ -424,3 +424,10 @@ def tour_step(robot):
     seen = first_seen_along(WORLD, tour())
     visits = [step for step, entered in enumerate(tour()) if entered == cell]
     return next(step for step in visits if np.count_nonzero((seen != NEVER_SEEN) & (seen <= step)) == known)
+
+
+def test_a_task_over_other_names_than_the_labels_is_refused(bags):
+    drive = drive_of(bags / name_of(FORMATS[0]), places_of(bags))
+    swapped = Task.from_formula(TASK.text, TASK.propositions[::-1])
+    with pytest.raises(PropositionsError, match=r"the labels of the log \(goal, hazard\): they differ in order"):
+        replay(drive, swapped, Policy.BASELINE, jax.random.key(0), NEAR)

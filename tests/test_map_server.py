@@ -1,12 +1,13 @@
 """Reading maps as their servers do: images and thresholds, the YAML, metres and cells."""
 
 import math
+import re
 import warnings
 from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from potlp_jax.environments.ros.map_files import GridFrame, load_map
@@ -129,8 +130,8 @@ def test_unknown_key_warns(tmp_path):
         ({"image": '""'}, "image: '' must be the name of an image"),
         ({"image": "[a, b]"}, "image: .* must be the name of an image"),
         ({"resolution": None}, "resolution: is missing"),
-        ({"resolution": "0"}, "resolution: 0 must be positive"),
-        ({"resolution": "-0.05"}, "resolution: -0.05 must be positive"),
+        ({"resolution": "0"}, "resolution: 0 must lie between 0.0001 and 100"),
+        ({"resolution": "-0.05"}, "resolution: -0.05 must lie between"),
         ({"resolution": ".nan"}, r"resolution: '\.nan' is not a finite number"),
         ({"resolution": "five"}, "resolution: 'five' is not a finite number"),
         ({"resolution": "[0.05]"}, "resolution: .* is not a finite number"),
@@ -194,9 +195,9 @@ def test_where_the_image_is_looked_for(tmp_path):
         (b"P5\n1 1\n70000\n00", "maximum 70000"),
         (p2([[0, 300]]), "has a pixel of 300, above its maximum 255"),
         (p2([["0", "black"]]), "has a pixel that is no number"),
-        (png(np.random.default_rng(0).integers(0, 255, (40, 40)).astype(np.uint8))[:800], "cannot be decoded"),
-        (b"", "cannot be decoded"),
-        (b"no image", "cannot be decoded"),
+        (png(np.random.default_rng(0).integers(0, 255, (40, 40)).astype(np.uint8))[:800], "is not an image .*damaged"),
+        (b"", r"is not an image \(PGM, PNG or BMP\), or is damaged"),
+        (b"no image", r"is not an image \(PGM, PNG or BMP\), or is damaged"),
     ],
 )
 def test_broken_images(tmp_path, content, message):
@@ -212,6 +213,47 @@ def test_no_obstacle_and_nothing_free(tmp_path):
         load_map(write_map(tmp_path, p5([[255, 255, 230, 127]])))
     with pytest.raises(MapError, match=r"free_thresh: 0\.196 leaves nothing free in map\.pgm"):
         load_map(write_map(tmp_path, p5([[0, 0, 205]])))
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    greys=st.lists(st.integers(0, 255), min_size=1, max_size=6),
+    low=st.integers(0, 999),
+    gap=st.integers(1, 1000),
+    negate=st.booleans(),
+    mode=st.sampled_from(["trinary", "scale", "raw"]),
+)
+@example(greys=[0, 0, 205], low=196, gap=454, negate=False, mode="trinary")
+@example(greys=[255, 255, 230, 127], low=196, gap=454, negate=False, mode="trinary")
+@example(greys=[205, 230, 254, 0], low=250, gap=400, negate=False, mode="trinary")
+def test_advice_on_thresholds_can_be_followed(tmp_path, greys, low, gap, negate, mode):
+    fields = {"mode": mode, "negate": int(negate and mode != "raw")}
+    fields |= {"free_thresh": low / 1000, "occupied_thresh": min(low + gap, 1000) / 1000}
+
+    def load():
+        """What is said of free_thresh; an error is raised."""
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            load_map(write_map(tmp_path, p5([greys]), **fields))
+        return " ".join(str(warning.message) for warning in told)
+
+    message = ""
+    try:
+        told = load()
+    except MapError as error:
+        message = str(error)
+    if message:
+        advice = re.search(r"such as free_thresh: ([\d.]+) and occupied_thresh: ([\d.]+)$", message)
+        if advice is None:
+            assert "no thresholds tell" in message
+            assert len({grey for grey in greys if mode != "raw" or grey <= 100}) < 2
+            return
+        fields |= {"free_thresh": advice[1], "occupied_thresh": advice[2]}
+        told = load()
+    bounds = re.findall(r"set free_thresh to ([\d.]+) or less", told)
+    if bounds:
+        fields["free_thresh"] = min(bounds, key=float)
+        assert "or less" not in load()
 
 
 def test_warns_of_unknown_that_becomes_free(tmp_path):

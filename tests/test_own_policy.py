@@ -12,7 +12,7 @@ from potlp_jax.errors import PotlpError, RecordError
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.move import MoveKind, move_to
 from potlp_jax.planning.policies import Policy
-from potlp_jax.planning.search.config import SearchConfig
+from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task
 from potlp_jax.trials.batch import Start, run_batch
@@ -30,7 +30,7 @@ ROOMS = Rooms.toy()
 TASK = Task.from_formula("F(a & F c)", propositions=ROOMS.propositions)
 CONFIG = TrialConfig(
     sensor=SensorConfig(range_cells=6.0),
-    decision=DecisionConfig(frontiers=FrontierConfig(max_subgoals=4), search=SearchConfig(simulations=20)),
+    decision=DecisionConfig(frontiers=FrontierConfig(max_subgoals=4), search=BestFirstConfig(simulations=20)),
 )
 KEYS = [jax.random.key(number) for number in range(3)]
 SHAPE = (ROOMS.config.largest, ROOMS.config.largest)
@@ -77,7 +77,7 @@ def test_a_policy_of_ones_own_takes_the_same_path_alone_and_in_a_batch(policy, e
     finished = {trial.name: trial for trial in run_batch(starts, policy, CONFIG, slots=2, estimator=estimator)}
     for number, start in enumerate(starts):
         trial = run_trial(start.world, TASK, policy, start.key, CONFIG, estimator=estimator)
-        assert problems_of(trial, TASK) == []
+        assert problems_of(trial, TASK, start.world) == []
         assert [list(cell) for cell in trial.path] == finished[number].path.tolist()
         assert (trial.outcome, trial.cost) == (finished[number].outcome, finished[number].cost)
 
@@ -101,7 +101,7 @@ def test_a_robot_is_driven_by_its_three_methods_alone():
     run = run_robot(robot, TASK, "baseline", KEYS[0], CONFIG)
     trial = run_trial(WORLDS[0], TASK, "baseline", KEYS[0], CONFIG)
     assert (run.outcome, run.cost, run.path, run.states) == (trial.outcome, trial.cost, trial.path, trial.states)
-    assert problems_of_path(WORLDS[0], run.path, run.cost, run.outcome, TASK.text, TASK.propositions) == []
+    assert problems_of_path(WORLDS[0], run.path, run.cost, run.outcome, TASK.text) == []
     with pytest.raises(PotlpError, match="asks the true map"):
         run_robot(SimulatedRobot(WORLDS[0], CONFIG), TASK, "oracle", KEYS[0], CONFIG)
 
@@ -134,7 +134,7 @@ def test_the_auditor_finds_what_is_wrong_with_a_path():
 
     def problems(**changes):
         changed = dataclasses.replace(trial, **changes)
-        return problems_of_path(WORLDS[0], changed.path, changed.cost, changed.outcome, TASK.text, TASK.propositions)
+        return problems_of_path(WORLDS[0], changed.path, changed.cost, changed.outcome, TASK.text)
 
     assert problems() == []
     assert "cost" in problems(cost=trial.cost + 0.5)[0]

@@ -111,7 +111,7 @@ def test_parcels_of_a_map_take_every_pair_of_rooms_and_are_lit(building):
         assert rooms[placement.start] == 0
     assert len(pairs) == 6
     for formula in generator.tasks.values():
-        Task.of_formula(formula, generator.propositions)
+        Task.from_formula(formula, generator.propositions)
 
 
 def test_trials_on_a_map_see_as_in_the_worlds_that_were_learned_from(building):

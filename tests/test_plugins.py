@@ -9,7 +9,7 @@ from potlp_jax.cli import completion
 from potlp_jax.environments.families import FAMILIES
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.toy import Toy
-from potlp_jax.errors import CheckpointError, PluginError
+from potlp_jax.errors import EstimatorError, PluginError
 from potlp_jax.learning.estimator import named_estimator
 from potlp_jax.planning.policies import Policy, named_policy
 from potlp_jax.sweep.runner import RESULTS, run_sweep
@@ -125,7 +125,7 @@ def test_an_estimator_is_a_function_by_name_or_a_file(elsewhere):
     assert float(plan.value) == trial.decisions[0].value
     with pytest.raises(PluginError, match="int cannot be called with belief"):
         named_estimator("foreign_worlds:number")
-    with pytest.raises(CheckpointError, match=r"missing\.npz"):
+    with pytest.raises(EstimatorError, match=r"missing\.npz"):
         named_estimator("missing.npz")
 
 

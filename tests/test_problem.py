@@ -114,5 +114,5 @@ def test_enumerated_actions_by_hand():
 @pytest.mark.parametrize(("formula", "subgoals"), [("F a & F b", 0), ("X a", 2), ("X a", 0)])
 def test_nothing_to_enumerate(formula, subgoals):
     problem = random_problem(formula, subgoals, 0)
-    assert enumerate_actions(problem).shape == (subgoals, len(task_of(formula).edges))
+    assert enumerate_actions(problem).shape == (subgoals, problem.edge_count)
     assert not np.any(enumerate_actions(problem))

@@ -155,7 +155,7 @@ def test_padding_changes_nothing_that_is_seen(seed, size, range_cells):
     occupied[[0, -1]] = occupied[:, [0, -1]] = True
     robot = (int(rng.integers(1, 11)), int(rng.integers(1, 16)))
     occupied[robot] = False
-    world = make_world(occupied, rng.integers(0, 4, occupied.shape), robot)
+    world = make_world(occupied, rng.integers(0, 4, occupied.shape), robot, propositions=("a", "b"))
     padded = pad_world(world, *size)
     config = SensorConfig(range_cells=range_cells)
     belief = look(BeliefMap.unobserved(world), world, world.start, config)
@@ -179,8 +179,8 @@ def labelled_room() -> tuple[np.ndarray, np.ndarray]:
 
 def test_labelled_cells_are_transparent():
     occupied, letters = labelled_room()
-    world = make_world(occupied, letters, (4, 2))
-    blank = make_world(occupied, np.zeros_like(letters), (4, 2))
+    world = make_world(occupied, letters, (4, 2), propositions=("a", "b"))
+    blank = make_world(occupied, np.zeros_like(letters), (4, 2), propositions=("a", "b"))
     config = SensorConfig(range_cells=30.0)
     belief = look(BeliefMap.unobserved(world), world, world.start, config)
     np.testing.assert_array_equal(belief.cells, look(BeliefMap.unobserved(blank), blank, blank.start, config).cells)
@@ -191,7 +191,7 @@ def test_labelled_cells_are_transparent():
 
 def test_what_is_not_seen_has_no_letter_and_what_was_seen_is_kept():
     occupied, letters = labelled_room()
-    world = make_world(occupied, letters, (4, 2))
+    world = make_world(occupied, letters, (4, 2), propositions=("a", "b"))
     config = SensorConfig(range_cells=30.0)
     first = look(BeliefMap.unobserved(world), world, world.start, config)
     assert int(first.cells[4, 15]) == BeliefMap.UNKNOWN
@@ -220,7 +220,7 @@ def test_one_trace_for_all_maps_and_cells():
     traced = jax.jit(chex.assert_max_traces(observe, n=1), static_argnums=3)
     occupied, letters = labelled_room()
     for robot in ((1, 1), (4, 4), (7, 18)):
-        world = make_world(occupied, letters, robot)
+        world = make_world(occupied, letters, robot, propositions=("a", "b"))
         traced(BeliefMap.unobserved(world), world, world.start, SensorConfig(range_cells=12.0))
 
 

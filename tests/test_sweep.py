@@ -31,6 +31,7 @@ from potlp_jax.sweep.specification import read_specification, specification_from
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store, process_start
 from potlp_jax.task.task import Task
 from potlp_jax.trials.loop import run_trial
+from potlp_jax.types import Status
 from potlp_jax.view.report_page import Cell, Shown, report_page
 from potlp_jax.view.style import policy_styles
 from tests.reference.browser import BROWSER, dump_page
@@ -58,6 +59,7 @@ def _row(item, cost=1.0):
         versions={"jax": "1"},
         commit="",
         seconds=0.5,
+        world_digest="0123456789abcdef",
     )
 
 
@@ -104,7 +106,11 @@ def test_wrong_entries_are_named(changes, message):
 
 
 def test_files_that_are_no_specification_are_named(tmp_path):
-    for text, message in (("[1, 2", "not YAML"), ("- a", "give a mapping"), ("worlds: 3", "environments is missing")):
+    for text, message in (
+        ("[1, 2", "is not valid YAML"),
+        ("- a", "give a mapping"),
+        ("worlds: 3", "environments is missing"),
+    ):
         (tmp_path / "sweep.yaml").write_text(text)
         with pytest.raises(ConfigurationError, match=rf"sweep\.yaml: .*{message}"):
             read_specification(tmp_path / "sweep.yaml")
@@ -181,7 +187,7 @@ def test_other_files_are_no_store(tmp_path):
     old = Store(tmp_path / "b")
     old._connection.execute("UPDATE facts SET value = 'potlp-sweep-0' WHERE name = 'format'")
     old.close()
-    with pytest.raises(StoreError, match=r"'potlp-sweep-0'.*'potlp-sweep-2'"):
+    with pytest.raises(StoreError, match=r"'potlp-sweep-0'.*'potlp-sweep-3'"):
         Store(tmp_path / "b")
 
 
@@ -243,7 +249,7 @@ from potlp_jax.sweep.store import Row, Store
 def rows(self, items, environment, policy):
     for item in items:
         time.sleep(0.002)
-        yield Row(item, "satisfied", item.world / 7, 9.0, 1, 1, 0, 0, (1, 2), "p", "c", {}, "", 0.0)
+        yield Row(item, "satisfied", item.world / 7, 9.0, 1, 1, 0, 0, (1, 2), "p", "c", {}, "", 0.0, "d")
 
 Sweep.rows = rows
 Sweep.possible = lambda self, items: {item.world: item.world % 3 != 1 for item in items}
@@ -423,6 +429,16 @@ def test_export_has_a_line_per_trial(finished, tmp_path):
     pandas = pytest.importorskip("pandas")
     assert _potlp("sweep", "export", finished, "--out", tmp_path / "a.parquet").exit_code == 0
     assert pandas.read_parquet(tmp_path / "a.parquet")["cost"].tolist() == [row.cost for row in _rows(finished)]
+
+
+def test_export_names_status_bits(tmp_path):
+    store = Store(tmp_path / RESULTS)
+    flagged = Status.SUBGOAL_OVERFLOW | Status.FALLBACK
+    store.finish([dataclasses.replace(_row(ITEMS[0]), status=int(flagged)), _row(ITEMS[1])])
+    store.close()
+    assert _potlp("sweep", "export", tmp_path, "--out", tmp_path / "a.csv").exit_code == 0
+    with (tmp_path / "a.csv").open() as file:
+        assert sorted(row["status"] for row in csv.DictReader(file)) == ["", "subgoal_overflow fallback"]
 
 
 def test_wrong_folders_and_names_are_refused(finished, tmp_path):

@@ -20,6 +20,7 @@ from potlp_jax.learning.questions import (
     random_formula,
 )
 from potlp_jax.planning.distances.product import grid_distances
+from potlp_jax.task.formula import parse_formula
 from potlp_jax.task.task import Task
 from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
 from potlp_jax.world.grid import BeliefMap
@@ -77,7 +78,7 @@ def test_where_everything_is_held_out_nothing_can_be_drawn():
 def test_names_of_any_kind_can_be_drawn(sigma):
     rng = np.random.default_rng(0)
     for _ in range(30):
-        assert Task.from_formula(random_formula(rng, sigma), sigma).propositions == sigma
+        assert parse_formula(random_formula(rng, sigma), sigma).propositions == sigma
 
 
 def test_classes_are_diverse():

@@ -19,14 +19,14 @@ from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning import policies
 from potlp_jax.planning.move import MoveKind
 from potlp_jax.planning.policies import Policy, decide
-from potlp_jax.planning.search.config import SearchConfig
+from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task, TaskSizes
 from potlp_jax.trials import loop as trial_module
 from potlp_jax.trials import robot
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
-from potlp_jax.trials.record import Outcome, load_trial
+from potlp_jax.trials.record import Outcome, load_trial, record_checksum
 from potlp_jax.trials.replay import replay_decision
 from potlp_jax.trials.robot import Leg, SimulatedRobot
 from potlp_jax.types import NO_STATE, Status
@@ -39,7 +39,7 @@ SIZES = TaskSizes(states=6, propositions=3, edges=9, classes=9, compound=3, cube
 CONFIG = TrialConfig(
     sensor=SensorConfig(range_cells=6.0),
     decision=DecisionConfig(
-        frontiers=FrontierConfig(max_subgoals=6), search=SearchConfig(simulations=200), path_horizon=64
+        frontiers=FrontierConfig(max_subgoals=6), search=BestFirstConfig(simulations=200), path_horizon=64
     ),
 )
 ROOMS = Rooms.toy()
@@ -70,7 +70,7 @@ def test_trials_keep_their_promises(policy):
     for number, task in enumerate(TASKS):
         world = ROOMS.generate(world_key(Split.VALIDATION, number, "rooms"))
         trial = _run(world, task, policy, number)
-        assert problems_of(trial, task) == []
+        assert problems_of(trial, task, world) == []
         satisfied += trial.outcome is Outcome.SATISFIED
     assert satisfied >= len(TASKS) // 2
 
@@ -165,6 +165,21 @@ def test_a_decision_is_replayed_from_its_record():
         replay_decision(trial, 9999)
 
 
+def test_a_record_names_status_bits(tmp_path):
+    trial = _run(ROOMS.generate(world_key(Split.VALIDATION, 0, "rooms")), TASKS[0], Policy.BASELINE, 0)
+    bits = Status.SUBGOAL_OVERFLOW | Status.FALLBACK
+    decisions = (dataclasses.replace(trial.decisions[0], status=int(bits)), *trial.decisions[1:])
+    dataclasses.replace(trial, status=int(bits), decisions=decisions).save(tmp_path / "trial.json")
+    data = json.loads((tmp_path / "trial.json").read_text())
+    assert data["status"] == data["decisions"][0]["status"] == ["subgoal_overflow", "fallback"]
+    read = load_trial(tmp_path / "trial.json")
+    assert read.status == read.decisions[0].status == bits
+    data["status"] = ["overflow"]
+    (tmp_path / "trial.json").write_text(json.dumps(data))
+    with pytest.raises(RecordError, match="damaged"):
+        load_trial(tmp_path / "trial.json")
+
+
 def test_damaged_records_are_refused(tmp_path):
     path = tmp_path / "trial.json"
     with pytest.raises(RecordError, match="cannot be read"):
@@ -176,12 +191,16 @@ def test_damaged_records_are_refused(tmp_path):
     with pytest.raises(RecordError, match=r"found 'potlp-trial-1'\); run `potlp run` again"):
         load_trial(path)
     path.write_text(json.dumps({"format": "potlp-trial-2"}))
-    with pytest.raises(RecordError, match="the trial record is damaged"):
+    with pytest.raises(RecordError, match="its checksum differs"):
         load_trial(path)
     world = ROOMS.generate(world_key(Split.VALIDATION, 0, "rooms"))
     data = _run(world, TASKS[0], Policy.ORACLE, 0).to_dict()
+    # A value that could be true: the checksum alone tells.
+    path.write_text(json.dumps({**data, "cost": data["cost"] + 1, "checksum": record_checksum(data)}))
+    with pytest.raises(RecordError, match="damaged, or was changed by hand"):
+        load_trial(path)
     data["decisions"][0]["preferred"] = 999
-    path.write_text(json.dumps(data))
+    path.write_text(json.dumps({**data, "checksum": record_checksum(data)}))
     with pytest.raises(RecordError, match="preferred 999 is none of its actions"):
         load_trial(path)
 
@@ -190,26 +209,30 @@ def test_a_start_that_violates_is_infeasible_without_a_move():
     letters = np.zeros((5, 5), np.int32)
     letters[2, 2] = 2
     letters[1, 1] = 1
-    world = make_world(np.pad(np.zeros((3, 3), bool), 1, constant_values=True), letters, (2, 2))
-    task = Task.from_formula("!b U a", propositions=("a", "b"))
+    world = make_world(
+        np.pad(np.zeros((3, 3), bool), 1, constant_values=True), letters, (2, 2), propositions=("a", "b")
+    )
+    task = world.task("!b U a")
     trial = run_trial(world, task, Policy.BASELINE, jax.random.key(0), CONFIG)
     assert trial.outcome is Outcome.INFEASIBLE
     assert trial.cost == 0.0
     assert len(trial.path) == 1
-    assert problems_of(trial, task) == []
+    assert problems_of(trial, task, world) == []
 
 
 def test_a_start_that_satisfies_costs_nothing():
     letters = np.zeros((5, 5), np.int32)
     letters[2, 2] = 1
-    world = make_world(np.pad(np.zeros((3, 3), bool), 1, constant_values=True), letters, (2, 2))
-    trial = run_trial(world, Task.from_formula("F a"), Policy.ORACLE, jax.random.key(0), CONFIG)
+    world = make_world(np.pad(np.zeros((3, 3), bool), 1, constant_values=True), letters, (2, 2), propositions=("a",))
+    trial = run_trial(world, world.task("F a"), Policy.ORACLE, jax.random.key(0), CONFIG)
     assert (trial.outcome, trial.cost, trial.decisions) == (Outcome.SATISFIED, 0.0, ())
 
 
 def test_a_task_that_this_world_cannot_fulfil_ends_infeasible():
-    world = make_world(np.pad(np.zeros((3, 3), bool), 1, constant_values=True), np.zeros((5, 5), np.int32), (2, 2))
-    task = Task.from_formula("F a", propositions=ROOMS.propositions)
+    nothing = np.zeros((5, 5), np.int32)
+    occupied = np.pad(np.zeros((3, 3), bool), 1, constant_values=True)
+    world = make_world(occupied, nothing, (2, 2), propositions=ROOMS.propositions)
+    task = world.task("F a")
     trial = _run(pad_world(world, *ROOMS_SHAPE), task, Policy.BASELINE, 0)
     assert trial.outcome is Outcome.INFEASIBLE
     assert not satisfaction_is_promised(trial, task)
@@ -233,7 +256,7 @@ def test_more_subgoals_than_the_array_holds_are_flagged_and_lose_nothing():
     for number in range(3):
         world = ROOMS.generate(world_key(Split.VALIDATION, number, "rooms"))
         trial = _run(world, TASKS[number], Policy.ORACLE, number, config)
-        assert problems_of(trial, TASKS[number]) == []
+        assert problems_of(trial, TASKS[number], world) == []
         flagged += bool(trial.status & Status.SUBGOAL_OVERFLOW)
     assert flagged > 0
 
@@ -251,7 +274,7 @@ def _decision_in(rows, formula, policy, shape=(6, 12), **settings):
     arrays = Task.from_formula(formula, propositions=("a", "b", "c")).padded(SIZES)
     cell = jnp.asarray(np.argwhere(art == "s")[0], jnp.int32)
     config = dataclasses.replace(CONFIG.decision, **settings)
-    belief = belief_from_numpy(cells, letters)
+    belief = belief_from_numpy(cells, letters, propositions=("a", "b", "c"))
     return _decide(belief, cell, jnp.int32(0), arrays, None, jax.random.key(0), policy=policy, config=config)
 
 
@@ -342,4 +365,4 @@ def test_an_oracle_without_estimator_is_refused():
 def test_policies_are_named_in_one_place():
     assert {policy.value for policy in policies.Policy} == {"known-map", "baseline", "optimistic", "oracle", "potlp"}
     with pytest.raises(PluginError, match="unknown policy 'wizard'"):
-        _run(make_world(np.zeros((3, 3), bool), np.zeros((3, 3), np.int32), (1, 1)), TASKS[0], "wizard", 0)
+        _run(ROOMS.world(0), TASKS[0], "wizard", 0)

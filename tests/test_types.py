@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import jaxtyping
 import numpy as np
+import pytest
 
 import potlp_jax
 from potlp_jax import types
-from potlp_jax.types import Status, status_array, status_if
+from potlp_jax.types import Status, status_array, status_if, status_names, status_of
 
 PACKAGE = Path(potlp_jax.__file__).parent
 ENTRY = re.compile(r"(?P<names>\w+(?:, \w+)*) {2,}\S")
@@ -59,6 +60,17 @@ def test_names_are_read_from_shapes():
     assert names_of(" Z") == {"Z"}
     assert names_of("_ #n ... 2") == {"n"}
     assert {"H", "W", "Z"} <= set(annotations())
+
+
+def test_names_of_status_bits_are_read_back():
+    assert status_names(0) == ()
+    assert status_of([]) == 0
+    for bits in range(2 * max(Status)):
+        # Numbers with a bit that nothing means have no name for it.
+        known = bits & sum(Status)
+        assert status_of(status_names(known)) == known
+    with pytest.raises(KeyError):
+        status_of(["lost"])
 
 
 def test_status_bits_are_distinct_and_combine_on_the_device():

@@ -1,4 +1,4 @@
-"""PO-UCT as published: against a literal Python version and the exact solver; batching, padding, keys."""
+"""PO-UCT, the paper's search: against a literal Python version and the exact solver; batching, padding, keys."""
 
 import dataclasses
 
@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from potlp_jax.bench.problems import family_problem
 from potlp_jax.planning.exact.api import solve_exact
 from potlp_jax.planning.search.api import plan_actions, plan_within, search, search_tree
 from potlp_jax.planning.search.arrays import uniform
@@ -71,7 +72,7 @@ def test_equals_a_literal_version(formula, seed):
     most = max(visits.values())
     assert int(plan.action) == min(reference.index(a) for a, count in visits.items() if count == most)
     assert float(plan.value) == float(plan.q_values[plan.action])
-    assert np.isinf(plan.gap)
+    assert np.isinf(plan.optimism_gap)
     assert int(tree.steps) > QUICK.simulations
 
 
@@ -90,6 +91,24 @@ def test_converges_to_the_exact_solution(formula, seed):
     error_of_few, error_of_many = (np.abs(np.asarray(plan.value) / exact.value - 1.0).mean() for plan in (few, many))
     assert error_of_many < 0.02 < error_of_few
     np.testing.assert_array_equal(many.action, exact.action)
+
+
+def test_regret_falls_with_simulations():
+    """On tuning problems of the benchmark, in one batch that goes on with its trees."""
+    problems = [family_problem("two", 2, "tuning", index) for index in range(12)]
+    truths = [solve_exact(problem).q_values for problem in problems]
+    batch, config = jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems), UctConfig(20, tree_capacity=2001)
+    run = jax.jit(search, static_argnames="config")
+    plans, trees = run(batch, keys(12), config=config)
+
+    def regret(plans):
+        return np.mean([q[int(action)] / q.min() - 1.0 for q, action in zip(truths, plans.action, strict=True)])
+
+    first = regret(plans)
+    for _ in range(99):
+        plans, trees = run(batch, keys(12), config=config, trees=trees)
+    np.testing.assert_array_equal(trees.simulations, 2000)
+    assert regret(plans) < 0.5 * first
 
 
 def test_the_key_drives_the_samples():

@@ -67,7 +67,7 @@ def _world(goal=(9, 22), hazard=(3, 20)):
     occupied[DOOR] = False
     letters = np.zeros((HEIGHT, WIDTH), np.int32)
     letters[goal], letters[hazard] = 1, 2
-    return make_world(occupied, letters, (6, 2))
+    return make_world(occupied, letters, (6, 2), propositions=PROPOSITIONS)
 
 
 def _action(index, q_value, subgoal: int | None = 0, **others):
@@ -129,7 +129,7 @@ def trial() -> Trial:
         propositions=PROPOSITIONS,
         policy="oracle",
         environment="toy/validation",
-        seed=3,
+        world_number=3,
         status=0,
         config={},
         versions={},
@@ -265,7 +265,9 @@ def test_raster_colours_cells_by_what_is_known():
     letters[2, 2], letters[2, 3] = 1, 3
     seen = np.zeros((5, 6), bool)
     seen[:, :4] = True
-    image = cell_image(make_world(occupied, letters, (1, 1)), seen, PROPOSITIONS, hatch=False, pixels=60)
+    image = cell_image(
+        make_world(occupied, letters, (1, 1), propositions=PROPOSITIONS), seen, PROPOSITIONS, hatch=False, pixels=60
+    )
     assert image.shape == (50, 60, 3)
 
     def cell(row, column):
@@ -312,7 +314,7 @@ def test_area_labels_stay_apart_and_inside(cells, seed):
         letters[cell] = generator.integers(1, 4)
     occupied = np.ones((30, 60), bool)
     occupied[1:-1, 1:-1] = False
-    world = make_world(occupied, letters, (1, 1))
+    world = make_world(occupied, letters, (1, 1), propositions=PROPOSITIONS)
     labels = place_labels(world, PROPOSITIONS, [(1, 1)], inches_per_cell=0.15)
     assert labels
     for label in labels:
@@ -505,7 +507,15 @@ def _row(policy, world, cost, outcome="satisfied"):
     return Row(
         item=Item("toy", "F goal", policy, world),
         **{"outcome": outcome, "cost": cost, "budget": 480.0, "steps": 9, "decisions": 3, "fallbacks": 0, "status": 0},
-        **{"key": (0, 1), "path": "", "configuration": "", "versions": {}, "commit": "", "seconds": 1.0},
+        **{
+            "key": (0, 1),
+            "path": "",
+            "configuration": "",
+            "versions": {},
+            "commit": "",
+            "seconds": 1.0,
+            "world_digest": "",
+        },
     )
 
 

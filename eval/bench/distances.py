@@ -32,6 +32,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from potlp_jax.environments.rooms import Rooms, RoomsConfig
 from potlp_jax.planning.distances.product import distance_table, product_distances, product_transitions
+from potlp_jax.sweep.rows import provenance
 from potlp_jax.task.task import Task
 from potlp_jax.world.moves import NEIGHBOURS
 
@@ -336,11 +337,13 @@ def main() -> None:
     if arguments.plot:
         plot(rows, arguments.plot)
     if arguments.out:
-        versions = {"jax": jax.__version__, "numpy": np.__version__, "scipy": scipy.__version__}
-        versions |= {"python": platform.python_version(), "device": str(jax.devices()[0])}
+        made_by = provenance()
+        # What our figures are compared with is of these versions.
+        made_by["versions"] |= {"scipy": scipy.__version__, "python": platform.python_version()}
+        made_by["device"] = str(jax.devices()[0])
         with open(arguments.out, "w", encoding="utf-8") as file:
             json.dump(
-                {"versions": versions, "repeats": arguments.repeats, "growth": growth(rows), "rows": rows},
+                {"provenance": made_by, "repeats": arguments.repeats, "growth": growth(rows), "rows": rows},
                 file,
                 indent=1,
             )

@@ -4,10 +4,14 @@
     python -m eval.bench.regret --quick
 
 The truth - Q of every root action by Eq. 3 - is computed once and kept. Where the exact solution does not fit into the
-time allowed, V* is bounded by a certified interval, and regrets are measured against the best that is known: our own
+time allowed, V* is bounded by a certified interval, and regrets are measured against the best that is known: best-first
 search with BEST_KNOWN simulations, within the certified bounds of each action; such instances are counted apart. The
 regret of a choice is its Q less the least Q, absolute and in % of V* less its dead-end part: what a dead end costs is a
 parameter, and would hide everything else where it is likely.
+
+Planners: ``best-first`` is the library's default search, ``po-uct`` its PO-UCT; ``po-uct-numba`` and
+``po-uct-pomdp-py`` are the same algorithm compiled by Numba and in pomdp-py; ``mctx`` is mctx's stochastic MuZero
+search.
 
 Rows of earlier runs into the same folder are kept where the new run does not repeat them.
 
@@ -37,9 +41,10 @@ from potlp_jax.planning.exact.api import bound_exact, solve_exact
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions
 from potlp_jax.planning.search.best_first import BEST_FIRST
-from potlp_jax.planning.search.config import SearchConfig, UctConfig
+from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
 from potlp_jax.planning.search.lockstep import SearchMethod
 from potlp_jax.planning.search.uct import UCT
+from potlp_jax.sweep.rows import provenance
 from potlp_jax.types import NO_ACTION
 
 mpl.use("Agg")
@@ -136,12 +141,15 @@ def _fingerprint(problem: PlanningProblem) -> str:
 
 @jax.jit
 def _long_search(problem: PlanningProblem, key: Any) -> Any:
-    config = SearchConfig(simulations=BEST_KNOWN, optimism=0.5, max_depth=48)
+    config = BestFirstConfig(simulations=BEST_KNOWN, optimism=0.5, max_depth=48)
     return plan_actions(problem, key, config).q_values
 
 
 def ours(
-    name: str, search: SearchMethod = BEST_FIRST, kind: type[SearchConfig | UctConfig] = SearchConfig, **settings: Any
+    name: str,
+    search: SearchMethod = BEST_FIRST,
+    kind: type[BestFirstConfig | UctConfig] = BestFirstConfig,
+    **settings: Any,
 ) -> Callable[..., Iterator[Answer]]:
     """One of our searches on all instances in one batch; every budget goes on from the one before."""
 
@@ -182,15 +190,17 @@ def ours(
 
 
 def numba_pouct(problems: Sequence[PlanningProblem], budgets: Sequence[int]) -> Iterator[Answer]:
-    """The published algorithm in Numba; by its most visited action, and by the one of least mean cost."""
+    """The paper's PO-UCT in Numba; by its most visited action, and by the one of least mean cost."""
     from eval.bench.opponents.pouct_numba import NumbaSearch
 
     NumbaSearch(problems[0]).run(10)
-    yield from _one_by_one("numba", NumbaSearch, problems, budgets, {"": "most_visited", ", least mean": "least_mean"})
+    yield from _one_by_one(
+        "po-uct-numba", NumbaSearch, problems, budgets, {"": "most_visited", ", least mean": "least_mean"}
+    )
 
 
 def pomdp_py(problems: Sequence[PlanningProblem], budgets: Sequence[int]) -> Iterator[Answer]:
-    """pomdp-py's POUCT; its own answer is the action of the best mean."""
+    """pomdp-py's PO-UCT; its own answer is the action of the best mean."""
     from eval.bench.opponents.pomdp_py_search import PomdpPySearch
 
     PomdpPySearch(problems[0]).run(10)
@@ -233,15 +243,15 @@ def _in_batches(
 
 
 PLANNERS: dict[str, Callable[..., Iterator[Answer]]] = {
-    "ours": ours("ours"),
-    "uct": ours("ours, uct", UCT, UctConfig),
-    "numba": numba_pouct,
-    "pomdp-py": pomdp_py,
+    "best-first": ours("best-first"),
+    "po-uct": ours("po-uct", UCT, UctConfig),
+    "po-uct-numba": numba_pouct,
+    "po-uct-pomdp-py": pomdp_py,
     "mctx": mctx,
 }
-FEW = {"pomdp-py": 6}
+FEW = {"po-uct-pomdp-py": 6}
 """Instances of a planner too slow for all."""
-LARGEST = {"ours": 1000, "uct": 1000, "pomdp-py": 1000, "mctx": 1000}
+LARGEST = {"best-first": 1000, "po-uct": 1000, "po-uct-pomdp-py": 1000, "mctx": 1000}
 """Budgets beyond which a planner is not asked: it gains no more, or takes too long."""
 
 
@@ -290,7 +300,7 @@ def _planners(arguments: argparse.Namespace) -> dict[str, Callable[..., Iterator
     """Those that were asked for, and our own with each optimism."""
     chosen = {name: PLANNERS[name] for name in arguments.planners}
     for optimism in arguments.optimism:
-        name = f"ours, optimism {optimism:g}"
+        name = f"best-first, optimism {optimism:g}"
         chosen[name] = ours(name, optimism=optimism)
     return chosen
 
@@ -412,7 +422,9 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--split", choices=splits, default="test", help="tune on 'tuning' only")
     parser.add_argument("--budgets", nargs="+", type=int, default=[10, 30, 100, 300, 1000, 10_000, 100_000])
     parser.add_argument("--planners", nargs="+", choices=list(PLANNERS), default=list(PLANNERS), metavar="NAME")
-    parser.add_argument("--optimism", nargs="+", type=float, default=[], metavar="W", help="our search with each, too")
+    parser.add_argument(
+        "--optimism", nargs="+", type=float, default=[], metavar="W", help="best-first search with each, too"
+    )
     parser.add_argument("--seconds", type=float, default=60.0, help="for the truth of one instance")
     parser.add_argument("--quick", action="store_true", help="one family, S = 4, 6 tuning instances, two budgets")
     parser.add_argument("--out", default="out/bench/regret")
@@ -438,7 +450,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
             f"{max(row.percent):.3g} % worst, {row.cpu_ms:.3g} CPU ms",
             flush=True,
         )
-        content = {"arguments": vars(parsed), "rows": [asdict(row) for row in rows.values()]}
+        content = {
+            "provenance": provenance(),
+            "arguments": vars(parsed),
+            "rows": [asdict(row) for row in rows.values()],
+        }
         (out / "regret.json").write_text(json.dumps(content, indent=1))
     ordered = sorted(rows.values(), key=lambda row: (list(FAMILIES).index(row.family), row.subgoals))
     report(ordered, out)

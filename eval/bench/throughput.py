@@ -33,7 +33,8 @@ import numpy as np
 from eval.bench.opponents import installed
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions, search
-from potlp_jax.planning.search.config import SearchConfig, UctConfig
+from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
+from potlp_jax.sweep.rows import provenance
 from potlp_jax.task.task import Task
 
 mpl.use("Agg")
@@ -126,7 +127,7 @@ def problem_batch(goals: int, subgoals: int, batch: int) -> PlanningProblem:
 
 
 def kernel(
-    problems: PlanningProblem, simulations: int, kind: type[SearchConfig | UctConfig] = SearchConfig
+    problems: PlanningProblem, simulations: int, kind: type[BestFirstConfig | UctConfig] = BestFirstConfig
 ) -> Prepared:
     """The batched search of one kind, with its other settings by default."""
     config = kind(simulations=simulations)
@@ -140,7 +141,7 @@ def kernel(
 
 def under_vmap(problems: PlanningProblem, simulations: int) -> Prepared:
     """``jax.vmap(plan_actions)``."""
-    config = SearchConfig(simulations=simulations)
+    config = BestFirstConfig(simulations=simulations)
 
     def run(problems, keys):
         plan = jax.vmap(lambda problem, key: plan_actions(problem, key, config))(problems, keys)
@@ -231,14 +232,14 @@ def _pomdp_py(problems: PlanningProblem, simulations: int) -> Prepared:
 
 
 PROGRAMS: dict[str, Callable[[PlanningProblem, int], Prepared]] = {
-    "search": kernel,
+    "best-first": kernel,
     "vmap(plan_actions)": under_vmap,
-    "search, uct": functools.partial(kernel, kind=UctConfig),
+    "po-uct": functools.partial(kernel, kind=UctConfig),
     "mctx": mctx,
-    "pomdp-py": _pomdp_py,
-    "numba": _numba,
+    "po-uct-pomdp-py": _pomdp_py,
+    "po-uct-numba": _numba,
 }
-MOST_ROWS = {"mctx": 64, "pomdp-py": 1, "numba": 1}
+MOST_ROWS = {"mctx": 64, "po-uct-pomdp-py": 1, "po-uct-numba": 1}
 """Batches beyond which a program is not asked: one tree at a time, or more than its rate is worth waiting for."""
 
 
@@ -253,7 +254,7 @@ def rates(arguments: argparse.Namespace) -> Iterator[Rate]:
 def scaling(arguments: argparse.Namespace) -> dict[str, list[Rate]]:
     """Our search, one parameter at a time."""
     quick, simulations = arguments.quick, arguments.simulations
-    run = functools.partial(measure, "search", simulations=simulations, repeats=arguments.repeats)
+    run = functools.partial(measure, "best-first", simulations=simulations, repeats=arguments.repeats)
     return {
         "S": [run(GOALS, s, 16) for s in ((2, 4) if quick else (2, 3, 4, 6, 8, 10, 12))],
         "Z": [run(goals, SUBGOALS, 16) for goals in ((1, 2) if quick else (1, 2, 3, 4))],
@@ -342,7 +343,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parsed = parse(arguments)
     out = Path(parsed.out)
     out.mkdir(parents=True, exist_ok=True)
-    machine = {"machine": platform.processor() or platform.machine(), "jax": jax.__version__, "arguments": vars(parsed)}
+    machine = {"provenance": provenance(), "machine": platform.processor() or platform.machine()}
     if parsed.scaling:
         groups = scaling(parsed)
         text, name = scaling_table(groups), "scaling"

@@ -28,7 +28,7 @@ ENVIRONMENT = "firefighting"
 def starts(worlds: int) -> list[Start]:
     """Every task of the environment in each of the worlds, in one size."""
     generator = make(ENVIRONMENT)
-    tasks = [Task.of_formula(formula, generator.propositions) for formula in generator.tasks.values()]
+    tasks = [Task.from_formula(formula, generator.propositions) for formula in generator.tasks.values()]
     sizes = tasks[0].sizes
     for task in tasks:
         sizes = sizes.union(task.sizes)

@@ -38,8 +38,7 @@ from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.planning.distances.product import grid_distances
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.results import Pair, pair_rows
-from potlp_jax.sweep.rows import read_path, source_commit
-from potlp_jax.trials.loop import versions
+from potlp_jax.sweep.rows import provenance, read_path
 from potlp_jax.view.layers import draw_ends
 from potlp_jax.view.style import ROBOT, new_figure, save_figure
 
@@ -195,7 +194,7 @@ def main() -> None:
             rows = [row for row in read_rows(options.out / name) if row.item.task == PARCELS.tasks["1"]]
             wanted = found[name]["contrast"]["example"]
             example = generator, next(p for p in pair_rows(rows, policies) if p[Policy.BASELINE].item.world == wanted)
-    results = {"maps": found, "camera": CAMERA, "versions": versions(), "reported_at": source_commit()}
+    results = {"maps": found, "camera": CAMERA, "provenance": provenance()}
     print(markdown(results))
     if options.report is not None:
         options.report.with_suffix(".json").write_text(json.dumps(results, indent=1) + "\n")

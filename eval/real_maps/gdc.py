@@ -18,7 +18,7 @@ LABELS = {"gdc_3ne": "gdc_3ne_locations.yaml", "gdc_floor2": "gdc_2_locations.ya
 
 
 def rooms_from_labels(maps: Path, name: str) -> dict[str, Any]:
-    """What a rooms file holds (``environments.mapped_rooms``), in map metres."""
+    """What a rooms file holds (``environments.ros.mapped_rooms``), in map metres."""
     frame = load_map(maps / f"{name}.yaml").frame
     labels = yaml.safe_load((maps / "labels" / LABELS[name]).read_text())
     rooms = {}

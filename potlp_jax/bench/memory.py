@@ -7,7 +7,7 @@ import jax
 
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import search_tree
-from potlp_jax.planning.search.config import SearchConfig, UctConfig
+from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +33,7 @@ class TreeMemory:
         return self.total / self.nodes
 
 
-def tree_memory(problem: PlanningProblem, config: SearchConfig | UctConfig) -> TreeMemory:
+def tree_memory(problem: PlanningProblem, config: BestFirstConfig | UctConfig) -> TreeMemory:
     """Memory of the tree that searching one problem of this shape with this configuration fills.
 
     Args:

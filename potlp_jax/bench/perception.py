@@ -10,6 +10,7 @@ from potlp_jax.learning.memory import remember
 from potlp_jax.learning.network import EstimatorNetwork
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.situation import DecisionConfig, assess
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.robot import photograph
 from potlp_jax.world.camera import CameraConfig, Disturbance
 
@@ -43,7 +44,7 @@ def measure_perception(
         "render", lambda world, cell: photograph(world, cell, key, camera, Disturbance()), world, scene.cell
     )
     # An estimator before its first observation: an empty memory of the right size.
-    blind = trained.start(*world.shape)
+    blind = trained.start(*world.shape, TrialConfig().panoramas)
     features = phases.measure(
         "first stage", lambda params, image: network.encode(params, image), trained.params, panorama
     )

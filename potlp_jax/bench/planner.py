@@ -24,7 +24,7 @@ from potlp_jax.planning.move import Move
 from potlp_jax.planning.policies import Policy, decide
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions, search
-from potlp_jax.planning.search.config import SearchConfig
+from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.situation import DecisionConfig, Situation, assess, planning_problem
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.types import NO_STATE
@@ -139,7 +139,7 @@ class SearchRow:
     timing: Timing
 
 
-def measure_search(family: str, subgoals: int, batch: int, config: SearchConfig, repeats: int) -> SearchRow:
+def measure_search(family: str, subgoals: int, batch: int, config: BestFirstConfig, repeats: int) -> SearchRow:
     """Search the first tuning problems of a family in lockstep.
 
     Args:

@@ -69,7 +69,7 @@ def run_bench(
     from potlp_jax.cli.inputs import setting_changes, trial_config
     from potlp_jax.environments.registry import make
     from potlp_jax.learning.estimator import estimator_for
-    from potlp_jax.planning.search.config import SearchConfig
+    from potlp_jax.planning.search.config import BestFirstConfig
 
     chosen = _read_parts(parts)
     # All words are read before anything is measured: measuring takes minutes.
@@ -80,7 +80,7 @@ def run_bench(
     _pin(core)
     decision = trial_config(setting_changes(simulations=simulations)).decision
     # Of the two searches the default is measured; `eval.bench` compares them.
-    searching = SearchConfig() if simulations is None else SearchConfig(simulations=simulations)
+    searching = BestFirstConfig() if simulations is None else BestFirstConfig(simulations=simulations)
     rows: dict[str, list[Any]] = {}
     with progress_bar() as progress:
         bar = progress.add_task("compiling and measuring", total=None)
@@ -166,7 +166,7 @@ def _plain(rows: dict[str, list[Any]]) -> dict[str, list[dict[str, Any]]]:
 def _print(rows: dict[str, list[Any]], where: dict[str, Any]) -> None:
     out = console()
     threads = "one thread" if where["threads"] == "one" else f"threads on {where['usable_cores']} cores"
-    out.print(f"{where['processor']}, {where['platform']}, {threads}; jax {where['jax']}", markup=False)
+    out.print(f"{where['processor']}, {where['platform']}, {threads}; jax {where['jax']}")
     if "search" in rows:
         out.print(_search_table(rows["search"]))
     if "distances" in rows:

@@ -89,7 +89,7 @@ def collect(
             processes=processes,
             tell=partial(collection_bars(progress), of_split),
         )
-    console().print(collection.summary(read_dataset(folder)), markup=False)
+    console().print(collection.summary(read_dataset(folder)))
 
 
 def _chosen(environment: str | None, recipe: str | None) -> "Recipe":

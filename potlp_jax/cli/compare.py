@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
 from potlp_jax.cli.completion import complete_policies
 from potlp_jax.cli.group import Command, command_app
@@ -21,7 +20,7 @@ from potlp_jax.cli.options import (
     TaskName,
     WorldNumber,
 )
-from potlp_jax.cli.output import console, fail, make_folder, print_json, to_json
+from potlp_jax.cli.output import console, fail, file_console, make_folder, print_json, to_json
 from potlp_jax.cli.sweep import print_cell, run_reported
 
 if TYPE_CHECKING:
@@ -114,8 +113,8 @@ def compare_policies(
     (cell,) = results.cells
     print_cell(console(), cell, specification.split)
     if out is not None:
-        console().print(f"wrote {', '.join(file.name for file in files)} in {out}", markup=False)
-        console().print(f"next: potlp report {out}", markup=False, style="dim")
+        console().print(f"wrote {', '.join(file.name for file in files)} in {out}")
+        console().print(f"next: potlp report {out}", style="dim")
 
 
 def _run(specification: "Specification", folder: Path, processes: int) -> "Results":
@@ -139,7 +138,7 @@ def _write(results: "Results", folder: Path) -> list[Path]:
     split, policies = results.specification["split"], results.specification["policies"]
     # As wide as the widest table: a file has no terminal to ask.
     with table.open("w", encoding="utf-8") as file:
-        print_cell(Console(file=file, width=150, highlight=False), cell, split)
+        print_cell(file_console(file, width=150), cell, split)
     _write_csv(cell, trials)
     title = f"{cell.environment}/{split}, task {cell.task}: {len(cell.pairs)} worlds"
     save_figure(draw_scatter(cell.pairs, policies, title), scatter)

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from potlp_jax.cli.group import Command, command_app
 from potlp_jax.cli.options import Json
-from potlp_jax.cli.output import FAILED, console, fail, make_folder, print_json, progress_bar, to_json
+from potlp_jax.cli.output import FAILED, console, fail, file_console, make_folder, print_json, progress_bar, to_json
 
 if TYPE_CHECKING:
     from potlp_jax.learning.dataset import Samples
@@ -29,7 +29,7 @@ SHOWN: int = 4
 
 app = command_app("estimator", "Describe or evaluate a trained estimator.")
 EstimatorArgument = Annotated[
-    Path, typer.Argument(metavar="CHECKPOINT", help="An estimator (.npz), as `potlp fit` writes it.")
+    Path, typer.Argument(metavar="ESTIMATOR", help="An estimator (.npz), as `potlp fit` writes it.")
 ]
 
 
@@ -47,7 +47,7 @@ EstimatorArgument = Annotated[
 """,
 )
 def evaluate_estimator(
-    checkpoint: EstimatorArgument,
+    estimator: EstimatorArgument,
     dataset: Annotated[Path, typer.Argument(metavar="DATASET", help="Folder of samples from `potlp collect`.")],
     out: Annotated[
         Path | None,
@@ -68,13 +68,14 @@ def evaluate_estimator(
     from potlp_jax.learning.metrics import INTACT, check_fit, evaluate, prior_of
     from potlp_jax.learning.network import EstimatorNetwork
     from potlp_jax.learning.serialization import load_estimator
+    from potlp_jax.sweep.rows import provenance
 
     # Before the file is read and the network compiled, like every check of words.
     variants = _read_variants(ablate)
-    params, config, metadata = load_estimator(checkpoint)
+    params, config, metadata = load_estimator(estimator)
     samples = read_dataset(dataset)
     # An estimator asked about propositions that it does not know would answer without meaning.
-    check_fit(config, metadata, samples, str(checkpoint), str(dataset))
+    check_fit(config, metadata, samples, str(estimator), str(dataset))
     _warn(metadata, samples)
     folder = None if out is None else make_folder(out)
     predictions = _predict(EstimatorNetwork(config), params, samples, variants)
@@ -83,7 +84,8 @@ def evaluate_estimator(
     reports = {name: evaluate(samples, entry, prior) for name, entry in predictions.items()}
     found = finite_or_null(
         {
-            "estimator": str(checkpoint),
+            "provenance": provenance(),
+            "estimator": str(estimator),
             "dataset": str(dataset),
             "environment": samples.metadata.environment,
             "split": samples.metadata.split,
@@ -94,7 +96,7 @@ def evaluate_estimator(
             "figures": {name: report.to_dict() for name, report in reports.items()},
         }
     )
-    heading = _heading(checkpoint, samples, prior)
+    heading = _heading(estimator, samples, prior)
     if folder is not None:
         (folder / "evaluation.json").write_text(to_json(found) + "\n", "utf-8")
         _write(folder, heading, reports=reports, samples=samples, predictions=predictions[INTACT])
@@ -104,7 +106,7 @@ def evaluate_estimator(
     _print_reports(console(), heading, reports, [INTACT])
     if folder is not None:
         pictures = "reliability.png, costs.png and predictions.png"
-        console().print(f"wrote evaluation.json, table.txt, {pictures} in {folder}", markup=False)
+        console().print(f"wrote evaluation.json, table.txt, {pictures} in {folder}")
 
 
 def _read_variants(ablate: str) -> tuple[str, ...]:
@@ -162,7 +164,7 @@ def _heading(path: Path, samples: "Samples", prior: "Prior") -> str:
 def _print_reports(out: Console, heading: str, reports: "Mapping[str, Report]", variants: Sequence[str]) -> None:
     from potlp_jax.view.calibration import VARIANTS, ablation_table, cost_table, probability_table
 
-    out.print(heading, markup=False, style="bold")
+    out.print(heading, style="bold")
     for name in variants:
         out.print(probability_table(reports[name], VARIANTS[name]))
         out.print(cost_table(reports[name], VARIANTS[name]))
@@ -178,7 +180,7 @@ def _write(
     from potlp_jax.view.style import save_figure
 
     with (folder / "table.txt").open("w", encoding="utf-8") as file:
-        _print_reports(Console(file=file, width=160, highlight=False), heading, reports, list(reports))
+        _print_reports(file_console(file, width=160), heading, reports, list(reports))
     # The confident ones, right and wrong, show most of what the network has learned.
     chosen = most_confident(samples, predictions, SHOWN)
     save_figure(draw_reliability(reports, heading), folder / "reliability.png")
@@ -197,18 +199,18 @@ def _write(
 [cyan]potlp estimator info out/fit/estimator.npz --json[/cyan]
 """,
 )
-def show_estimator(checkpoint: EstimatorArgument, json: Json = False) -> None:
+def show_estimator(estimator: EstimatorArgument, json: Json = False) -> None:
     """Show what an estimator knows, how large it is and how it was trained."""
     from potlp_jax.codec import finite_or_null
     from potlp_jax.learning.network import operation_counts, parameter_count
     from potlp_jax.learning.serialization import load_estimator
 
-    params, config, metadata = load_estimator(checkpoint)
+    params, config, metadata = load_estimator(estimator)
     # The network runs in two parts: once for a panorama, then once for each subgoal and outcome class.
     per_panorama, per_answer = operation_counts(config)
     description = {
-        "estimator": str(checkpoint),
-        "bytes": checkpoint.stat().st_size,
+        "estimator": str(estimator),
+        "bytes": estimator.stat().st_size,
         "parameters": parameter_count(params),
         "operations_per_panorama": per_panorama,
         "operations_per_answer": per_answer,
@@ -219,7 +221,7 @@ def show_estimator(checkpoint: EstimatorArgument, json: Json = False) -> None:
         print_json(finite_or_null(description))
         return
     out = console()
-    out.print(str(checkpoint), markup=False, style="bold")
+    out.print(str(estimator), style="bold")
     table = Table(box=SIMPLE_HEAD, show_header=False, pad_edge=False)
     table.add_column(no_wrap=True)
     table.add_column()

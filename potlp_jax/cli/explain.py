@@ -64,10 +64,10 @@ def explain_decision(
     if found.actions:
         output.print(action_table(trial, found))
     else:
-        output.print(describe_decision(trial, found), markup=False)
-        output.print(f"policy {trial.policy} does not search: it weighed no actions", markup=False)
+        output.print(describe_decision(trial, found))
+        output.print(f"policy {trial.policy} does not search: it weighed no actions")
     for file in files:
-        output.print(f"wrote {file}", markup=False)
+        output.print(f"wrote {file}")
 
 
 def _read_decision(name: str) -> "tuple[Trial, Decision]":
@@ -102,7 +102,8 @@ def _draw(trial: "Trial", decision: "Decision", out: Path, *, depth: int, estima
 
     if not decision.actions:
         fail(f"decision {decision.index} of policy {trial.policy} did not search: there is no tree to draw")
-    # A record keeps the actions of a decision but not the tree. Searching again with its key grows the same tree.
+    # A record keeps the actions of a decision but not the tree. Searching again, with its key where the search samples,
+    # grows the same tree.
     problem, plan, tree = replay_decision(trial, decision.index, read_estimator(estimator))
     # Where commitment overrode the search, the record holds what the search itself preferred apart.
     if int(plan.action) != (decision.choice if decision.preferred is None else decision.preferred):

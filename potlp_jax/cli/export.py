@@ -100,7 +100,7 @@ def _read_platforms(text: str) -> tuple[str, ...]:
 def _print(files: list[Path], manifest: dict[str, Any]) -> None:
     out = console()
     for name, program in manifest["functions"].items():
-        out.print(f"{name}: {program['meaning']}", markup=False, style="bold")
+        out.print(f"{name}: {program['meaning']}", style="bold")
         table = Table(box=SIMPLE_HEAD)
         for column in ("", "name", "shape", "type"):
             table.add_column(column)
@@ -109,4 +109,4 @@ def _print(files: list[Path], manifest: dict[str, Any]) -> None:
                 table.add_row(direction, value["name"], " × ".join(map(str, value["shape"])) or "-", value["dtype"])
         out.print(table)
     for file in files:
-        out.print(f"wrote {file}", markup=False)
+        out.print(f"wrote {file}")

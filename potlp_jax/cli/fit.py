@@ -93,7 +93,6 @@ def fit(
     console().print(
         f"{folder / fitting.ESTIMATOR}: step {trained.best_step} of {trained.steps}, validation loss "
         f"{trained.best_loss:.4f}; ended by {trained.reason} after {trained.seconds / 60:.1f} min",
-        markup=False,
         soft_wrap=True,
     )
 

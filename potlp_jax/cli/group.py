@@ -19,6 +19,7 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
         "view": "potlp_jax.cli.view",
         "sweep": "potlp_jax.cli.sweep",
         "report": "potlp_jax.cli.report",
+        "audit": "potlp_jax.cli.audit",
         "collect": "potlp_jax.cli.collect",
         "fit": "potlp_jax.cli.fit",
         "estimator": "potlp_jax.cli.estimator",

@@ -51,7 +51,7 @@ def default_policy(generator: Generator) -> Policy:
 
 
 def read_estimator(name: str | None) -> TrainedEstimator | Estimator | None:
-    """An estimator by name; None asks for the shipped one. Raises CheckpointError or PluginError."""
+    """An estimator by name; None asks for the shipped one. Raises EstimatorError or PluginError."""
     return None if name is None else named_estimator(name)
 
 

@@ -181,9 +181,9 @@ def logs_to_dataset(
     else:
         out_console = console()
         for bag, count in summary["views"].items():
-            out_console.print(f"{bag}: {count} views", markup=False)
-        out_console.print(f"{len(holds)} samples, {int(holds.sum())} successes", markup=False)
-        out_console.print(f"wrote {out}", markup=False)
+            out_console.print(f"{bag}: {count} views")
+        out_console.print(f"{len(holds)} samples, {int(holds.sum())} successes")
+        out_console.print(f"wrote {out}")
     if not len(holds):
         logger.warning(
             "no sample: nowhere a subgoal was in view whose answer the final map gives; drive on until the building is "
@@ -253,7 +253,7 @@ def replay_log(
     folder = make_folder(out)
     with progress_bar() as progress:
         progress.add_task("deciding along the drive (the first decision compiles)", total=None)
-        # The key matters to the search uct alone, and is fixed so that a log gives the same decisions every time.
+        # Only the search `uct` draws from the key, and it is fixed so that a log gives the same decisions every time.
         trial, panoramas = replay(drive, asked, chosen, jax.random.key(0), trial_settings, trained)
     files = [folder / RECORD, folder / "trial.png", folder / PAGE]
     trial.save(files[0])
@@ -264,10 +264,9 @@ def replay_log(
     else:
         console().print(
             f"{trial.outcome}: {len(trial.decisions)} decisions of {policy_name(chosen)} along {trial.cost:.2f} m",
-            markup=False,
         )
         for file in files:
-            console().print(f"wrote {file}", markup=False)
+            console().print(f"wrote {file}")
     # Not by default, unlike `potlp view`: replays of logs are made in loops over bags.
     if open_it:
         open_page(files[2])
@@ -310,15 +309,15 @@ def write_log(
     # A bag has no propositions; without the labels beside it, it could not be read back as the same trial.
     labels = out.with_suffix(".labels.yaml")
     count = write_trial(load_trial(record_file(trial)), out, chosen, labels, height)
-    console().print(f"wrote {out}: {count} messages", markup=False)
-    console().print(f"wrote {labels}", markup=False)
-    console().print(f"next: potlp log inspect {out}", markup=False, style="dim")
+    console().print(f"wrote {out}: {count} messages")
+    console().print(f"wrote {labels}")
+    console().print(f"next: potlp log inspect {out}", style="dim")
 
 
 def _print_inspection(found: dict[str, Any]) -> None:
     out = console()
-    out.print(f"{found['bag']}  {found['format']}", markup=False, style="bold")
-    out.print(f"{found['seconds']:.1f} s, {found['messages']} messages", markup=False)
+    out.print(f"{found['bag']}  {found['format']}", style="bold")
+    out.print(f"{found['seconds']:.1f} s, {found['messages']} messages")
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for name in ("topic", "type", "used for"):
         table.add_column(name)
@@ -339,13 +338,13 @@ def _print_inspection(found: dict[str, Any]) -> None:
         )
     out.print(table)
     for name, value in _facts(found):
-        out.print(f"{name:10} {value}", markup=False)
+        out.print(f"{name:10} {value}")
     for name, answer in found["uses"].items():
         # An answer begins with yes or no, and goes on with why.
         good = answer.startswith("yes")
-        out.print(f"{name}: {answer}", markup=False, style="green" if good else "red")
+        out.print(f"{name}: {answer}", style="green" if good else "red")
     for problem in found["problems"]:
-        out.print(f"problem: {problem}", markup=False, style="yellow")
+        out.print(f"problem: {problem}", style="yellow")
 
 
 def _facts(found: dict[str, Any]) -> list[tuple[str, str]]:

@@ -80,13 +80,13 @@ def inspect_map(
         )
         return
     out = console()
-    out.print(str(file), markup=False, style="bold")
+    out.print(str(file), style="bold")
     for name, text in (*_map_lines(image_map, survey), *_clean_lines(clean, radius)):
-        out.print(f"{name:12} {text}", markup=False)
+        out.print(f"{name:12} {text}")
     if survey.passages:
         out.print(_passage_table(survey.passages))
     for defect in defects:
-        out.print(f"- {defect}", markup=False, soft_wrap=True)
+        out.print(f"- {defect}", soft_wrap=True)
 
 
 @app.command(
@@ -130,12 +130,12 @@ def write_clean_map(
         return
     output = console()
     for name, text in _clean_lines(clean, radius):
-        output.print(f"{name:12} {text}", markup=False)
+        output.print(f"{name:12} {text}")
     for line in _cut_off_lines(clean):
-        output.print(f"- {line}", markup=False)
-    output.print(f"wrote {out} and {image}", markup=False)
+        output.print(f"- {line}")
+    output.print(f"wrote {out} and {image}")
     next_one = f"potlp map label {out} --resolution {resolution:g} --radius 0, then potlp run {world}"
-    output.print(f"next: {next_one} (the radius is in the map already)", markup=False, style="dim")
+    output.print(f"next: {next_one} (the radius is in the map already)", style="dim")
 
 
 @app.command(
@@ -203,12 +203,12 @@ def label_map(
         return
     output = console()
     for name, count in cells.items():
-        output.print(f"{name:12} {count} cells, {count * side**2:.1f} m2", markup=False)
-    output.print(f"wrote {target}", markup=False)
+        output.print(f"{name:12} {count} cells, {count * side**2:.1f} m2")
+    output.print(f"wrote {target}")
     # A command that works as it stands: a task of the labels, or to reach every place.
     example = labels.tasks[0][0] if labels.tasks else " & ".join(f"F {name}" for name in labels.names)
     world = _environment(file, None if out is None else target, resolution, radius)
-    output.print(f"next: potlp run {world} --task '{example}'", markup=False, style="dim")
+    output.print(f"next: potlp run {world} --task '{example}'", style="dim")
 
 
 @app.command(
@@ -254,7 +254,7 @@ def preview_map(
         family = RosMap(RosMapConfig(file, str(found), resolution, radius))
         figure = draw_places(family, family.generate(jax.random.key(0)), _title(file, family.clean))
     save_figure(figure, out)
-    console().print(f"wrote {out}", markup=False)
+    console().print(f"wrote {out}")
 
 
 def _environment(file: Path, places: Path | None, resolution: float, radius: float) -> str:
@@ -388,7 +388,7 @@ def _joined(
 ) -> "Places":
     """The old labels with what the options add. Raises TaskError for a bad name or formula."""
     from potlp_jax.environments.ros.places import Places
-    from potlp_jax.task.formula import check_propositions
+    from potlp_jax.task.propositions import check_propositions
     from potlp_jax.task.task import Task
 
     # A name that is given again gets another place: the proposition holds in each of them.
@@ -405,7 +405,7 @@ def _joined(
     formulas = dict(old.tasks) | dict(_named("--task", option, "NAME=FORMULA") for option in tasks)
     # Compiled only to be checked; labels keep the text.
     for formula in formulas.values():
-        Task.of_formula(formula, names)
+        Task.from_formula(formula, names)
     return Places(
         tuple((name, tuple(found)) for name, found in regions.items()),
         old.start if start is None else _read_start(start),

@@ -17,6 +17,7 @@ from potlp_jax.cli.completion import (
     complete_split,
     complete_task,
 )
+from potlp_jax.environments.families import FAMILIES
 
 # How results are shown.
 Json = Annotated[bool, typer.Option("--json", help="Write JSON, and nothing else, to stdout.")]
@@ -28,10 +29,8 @@ Environment = Annotated[
     str,
     typer.Argument(
         metavar="ENV",
-        # The families that need no explanation, and the forms of names that do; TAB lists them all.
-        help="[cyan]toy[/cyan], [cyan]firefighting[/cyan], [cyan]delivery[/cyan], [cyan]rooms[/cyan], "
-        "[cyan]map:FILE.yaml[/cyan] (ROS map), [cyan]floorplan:FILE.xml[/cyan] (real floor plan, or a folder), or "
-        "[cyan]module:attribute[/cyan] of an environment of your own.",
+        help=", ".join(f"[cyan]{name}[/cyan]" for name in FAMILIES)
+        + ", or [cyan]module:attribute[/cyan] of an environment of your own.",
         autocompletion=complete_environment,
     ),
 ]
@@ -74,7 +73,7 @@ SearchName = Annotated[
     str | None,
     typer.Option(
         "--search",
-        help="best-first (the default) or uct, the search as published; of policies that search.",
+        help="For policies that search: best-first (the default, deterministic) or uct (the paper's PO-UCT, sampled).",
         show_default=False,
         autocompletion=complete_search,
     ),

@@ -25,18 +25,32 @@ logger = logging.getLogger(__name__)
 FAILED = 1
 BAD_INPUT = 2
 
+PIPE_COLUMNS: int = 160
+"""Width of what is printed where stdout is no terminal: the widest table of the commands fits."""
+
 
 def console() -> Console:
     """Where results go; what is no terminal gets lines as long as they need to be."""
-    # Rich colours numbers and paths wherever it sees them; here colour has a meaning. In a pipe Rich would wrap tables
-    # at 80 columns, where whoever reads them next wants whole lines.
-    output = Console(highlight=False)
-    return output if output.is_terminal else Console(highlight=False, width=160)
+    # In a pipe Rich would wrap tables at 80 columns, where whoever reads them next wants whole lines.
+    output = _literal_console()
+    return output if output.is_terminal else _literal_console(width=PIPE_COLUMNS)
 
 
 def error_console() -> Console:
     """Where progress, notes and errors go."""
-    return Console(stderr=True, highlight=False)
+    return _literal_console(stderr=True)
+
+
+def file_console(file: TextIO, width: int) -> Console:
+    """Writes tables into a text file with lines of up to ``width`` columns: a file has no terminal to ask."""
+    return _literal_console(file=file, width=width)
+
+
+def _literal_console(**options: Any) -> Console:
+    # What is printed holds names, paths and formulas of users: `map:plans/office` or `[a]` must come out as they were
+    # typed, and Rich would read pictograms and styles in them. It would also colour numbers and paths wherever it sees
+    # them; here colour has a meaning, and is given as `style` or in a `rich.text.Text`.
+    return Console(markup=False, emoji=False, highlight=False, **options)
 
 
 def package_version() -> str:
@@ -64,7 +78,7 @@ class _Messages(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         # A console of its own for each line: who runs commands in one process, as tests do, may exchange stderr.
         style = "dim" if record.levelno < logging.INFO else "yellow"
-        error_console().print(self.format(record), style=style, markup=False, soft_wrap=True)
+        error_console().print(self.format(record), style=style, soft_wrap=True)
 
 
 def set_verbosity(level: int) -> None:
@@ -83,8 +97,15 @@ def shows_progress() -> bool:
 
 def fail(message: str, code: int = BAD_INPUT) -> NoReturn:
     """End the command with one clear message on stderr."""
-    error_console().print(f"potlp: {message}", style="red", markup=False, soft_wrap=True)
+    error_console().print(f"potlp: {_printable(message)}", style="red", soft_wrap=True)
     raise typer.Exit(code)
+
+
+def _printable(message: str) -> str:
+    """Without what a terminal obeys or cannot show: names in damaged files may be any bytes."""
+    return "".join(
+        char if char.isprintable() or char == "\n" else char.encode("unicode_escape").decode() for char in message
+    )
 
 
 @contextmanager
@@ -124,7 +145,7 @@ def progress_bar() -> "Progress":
     terminal = error_console()
     return Progress(
         SpinnerColumn(),
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),

@@ -70,7 +70,7 @@ def write_report(
                 shown.append(_shown(sweep, reason, row, baseline))
             cells.append(Cell(cell.environment, cell.task, pairs, shown))
     page.write_text(report_page(page_title(folder), _facts(facts, rows), policies, cells), "utf-8")
-    console().print(f"wrote {page}", markup=False)
+    console().print(f"wrote {page}")
 
 
 def page_title(folder: Path) -> str:

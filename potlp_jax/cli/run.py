@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.text import Text
 
 from potlp_jax.cli.group import Command, command_app
 from potlp_jax.cli.options import (
@@ -103,7 +104,7 @@ def run_one(
             trial_key(world),
             config,
             environment=f"{environment}/{chosen_split}",
-            seed=world,
+            world_number=world,
             estimator=trained,
         )
     # The record first: should drawing fail, the trial is not lost.
@@ -170,18 +171,18 @@ def _print(trial: "Trial", files: list[Path]) -> None:
     out = console()
     # The colour repeats the word, so that nothing is lost without it.
     colour = "green" if trial.outcome is Outcome.SATISFIED else "red"
-    out.print(f"[bold {colour}]{trial.outcome.value}[/]  cost {trial.cost:.2f}")
+    out.print(Text.assemble((trial.outcome.value, f"bold {colour}"), f"  cost {trial.cost:.2f}"))
     summary = trial.summary()
     for name in _SHOWN:
-        out.print(f"{name:12} {summary[name]}", markup=False)
+        out.print(f"{name:12} {summary[name]}")
     # Flags say that an array or a loop was too small for this trial (`types.Status`); most trials have none.
     if trial.status:
         flags = ", ".join(status_names(trial.status)).replace("_", " ")
-        out.print(f"{'status':12} {flags}", markup=False)
+        out.print(f"{'status':12} {flags}")
     for file in files:
-        out.print(f"wrote {file}", markup=False)
+        out.print(f"wrote {file}")
     # What one would do next with these files; a newcomer need not look it up.
     if files:
-        out.print(f"next: potlp explain {files[0].parent}:0", markup=False, style="dim")
+        out.print(f"next: potlp explain {files[0].parent}:0", style="dim")
     else:
-        out.print("add --out FOLDER for the record, a picture and an animation", markup=False, style="dim")
+        out.print("add --out FOLDER for the record, a picture and an animation", style="dim")

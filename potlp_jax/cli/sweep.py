@@ -170,12 +170,10 @@ def print_cell(out: Console, cell: "CellResults", split: str) -> None:
     from potlp_jax.view.comparisons import comparison_table, remark_lines
 
     redrawn = f", {cell.redrawn} impossible ones left out" if cell.redrawn else ""
-    out.print(
-        f"{cell.environment}/{split}, task {cell.task}: {len(cell.pairs)} worlds{redrawn}", markup=False, style="bold"
-    )
+    out.print(f"{cell.environment}/{split}, task {cell.task}: {len(cell.pairs)} worlds{redrawn}", style="bold")
     out.print(comparison_table(cell.comparison))
     for line in remark_lines(cell.comparison):
-        out.print(line, markup=False)
+        out.print(line)
 
 
 @app.command("export", cls=Command)
@@ -194,15 +192,21 @@ def export(
         _write_parquet(rows, out)
     else:
         fail(f"--out {out}: give a name that ends in .csv or .parquet")
-    console().print(f"wrote {len(rows)} trials to {out}", markup=False)
+    console().print(f"wrote {len(rows)} trials to {out}")
 
 
 def _flat(row: "Row") -> dict[str, Any]:
     """One level of plain values."""
-    # Keys and versions as text: CSV has no lists, and Parquet's would differ from row to row.
+    from potlp_jax.types import status_names
+
+    # Status, keys and versions as text: CSV has no lists, and Parquet's would differ from row to row.
     values = dataclasses.asdict(row)
     item = values.pop("item")
-    values |= {"key": " ".join(map(str, row.key)), "versions": json_module.dumps(values["versions"], sort_keys=True)}
+    values |= {
+        "status": " ".join(status_names(row.status)),
+        "key": " ".join(map(str, row.key)),
+        "versions": json_module.dumps(values["versions"], sort_keys=True),
+    }
     return {**item, **values}
 
 

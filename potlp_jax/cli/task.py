@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.markup import escape
 from rich.table import Table
 
 from potlp_jax.cli.group import Command, command_app
@@ -59,13 +58,13 @@ def show_task(
         print_json(description)
         return
     shown = console()
-    shown.print(task.text, style="bold", markup=False)
-    shown.print(f"propositions: {', '.join(task.propositions) or 'none'}", markup=False)
+    shown.print(task.text, style="bold")
+    shown.print(f"propositions: {', '.join(task.propositions) or 'none'}")
     shown.print(_states(task, description))
     if description["classes"]:
         shown.print(_classes(description))
     if out is not None:
-        shown.print(f"wrote {out}", markup=False)
+        shown.print(f"wrote {out}")
 
 
 def _states(task: "Task", description: dict[str, Any]) -> Table:
@@ -84,7 +83,7 @@ def _states(task: "Task", description: dict[str, Any]) -> Table:
             first = (str(state), _role(state, description)) if line == 0 else ("", "")
             words = transition_words(task, state, move["to"])
             end = line == len(moves) - 1
-            table.add_row(*first, str(move["to"]), escape(words), escape(move["guard"]), end_section=end)
+            table.add_row(*first, str(move["to"]), words, move["guard"], end_section=end)
     return table
 
 
@@ -109,5 +108,5 @@ def _classes(description: dict[str, Any]) -> Table:
         ]
         # Literals that all keeping letters share may admit further letters; labels use the exact ones.
         stay = outcome["stay"] + ("" if outcome["stay_is_exact"] else " (among others)")
-        table.add_row(str(index), escape(stay), escape(outcome["cube"]), ", ".join(edges))
+        table.add_row(str(index), stay, outcome["cube"], ", ".join(edges))
     return table

@@ -49,6 +49,6 @@ def view_trial(
     if page.suffix != ".html":
         fail(f"--out {page}: give a name that ends in .html")
     page.write_text(replay_page(recorded, panoramas_of(recorded)), "utf-8")
-    console().print(f"wrote {page}", markup=False)
+    console().print(f"wrote {page}")
     if open_it:
         open_page(page)

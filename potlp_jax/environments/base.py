@@ -12,6 +12,7 @@ from jaxtyping import PRNGKeyArray
 
 from potlp_jax.environments.splits import Split, default_split, world_key
 from potlp_jax.errors import TaskError
+from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.reading import read_task
 from potlp_jax.task.task import Task
 from potlp_jax.world.grid import World
@@ -25,7 +26,7 @@ class Generator(abc.ABC):
     to other processes: their attributes must be picklable.
 
     Attributes:
-        name: the family's name; it also separates the families' seeds.
+        name: the family's name; it also goes into the keys of its worlds.
         propositions: bit ``i`` of every letter of the family is ``propositions[i]``.
         tasks: formulas that belong to the family, by the number (or name) used on the command line.
         settings: what trials in its worlds need to be different from the defaults: fields of
@@ -42,20 +43,29 @@ class Generator(abc.ABC):
 
     @abc.abstractmethod
     def draw(self, key: PRNGKeyArray) -> World:
-        """Make the world of this key: on the host, the same on every machine. Called by ``generate``.
+        """Make the world of this key, with the family's propositions: on the host, the same on every machine. Called
+        by ``generate``.
 
         Raises:
             WorldError: no world can be made.
         """
 
     def generate(self, key: PRNGKeyArray) -> World:
-        """The world of this key, with the propositions and settings of its family. Raises WorldError as ``draw``."""
+        """The world of this key, with the settings of its family. Raises WorldError as ``draw``."""
         return self.signed(self.draw(key))
 
     def signed(self, world: World) -> World:
-        """The world with the propositions and settings of this family."""
+        """The world with the settings of this family. Raises PropositionsError where it has other propositions."""
+        # The names come with the letters, from where these are written: put on afterwards they could be wrong.
+        require_same_propositions(
+            self.propositions,
+            world.propositions,
+            asker=f"the environment {self.name!r}",
+            knower="the world that it drew",
+            remedy="make_world(..., propositions=self.propositions) in draw",
+        )
         # A world that says itself what it needs cannot be run with the settings of another family by oversight.
-        return dataclasses.replace(world, propositions=self.propositions, settings=self.settings)
+        return dataclasses.replace(world, settings=self.settings)
 
     def world(self, index: int, split: Split | str | None = None) -> World:
         """World number ``index`` of a split, by default of that from which the command line takes its worlds.

@@ -169,7 +169,9 @@ class Firefighting(Generator):
         occupied = _walls(self.config, layout)
         letters = _letters(self.config, layout, self.propositions)
         look = _appearance(self.config, layout, occupied, look_rng)
-        return self.signed(make_world(occupied, letters, layout.start, appearance=look)), layout
+        return self.signed(
+            make_world(occupied, letters, layout.start, appearance=look, propositions=self.propositions)
+        ), layout
 
 
 def hallway_rows(config: FirefightingConfig, hallway: int) -> tuple[int, int]:

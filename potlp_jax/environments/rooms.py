@@ -73,7 +73,8 @@ class Rooms(Generator):
         occupied = _floor(rng, self.config, rows, columns)
         free = np.argwhere(~occupied)
         start = free[rng.integers(len(free))]
-        world = make_world(occupied, _letters(rng, self.config, occupied), (int(start[0]), int(start[1])))
+        letters = _letters(rng, self.config, occupied)
+        world = make_world(occupied, letters, (int(start[0]), int(start[1])), propositions=self.propositions)
         # All floors of a family have one array shape, so that one compilation serves them all.
         return pad_world(world, self.config.largest, self.config.largest)
 

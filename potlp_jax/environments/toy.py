@@ -72,7 +72,7 @@ class Toy(Generator):
         letters = np.zeros(occupied.shape, np.int32)
         letters[goal] = 1 << self.propositions.index("goal")
         letters[hazard] = 1 << self.propositions.index("hazard")
-        return make_world(occupied, letters, start)
+        return make_world(occupied, letters, start, propositions=self.propositions)
 
 
 def _door(config: ToyConfig, middle: int) -> Cell | None:

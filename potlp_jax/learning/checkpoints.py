@@ -6,6 +6,7 @@ writes to a temporary name and renames, so a process killed at any time leaves w
 This is the only module that imports Orbax: planning with a trained estimator does without.
 """
 
+import json
 import re
 import shutil
 import zlib
@@ -20,7 +21,8 @@ from orbax.checkpoint import v1 as ocp
 
 from potlp_jax.codec import differences, json_copy
 from potlp_jax.errors import CheckpointError
-from potlp_jax.learning.serialization import array_shapes, named_arrays
+from potlp_jax.files import one_line, short
+from potlp_jax.learning.serialization import array_shapes, named_arrays, require_finite
 
 CHECKPOINT_FORMAT: str = "potlp-checkpoint-1"
 """Changed when older checkpoints can no longer be read."""
@@ -56,8 +58,8 @@ def save_checkpoint(
         "identity": json_copy(identity),
         "progress": json_copy(progress),
         "arrays": array_shapes(arrays),
-        "checksum": _checksum(arrays),
     }
+    description["checksum"] = _checksum(arrays, description)
     # Arrays by name and not the state itself: reading then needs no class that may have changed.
     ocp.save(str(folder / str(step)), arrays, custom_metadata=description, overwrite=True)
     # After the new one is whole, never before.
@@ -80,7 +82,8 @@ def load_checkpoint(
         The state, bit for bit, and the progress.
 
     Raises:
-        CheckpointError: damaged, of another format, or of another training; the message names every difference.
+        CheckpointError: damaged, of another format, of another training (the message names every difference), or with
+            values that are NaN or infinite.
     """
     path = Path(folder).absolute() / str(step)
     wanted = named_arrays(like)
@@ -91,7 +94,10 @@ def load_checkpoint(
         raise _damaged_checkpoint(path, error) from error
     if not isinstance(description, Mapping) or description.get("format") != CHECKPOINT_FORMAT:
         found = description.get("format") if isinstance(description, Mapping) else None
-        raise CheckpointError(f"{path} has format {found!r}; this library reads {CHECKPOINT_FORMAT!r}")
+        raise CheckpointError(f"{path} has format {short(found)}; this library reads {CHECKPOINT_FORMAT!r}")
+    missing = {"identity", "arrays", "checksum", "progress"} - set(description)
+    if missing or not isinstance(description["progress"], Mapping):
+        raise _damaged_checkpoint(path, f"its description lacks {', '.join(sorted(missing)) or 'progress'}")
     found = differences(description["identity"], json_copy(identity))
     found += differences(description["arrays"], array_shapes(wanted), "array")
     if found:
@@ -101,18 +107,24 @@ def load_checkpoint(
     except Exception as error:
         raise _damaged_checkpoint(path, error) from error
     # Orbax does not notice every flipped bit.
-    if _checksum(arrays) != description["checksum"]:
+    if _checksum(arrays, description) != description["checksum"]:
         raise _damaged_checkpoint(path, "its checksum differs")
+    # Scalars are left out: the best loss of a training that has not been evaluated yet is inf.
+    require_finite({name: array for name, array in arrays.items() if np.ndim(array) > 0}, str(path))
     leaves = [jnp.asarray(arrays[name]) for name in wanted]
     return jax.tree.unflatten(jax.tree.structure(like), leaves), dict(description["progress"])
 
 
 def _damaged_checkpoint(path: Path, why: Any) -> CheckpointError:
-    return CheckpointError(f"{path} cannot be read ({why}): delete it to resume from the one before, if there is one")
+    return CheckpointError(
+        f"{path} cannot be read ({one_line(why)}): delete it to resume from the one before, if there is one"
+    )
 
 
-def _checksum(arrays: Mapping[str, np.ndarray]) -> int:
-    total = 0
+def _checksum(arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) -> int:
+    """Of the arrays and of all that the description says beside it."""
+    said = {name: value for name, value in description.items() if name != "checksum"}
+    total = zlib.crc32(json.dumps(said, sort_keys=True).encode())
     # By name, so that the order of a dictionary does not matter.
     for name in sorted(arrays):
         total = zlib.crc32(np.ascontiguousarray(arrays[name]).tobytes(), total)

@@ -6,11 +6,12 @@ renamed, the samples last: a shard exists when its samples file does. Every file
 in its schema, under the key ``potlp``. ``docs/dataset.md`` describes the columns.
 """
 
+import contextlib
 import dataclasses
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from jaxtyping import Float32, Int8, Int32, UInt8
 
 from potlp_jax.codec import config_from_dict, differences, json_copy
 from potlp_jax.errors import ConfigurationError, DatasetError
+from potlp_jax.files import decode_image, one_line, reading, require_file, short
 
 SCHEMA_VERSION: int = 1
 """Changes when a column or its meaning does."""
@@ -32,6 +34,8 @@ JPEG_QUALITY: int = 92
 _METADATA_KEY = b"potlp"
 
 _TEMPORARY = ".tmp"
+
+_REMEDY = "delete both files of the shard and collect or convert it again"
 
 # docs/dataset.md says what the columns mean; who changes them changes SCHEMA_VERSION.
 VIEWS_SCHEMA = pa.schema(
@@ -111,16 +115,17 @@ class DatasetMetadata:
         """The metadata that ``to_json`` wrote. Raises DatasetError where the text is something else."""
         try:
             data = json.loads(text)
-            # Before the other fields: those of another version may well have other names.
             version = data["schema_version"]
-            if version != SCHEMA_VERSION:
-                raise DatasetError(
-                    f"schema version {version}; this library reads {SCHEMA_VERSION}: collect the dataset again, or use "
-                    "the version of the library that wrote it"
-                )
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
+            raise DatasetError(f"not the metadata of a dataset: {one_line(error)}") from error
+        # Before the other fields: those of another version may well have other names.
+        if version != SCHEMA_VERSION:
+            raise DatasetError(
+                f"schema version {short(version)}; this library reads {SCHEMA_VERSION}: collect the dataset again, or "
+                "use the version of the library that wrote it"
+            )
+        try:
             return config_from_dict(cls, data, "metadata")
-        except (KeyError, TypeError, json.JSONDecodeError) as error:
-            raise DatasetError(f"not the metadata of a dataset: {error!r}") from error
         except ConfigurationError as error:
             raise DatasetError(f"not the metadata of a dataset: {error}") from error
 
@@ -190,11 +195,8 @@ def encode(
 
 def decode(image: bytes) -> UInt8[np.ndarray, "rows columns 3"]:
     """The RGB image; may be called from several threads."""
-    # OpenCV raises on an empty buffer and returns None on a damaged one.
-    decoded = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR) if image else None
-    if decoded is None:
-        raise DatasetError(f"not an image: {len(image)} bytes that OpenCV does not decode")
-    return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
+    with reading("a panorama of the dataset", DatasetError, "an image"):
+        return cv2.cvtColor(decode_image(image, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 
 def writer_versions() -> dict[str, str]:
@@ -301,7 +303,8 @@ def _write_table(path: Path, columns: Mapping[str, Any], schema: pa.Schema, meta
     # With the process's number: two that write the same shard by mistake do not write into one file.
     temporary = path.with_name(f"{path.name}.{os.getpid()}{_TEMPORARY}")
     with temporary.open("wb") as file:
-        pq.write_table(table, file, compression="zstd")
+        # With checksums of the pages, so that a flipped bit is found when they are read.
+        pq.write_table(table, file, compression="zstd", write_page_checksum=True)
         file.flush()
         # Before the rename: otherwise a power cut could leave the name without the contents.
         os.fsync(file.fileno())
@@ -309,16 +312,25 @@ def _write_table(path: Path, columns: Mapping[str, Any], schema: pa.Schema, meta
 
 
 def _broken(path: Path, why: str) -> DatasetError:
-    return DatasetError(f"{path} {why}: delete both files of the shard and collect or convert it again")
+    return DatasetError(f"{path} {why}: {_REMEDY}")
 
 
 def _schema_of(path: Path) -> pa.Schema:
-    try:
+    if not path.exists():
+        raise _broken(path, "is missing")
+    require_file(path, DatasetError)
+    with _reading(path):
         return pq.read_schema(path)
-    except FileNotFoundError as error:
-        raise _broken(path, "is missing") from error
-    except (pa.ArrowInvalid, OSError) as error:
-        raise _broken(path, f"cannot be read ({error})") from error
+
+
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """As ``files.reading``, with what to do about a shard that is damaged."""
+    try:
+        with reading(path, DatasetError, "a shard of a dataset"):
+            yield
+    except DatasetError as error:
+        raise DatasetError(f"{error}: {_REMEDY}") from error
 
 
 def _metadata_of(path: Path, schema: pa.Schema) -> DatasetMetadata:
@@ -326,7 +338,7 @@ def _metadata_of(path: Path, schema: pa.Schema) -> DatasetMetadata:
     if text is None:
         raise DatasetError(f"{path} has no metadata of a dataset in its schema (key '{_METADATA_KEY.decode()}')")
     try:
-        return DatasetMetadata.from_json(text.decode())
+        return DatasetMetadata.from_json(text.decode("utf-8", "replace"))
     except DatasetError as error:
         raise DatasetError(f"{path}: {error}") from error
 
@@ -337,10 +349,13 @@ def _read_table(path: Path, schema: pa.Schema, columns: tuple[str, ...] | None) 
     # More columns than the schema's are no harm: data from elsewhere may keep what they need.
     if wrong:
         raise _broken(path, f"has other columns than the schema: {', '.join(wrong)}")
-    try:
-        return pq.read_table(path, columns=list(columns or schema.names))
-    except (pa.ArrowInvalid, OSError) as error:
-        raise _broken(path, f"cannot be read ({error})") from error
+    with _reading(path):
+        table = pq.read_table(path, columns=list(columns or schema.names), page_checksum_verification=True)
+        # Offsets that point beyond their values would be followed later.
+        table.validate(full=True)
+    if any(table[name].null_count for name in table.column_names):
+        raise _broken(path, "has missing values")
+    return table
 
 
 def _sample_columns(table: pa.Table, propositions: int, path: Path) -> dict[str, np.ndarray]:

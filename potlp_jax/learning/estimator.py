@@ -19,7 +19,7 @@ from flax import struct
 from jaxtyping import Array, Float32, Int32, UInt8
 
 from potlp_jax import plugins
-from potlp_jax.errors import CheckpointError, PluginError
+from potlp_jax.errors import EstimatorError, PluginError
 from potlp_jax.learning.memory import (
     PanoramaMemory,
     empty_memory,
@@ -36,9 +36,6 @@ from potlp_jax.types import NO_STATE
 from potlp_jax.world.camera import bearing
 from potlp_jax.world.frontiers import Subgoals
 from potlp_jax.world.grid import BeliefMap
-
-MEMORY: int = 32
-"""Panoramas that are remembered. A trial takes 14 to 100, of which seldom more than a dozen still show a frontier."""
 
 QUESTIONS: int = 3
 """Classes that are asked of a subgoal at a time."""
@@ -62,7 +59,11 @@ class NetworkEstimator:
 
         The network counts in the unit of the worlds that it learned from, which is the belief's: cells or metres.
         Subgoals are asked one after the other, of each so many classes at a time, so that padding costs little.
+
+        Raises:
+            PropositionsError: the network was trained for other propositions than the task's.
         """
+        require_propositions(self.config, task.propositions, "the estimator's network")
         # Each subgoal is judged from the panorama in which it was last in sight, taken from where the robot then stood.
         places = slots_of_observations(self.memory, observation_of_subgoals(self.memory, subgoals))
         distance = self.distances(belief, subgoals)
@@ -87,6 +88,8 @@ class NetworkEstimator:
             success_probability=exclusive_chances(probability, subgoals, self.config.exclusive_within),
             success_cost=success_cost,
             failure_cost=failure_cost,
+            # Sticky: once a panorama was dropped that showed a frontier, later estimates may be worse for it.
+            status=self.memory.status,
         )
 
     def _ask_of_subgoal(
@@ -197,17 +200,17 @@ class TrainedEstimator:
         """Name and digest, as in records."""
         return f"{self.name} {self.digest}"
 
-    def start(self, height: int, width: int, memory: int = MEMORY) -> NetworkEstimator:
+    def start(self, height: int, width: int, panoramas: int) -> NetworkEstimator:
         """The estimator for a new trial: nothing observed yet.
 
         Args:
             height, width: of the map's array.
-            memory: panoramas that are remembered.
+            panoramas: how many are remembered.
 
         Returns:
             What a decision calls inside jit.
         """
-        empty = empty_memory(memory, self.config.feature_shape, height, width)
+        empty = empty_memory(panoramas, self.config.feature_shape, height, width)
         return NetworkEstimator(params=self.params, memory=empty, config=self.config)
 
 
@@ -217,7 +220,7 @@ observe_panorama = jax.jit(NetworkEstimator.observe)
 
 @functools.lru_cache(maxsize=8)
 def read_estimator(path: Path) -> TrainedEstimator:
-    """Read an estimator. Raises CheckpointError where the file is none."""
+    """Read an estimator. Raises EstimatorError where the file is none."""
     # A digest and not the name: two files of one name are two estimators in records.
     params, config, metadata = load_estimator(path)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
@@ -236,7 +239,7 @@ def named_estimator(name: str | Path) -> TrainedEstimator | Estimator:
         The estimator.
 
     Raises:
-        CheckpointError: there is no such file, or it is no estimator.
+        EstimatorError: there is no such file, or it is no estimator.
         PluginError: it cannot be imported, or is no estimator.
     """
     path = Path(name)
@@ -275,11 +278,12 @@ def estimator_for(propositions: tuple[str, ...], given: TrainedEstimator | None 
     """The estimator to use for a task: the one given, else the shipped one.
 
     Raises:
-        CheckpointError: the one given knows other propositions, or none is shipped for these.
+        EstimatorError: none is shipped for these.
+        PropositionsError: the one given knows other propositions.
     """
     estimator = shipped_estimator(propositions) if given is None else given
     if estimator is None:
-        raise CheckpointError(
+        raise EstimatorError(
             f"no estimator is shipped for the propositions {', '.join(propositions)}: choose another policy, or give "
             "an estimator that was trained for them (docs/estimator.md)"
         )

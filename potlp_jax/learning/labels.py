@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float32, Int32
 
 from potlp_jax.planning.distances.product import SOURCES_AT_ONCE, arrivals_per_source, distances_per_source
 from potlp_jax.planning.estimates import Estimates
+from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_STATE
 from potlp_jax.world.frontiers import Subgoals, frontier_cells
@@ -53,7 +54,12 @@ def true_labels(world: World, belief: BeliefMap, subgoals: Subgoals, task: TaskA
 
     Returns:
         Costs in the world's unit.
+
+    Raises:
+        PropositionsError: world, belief and task are not over the same propositions.
     """
+    require_same_propositions(task.propositions, world.propositions, knower="the true map")
+    require_same_propositions(task.propositions, belief.propositions, knower="the belief")
     count, states = subgoals.mask.shape[0], task.transitions.shape[0]
     lanes = max(min(SOURCES_AT_ONCE, count * states), 1)
     stays = task.transitions == jnp.arange(states, dtype=jnp.int32)[:, None]

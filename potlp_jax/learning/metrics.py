@@ -155,10 +155,10 @@ def check_fit(
         estimator, dataset: their names in messages.
 
     Raises:
-        CheckpointError: other propositions.
+        PropositionsError: other propositions.
         EvaluationError: another size of panorama, another camera or another unit of cost than those it learned from.
     """
-    require_propositions(config, tuple(samples.metadata.propositions), estimator)
+    require_propositions(config, tuple(samples.metadata.propositions), estimator, asker=dataset)
     if not samples.images:
         raise EvaluationError(f"{dataset} has no panoramas")
     size = decode(samples.images[0]).shape[:2]

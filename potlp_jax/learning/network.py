@@ -60,7 +60,7 @@ _SLOPE = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class NetworkConfig:
-    """Everything that, with the parameters, defines the answers; it is stored in every checkpoint.
+    """Everything that, with the parameters, defines the answers; it is stored in every estimator's file.
 
     Attributes:
         propositions: Sigma: the meaning of the entries of both phi, in order.

@@ -7,6 +7,8 @@ an automaton for ``labels.true_labels`` whose states are the distinct sets of st
 once per such set, so that further questions of the same set cost next to nothing.
 """
 
+import contextlib
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -14,7 +16,9 @@ from types import MappingProxyType
 import jax.numpy as jnp
 import numpy as np
 
+from potlp_jax.errors import TaskWarning, UnsatisfiableError
 from potlp_jax.task.guards import Phi
+from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import Task, TaskArrays, TaskSizes
 from potlp_jax.types import NO_CLASS
 
@@ -60,12 +64,14 @@ class Question:
 
     Attributes:
         task: the formula.
+        propositions: of the task; what the entries of the vectors and the bits of the letters mean.
         outcome_class: the index of the class in ``Task.classes``.
         phi_stay, phi_go: its vectors.
         stay, go: the letters that keep the state (exact), and those of the cube.
     """
 
     task: str
+    propositions: tuple[str, ...]
     outcome_class: int
     phi_stay: Phi
     phi_go: Phi
@@ -103,9 +109,13 @@ class TaskDistribution:
     def draw(self, rng: np.random.Generator) -> Task:
         """The next task."""
         for _ in range(_ATTEMPTS):
-            task = Task.from_formula(random_formula(rng, self.propositions), self.propositions)
-            if self._accepts(task):
-                return task
+            text = random_formula(rng, self.propositions)
+            # What nothing satisfies, and what everything does, is drawn now and then and asks no question.
+            with contextlib.suppress(UnsatisfiableError), warnings.catch_warnings():
+                warnings.simplefilter("ignore", TaskWarning)
+                task = Task.from_formula(text, self.propositions)
+                if self._accepts(task):
+                    return task
         raise ValueError(f"no task was found over {self.propositions}: the formulas that are held out leave none")
 
     def _accepts(self, task: Task) -> bool:
@@ -127,6 +137,7 @@ def questions_of(task: Task) -> tuple[Question, ...]:
     return tuple(
         Question(
             task=task.text,
+            propositions=task.propositions,
             outcome_class=c,
             phi_stay=phi_stay,
             phi_go=phi_go,
@@ -181,6 +192,7 @@ def question_sheet(questions: Sequence[Question], count: int, staying_sets: int)
         Arrays of a task without edges, accepting states or traps: only ``true_labels`` can read it.
 
     Raises:
+        PropositionsError: the questions are of tasks over different propositions.
         ValueError: no question, more questions or sets than there is room for, or room for fewer than two sets.
     """
     stays = list(dict.fromkeys(question.stay for question in questions))
@@ -189,7 +201,15 @@ def question_sheet(questions: Sequence[Question], count: int, staying_sets: int)
             f"{len(questions)} questions with {len(stays)} staying sets do not fit a sheet of {count} and "
             f"{staying_sets}: a sheet has at least one question, and room for two sets or more"
         )
-    letters, propositions = len(stays[0]), len(questions[0].phi_stay)
+    for question in questions:
+        require_same_propositions(
+            question.propositions,
+            questions[0].propositions,
+            asker=f"a question of {question.task!r}",
+            knower=f"one of {questions[0].task!r}",
+            remedy="ask about tasks over the same ones",
+        )
+    letters, propositions = len(stays[0]), len(questions[0].propositions)
     states = np.arange(staying_sets, dtype=np.int32)[:, None]
     keeps = np.ones((staying_sets, letters), bool)
     keeps[: len(stays)] = stays
@@ -211,6 +231,7 @@ def question_sheet(questions: Sequence[Question], count: int, staying_sets: int)
         condition_classes=jnp.asarray(np.where(real, np.arange(count), NO_CLASS).astype(np.int32)[:, None]),
         condition_mask=jnp.asarray(real),
         implies=jnp.asarray(np.diag(real)),
+        propositions=questions[0].propositions,
     )
 
 

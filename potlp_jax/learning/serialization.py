@@ -8,8 +8,6 @@ people: it is read with NumPy alone, needs no device topology, and the zip's che
 import dataclasses
 import json
 import os
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,8 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from potlp_jax.codec import config_from_dict, differences
-from potlp_jax.errors import CheckpointError, ConfigurationError
+from potlp_jax.errors import ConfigurationError, EstimatorError, NetworkError
+from potlp_jax.files import read_npz, reading, require_mapping, short
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
+from potlp_jax.task.propositions import require_same_propositions
 
 ESTIMATOR_FORMAT: str = "potlp-estimator-3"
 """Changed when older files can no longer be read."""
@@ -59,51 +59,84 @@ def load_estimator(path: Path | str) -> tuple[Params, NetworkConfig, dict[str, A
     """Parameters, network configuration and metadata of an estimator.
 
     Raises:
-        CheckpointError: no such file, damaged, of another format, or parameters that do not fit the configuration.
+        EstimatorError: no such file, damaged, of another format, parameters that do not fit the configuration, or a
+            parameter that is NaN or infinite.
     """
-    # All that a file that is no zip, or a damaged one, makes NumPy and zlib raise.
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+    if not Path(path).exists():
+        raise EstimatorError(f"there is no estimator {path}: train one (potlp fit)")
+    arrays = read_npz(path, EstimatorError, "an estimator")
+    with reading(path, EstimatorError, "an estimator"):
         header = json.loads(arrays.pop(_HEADER).tobytes().decode())
-    except FileNotFoundError as error:
-        raise CheckpointError(f"there is no estimator {path}: train one (potlp fit)") from error
-    except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
-        raise CheckpointError(f"{path} is not an estimator, or is damaged ({error}): get it again") from error
     if not isinstance(header, dict) or header.get("format") != ESTIMATOR_FORMAT:
         found = header.get("format") if isinstance(header, dict) else None
-        raise CheckpointError(f"{path} has format {found!r}; this library reads {ESTIMATOR_FORMAT!r}: train it again")
-    try:
-        config = config_from_dict(NetworkConfig, header["network"], "network")
-    except ConfigurationError as error:
-        raise CheckpointError(f"{path}: {error}") from error
-    # What the network would have, without computing it: names and shapes must agree before anything is used.
-    like = jax.eval_shape(EstimatorNetwork(config).init, jax.random.key(0))
-    wanted = named_leaves(like)
+        raise EstimatorError(
+            f"{path} has format {short(found)}; this library reads {ESTIMATOR_FORMAT!r}: train it again"
+        )
+    # Widths of a damaged header may be beyond what any array can have, which shows when shapes are worked out.
+    with reading(path, EstimatorError, "an estimator"):
+        config, metadata = _configuration(path, header)
+        # What the network would have, without computing it: names and shapes must agree before anything is used.
+        like = jax.eval_shape(EstimatorNetwork(config).init, jax.random.key(0))
+        wanted = named_leaves(like)
     found = differences(array_shapes(arrays), array_shapes(wanted), "array")
     if found:
-        raise CheckpointError(f"{path}: the parameters do not fit the network. {'; '.join(found)}")
+        raise EstimatorError(f"{path}: the parameters do not fit the network. {'; '.join(found)}")
+    require_finite(arrays, str(path))
     leaves = [jnp.asarray(arrays[name]) for name in wanted]
-    return jax.tree.unflatten(jax.tree.structure(like), leaves), config, header["metadata"]
+    return jax.tree.unflatten(jax.tree.structure(like), leaves), config, metadata
 
 
-def require_propositions(config: NetworkConfig, propositions: tuple[str, ...], where: str) -> None:
+def require_finite(arrays: Mapping[str, np.ndarray], where: str) -> None:
+    """Check that all parameters are numbers.
+
+    Args:
+        arrays: by name.
+        where: names the file in the message.
+
+    Raises:
+        EstimatorError: an array holds NaN or an infinity; the first one is named.
+    """
+    # One such parameter reaches most estimates, and every decision would be flagged as invalid.
+    for name, array in arrays.items():
+        # Keys and counters are integers, which are always finite.
+        if np.issubdtype(array.dtype, np.floating) and not np.all(np.isfinite(array)):
+            count = int(np.sum(~np.isfinite(array)))
+            raise EstimatorError(
+                f"{where}: the parameter {name} holds {count} values that are NaN or infinite, of {array.size}: get it "
+                "again, or train it again"
+            )
+
+
+def _configuration(path: Path | str, header: Mapping[str, Any]) -> tuple[NetworkConfig, dict[str, Any]]:
+    try:
+        config = config_from_dict(NetworkConfig, header["network"], "network")
+    except (ConfigurationError, NetworkError) as error:
+        raise EstimatorError(f"{path}: {error}") from error
+    return config, require_mapping(path, header["metadata"], EstimatorError, "an estimator with metadata")
+
+
+def require_propositions(
+    config: NetworkConfig, propositions: tuple[str, ...], where: str, asker: str = "the task"
+) -> None:
     """Check that an estimator was trained with these propositions, in this order.
 
     Args:
         config: of the estimator's network.
         propositions: those of the task or the data.
         where: names the estimator in the message.
+        asker: names the task or the data.
 
     Raises:
-        CheckpointError: it was not.
+        PropositionsError: it was not.
     """
-    # The order matters: an entry of phi means what its position says.
-    if config.propositions != propositions:
-        raise CheckpointError(
-            f"{where} knows the propositions {', '.join(config.propositions)} in this order, and not "
-            f"{', '.join(propositions)}: state the task over its propositions, or train an estimator for these"
-        )
+    # An entry of phi means what its position says, as a bit of a letter does.
+    require_same_propositions(
+        propositions,
+        config.propositions,
+        asker=asker,
+        knower=where,
+        remedy="give an estimator that was trained for the former, or train one (docs/estimator.md)",
+    )
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:

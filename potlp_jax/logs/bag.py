@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from io import BufferedReader, BytesIO
 from pathlib import Path
 
-import yaml
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag1.reader import Header, RecordType, decompressors, read_bytes, read_uint32
 from rosbags.rosbag2 import Reader as Rosbag2Reader
@@ -24,12 +23,16 @@ from rosbags.rosbag2.storage_mcap import decompress, read_exact, read_string
 from rosbags.typesys.msg import normalize_msgtype
 
 from potlp_jax.errors import LogError
+from potlp_jax.files import one_line, read_yaml, reading, require_file
 
 FORMATS = {".bag": "ROS 1 bag", ".db3": "ROS 2 bag (sqlite3)", ".mcap": "MCAP"}
 """Formats by the ending of their files."""
 
 # First and last bytes of an MCAP file.
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
+_LATEST = 2**63 - 1
+"""Nanoseconds since 1970, in the year 2262, up to which times are held."""
+
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x03, 0x04, 0x05, 0x06
 """Records of an MCAP file that lead to messages."""
 
@@ -70,8 +73,8 @@ class Bag:
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Messages of some topics, by time in a whole bag, as they stand in the file in a damaged one."""
         # The library sorts by time; a scan gives what it finds where it finds it.
-        source = _scan(self.path) if self.damaged else _read(self.path)
-        return (message for message in source if message.topic in topics)
+        source = _until_damage(_scan if self.damaged else _read, self.path)
+        return (message for message in source if isinstance(message, RawMessage) and message.topic in topics)
 
 
 def open_bag(path: Path) -> Bag:
@@ -81,22 +84,28 @@ def open_bag(path: Path) -> Bag:
         LogError: it is missing, of another format, or nothing in it can be read.
     """
     files = _files(path)
+    for file in files:
+        # Of any size: bags are read message by message.
+        require_file(file, LogError)
     ending = files[0].suffix
     damaged, problems = False, []
     # The whole bag is read once in any case, to know its topics and times: damage shows on the way.
-    topics, times, error = _count(lambda: _read(path))
+    topics, times, error = _count(_read, path)
+    # The file says how much there was; the reading says how much there is.
+    expected, found = _expected_count(path), sum(map(len, times.values()))
+    if error is None and expected not in (None, found):
+        # Readers pass over messages of topics that are gone.
+        problems.append(f"{found} messages could be read, where by its own count there are {expected}")
     if error is not None:
         damaged = True
-        # The file says how much there was; the scan says how much there is.
-        expected = _expected_count(path)
-        topics, times, scan_error = _count(lambda: _scan(path))
+        topics, times, scan_error = _count(_scan, path)
         found = sum(map(len, times.values()))
         # The scan often fails for the same reason as the library: said once.
         why = "; ".join(dict.fromkeys(filter(None, (error, scan_error))))
         problems.append(f"damaged or cut short ({why}): {found} messages could be read, {_lost(found, expected)}")
     if not any(times.values()):
         why = f" ({problems[0]})" if problems else ""
-        raise LogError(f"{path}: holds no message{why}; record it again")
+        raise LogError(f"{one_line(path)}: holds no message{why}; record it again")
     # A folder is a ROS 2 bag whatever its storage; a lone .mcap file may come from anywhere.
     is_folder = path.is_dir() or len(files) > 1
     name = f"ROS 2 bag ({'MCAP' if ending == '.mcap' else 'sqlite3'})" if is_folder else FORMATS[ending]
@@ -111,8 +120,9 @@ def _lost(found: int, expected: int | None) -> str:
 
 def _files(path: Path) -> list[Path]:
     """The storage files of a bag, in order."""
-    if not path.exists():
-        raise LogError(f"{path}: there is no such file or folder")
+    with reading(path, LogError, "a log"):
+        if not path.exists():
+            raise LogError(f"{one_line(path)}: there is no such file or folder")
     if not path.is_dir():
         if path.suffix not in FORMATS:
             raise LogError(f"{path}: {path.suffix or 'no ending'} is no format of logs; known are {', '.join(FORMATS)}")
@@ -127,21 +137,34 @@ def _files(path: Path) -> list[Path]:
 
 
 def _count(
-    messages: Callable[[], Iterator[RawMessage]],
+    source: Callable[[Path], Iterator[RawMessage]], path: Path
 ) -> tuple[dict[str, str], dict[str, list[int]], str | None]:
     """Types and times by topic, and what stopped the reading."""
     topics: dict[str, str] = {}
     times: dict[str, list[int]] = {}
+    for message in _until_damage(source, path):
+        if isinstance(message, str):
+            return topics, times, message
+        topics.setdefault(message.topic, message.type)
+        times.setdefault(message.topic, []).append(message.time)
+    return topics, times, None
+
+
+def _until_damage(source: Callable[[Path], Iterator[RawMessage]], path: Path) -> Iterator[RawMessage | str]:
+    """Messages until the reading fails, then why. Every pass over a bag goes through here: what one finds, all do."""
     try:
-        for message in messages():
-            topics.setdefault(message.topic, message.type)
-            times.setdefault(message.topic, []).append(message.time)
+        for message in source(path):
+            # Stored values have any type and size in a damaged database, and times are kept in 64 bits with a sign.
+            if not (isinstance(message.topic, str) and isinstance(message.type, str)):
+                raise ValueError("a topic without name or type")
+            if not (isinstance(message.time, int) and 0 <= message.time <= _LATEST):
+                raise ValueError(f"a message of {message.topic} has an impossible time")
+            yield message
     except LogError:
         raise
     # Parsers of damaged files fail in as many ways as files can be damaged.
     except Exception as error:
-        return topics, times, str(error).rstrip(".") or type(error).__name__
-    return topics, times, None
+        yield "a size beyond the memory" if isinstance(error, MemoryError) else one_line(error).rstrip(".")
 
 
 def _read(path: Path) -> Iterator[RawMessage]:
@@ -154,8 +177,8 @@ def _read(path: Path) -> Iterator[RawMessage]:
 
 def _expected_count(path: Path) -> int | None:
     """Messages that a damaged bag had, by its own word."""
-    with contextlib.suppress(OSError, yaml.YAMLError, KeyError, TypeError, ValueError):
-        metadata = yaml.safe_load((path / "metadata.yaml").read_text("utf-8"))
+    with contextlib.suppress(LogError), reading(path, LogError, "the folder of a bag"):
+        metadata = read_yaml(path / "metadata.yaml", LogError)
         return int(metadata["rosbag2_bagfile_information"]["message_count"])
     # The index may be whole while the messages are not; else whatever is wrong with it leaves no number.
     with (
@@ -277,7 +300,8 @@ def _mcap_records(stream: BufferedReader | BytesIO) -> Iterator[tuple[int, bytes
 
 def _scan_sqlite(file: Path) -> Iterator[RawMessage]:
     """Rows from the front until a page is damaged, then from the back."""
-    connection = sqlite3.connect(f"file:{file}?immutable=1", uri=True)
+    # As a URI, in which a question mark or a percent sign of the name must be escaped.
+    connection = sqlite3.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True)
     with contextlib.closing(connection):
         # Without it a file that is shorter than its header says is refused altogether.
         connection.execute("PRAGMA writable_schema = ON")

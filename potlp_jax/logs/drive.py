@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Int32, Int64, UInt8
+from jaxtyping import Bool, Int8, Int32, Int64, UInt8
 from scipy import ndimage
 
 from potlp_jax.environments.ros.map_files import GridFrame
@@ -137,7 +137,7 @@ def read_drive(log: Log, places: Places, config: GridConfig = GridConfig()) -> D
     pictures, bearings = match_pictures(log, poses, path, times, grid.frame, notes)
     return Drive(
         log=log,
-        world=make_world(~grid.free, letters, path[0], resolution=grid.frame.resolution),
+        world=make_world(~grid.free, letters, path[0], resolution=grid.frame.resolution, propositions=places.names),
         frame=grid.frame,
         seen=grid.seen,
         path=tuple(path),
@@ -162,17 +162,26 @@ def _final_map(log: Log) -> MapMessage:
             + ", ".join(f"{topic} ({kind})" for topic, kind in sorted(log.bag.topics.items()))
         )
     # A map without free cells or without obstacles is nearly always one with other thresholds.
-    for kind, pixels, option in (
-        ("nothing free", final.free(log.config), "--free"),
-        ("no obstacle", final.obstacles(log.config), "--occupied"),
-    ):
+    for kind, pixels in (("nothing free", final.free(log.config)), ("no obstacle", final.obstacles(log.config))):
         if not pixels.any():
-            values = ", ".join(map(str, np.unique(final.occupancy)[:8]))
             raise LogError(
-                f"{log.path}: {log.map_topic}: the thresholds leave {kind} in the last map, whose values are {values}; "
-                f"give {option} PERCENT"
+                f"{log.path}: {log.map_topic}: the thresholds leave {kind} in the last map: {_advise(final.occupancy)}"
             )
     return final
+
+
+def _advise(occupancy: Int8[np.ndarray, "H W"]) -> str:
+    """Thresholds under which a map has free space and obstacles, where there are any."""
+    known = np.unique(occupancy[occupancy >= 0])
+    if len(known) < 2:
+        found = f"the value {known[0]} and unknown cells" if len(known) else "unknown cells"
+        return f"it holds {found} only; drive further, or give another --map-topic"
+    # Both at once: advice on one alone may ask for a value that the other forbids.
+    third = int(known[-1] - known[0]) // 3
+    return (
+        f"its values are {', '.join(map(str, known[:8]))}{', ...' if len(known) > 8 else ''}; give thresholds between "
+        f"{known[0]} and {known[-1]}, such as --free {known[0] + third} --occupied {known[-1] - third}"
+    )
 
 
 def _first_seen(

@@ -5,8 +5,6 @@ there may be gigabytes of them.
 """
 
 import contextlib
-import io
-import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,12 +15,12 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Bool, Int8, UInt8
-from PIL import Image, UnidentifiedImageError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from potlp_jax.environments.ros.map_files import OCCUPIED, GridFrame
+from potlp_jax.environments.ros.map_files import LARGEST_NUMBER, LARGEST_PIXEL, OCCUPIED, SMALLEST_PIXEL, GridFrame
 from potlp_jax.errors import LogError
+from potlp_jax.files import decode_image, image_size, reading, short
 from potlp_jax.logs.bag import RawMessage, open_bag
 from potlp_jax.logs.transforms import Edge, Quaternion, Transforms, yaw_of
 
@@ -146,8 +144,10 @@ class Log:
         """The maps, by the time at which they were received where the bag is whole."""
         # Read again at each call: the maps of an hour may take gigabytes.
         topics = () if self.map_topic is None else (self.map_topic,)
-        found = (self._map(message)[0] for message in self.bag.messages(topics))
-        return (message for message in found if message is not None)
+        for message in self.bag.messages(topics):
+            # The same messages are lost as in the first pass, which has counted them.
+            with contextlib.suppress(LogError), reading(self.path, LogError, "a map"):
+                yield self._map(message)
 
     def read_pictures(self) -> Iterator[tuple[int, UInt8[np.ndarray, "h w 3"] | None]]:
         """Index and RGB of each message of the pictures' topic; None where it cannot be decoded."""
@@ -155,9 +155,10 @@ class Log:
         for index, message in enumerate(self.bag.messages(topics)):
             fields = self._decode(message)
             # Numbered with those that cannot be decoded: an index means the same message here and in ``pictures``.
-            data = b"" if fields is None else bytes(fields.data)
-            picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
-            yield index, None if picture is None else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+            picture = None
+            with contextlib.suppress(LogError), reading(self.path, LogError, "a picture"):
+                picture = cv2.cvtColor(decode_image(bytes(fields.data), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+            yield index, picture
 
     @cached_property
     def base_frame(self) -> str | None:
@@ -204,14 +205,8 @@ class Log:
                 index += 1
             if fields is None:
                 self._lose(message.topic, f"of another definition than {message.type}")
-            elif message.topic == self.map_topic:
-                self._keep_map(message)
-            elif message.topic == self.image_topic:
-                self._keep_picture(message, fields, index - 1)
-            elif message.type == ODOMETRY_TYPE:
-                self._keep_odometry(message, fields)
             else:
-                self._keep_transforms(message, fields)
+                self._keep(message, fields, index - 1)
         # Odometry is the same transform as in /tf, by another topic: used where /tf does not have it.
         for edge, poses in self._odometry_poses.items():
             if not self.transforms.has(*edge):
@@ -225,6 +220,23 @@ class Log:
             self.problems.append(
                 f"{topic}: {count} stamps are by another clock than the recording, whose times are used for them"
             )
+
+    def _keep(self, message: RawMessage, fields: Any, index: int) -> None:
+        try:
+            with reading(self.path, LogError, "a message"):
+                if message.topic == self.map_topic:
+                    self._keep_map(message)
+                elif message.topic == self.image_topic:
+                    self._keep_picture(message, fields, index)
+                elif message.type == ODOMETRY_TYPE:
+                    self._keep_odometry(message, fields)
+                else:
+                    self._keep_transforms(message, fields)
+        # Flipped bits leave messages that can be decoded and make no sense: one is lost, not the log.
+        except _LostError as error:
+            self._lose(message.topic, str(error))
+        except LogError:
+            self._lose(message.topic, "damaged")
 
     def _decode(self, message: RawMessage) -> Any:
         """The message's fields; None where it is not of its type's definition."""
@@ -246,34 +258,29 @@ class Log:
         self._other_clock[message.topic] += 1
         return message.time
 
-    def _map(self, message: RawMessage) -> tuple[MapMessage | None, str]:
-        """A map, or what is wrong with it."""
+    def _map(self, message: RawMessage) -> MapMessage:
+        """A map. Raises _LostError."""
         fields = self._decode(message)
         if fields is None:
-            return None, ""
+            raise _LostError(f"of another definition than {message.type}")
         info = fields.info
         height, width = int(info.height), int(info.width)
         # The shortest decimal that is this float32: 0.05, not 0.05000000074505806.
         resolution = float(str(np.float32(info.resolution)))
-        if height * width == 0 or not 0 < resolution < math.inf:
-            return None, f"empty, {height} x {width} cells of {resolution:g} m"
+        if height * width == 0 or not SMALLEST_PIXEL <= resolution <= LARGEST_PIXEL:
+            raise _LostError(f"empty, {height} x {width} cells of {resolution:g} m")
         if len(fields.data) != height * width:
-            return None, f"{len(fields.data)} values for {height} x {width} cells"
+            raise _LostError(f"{len(fields.data)} values for {height} x {width} cells")
         # ROS counts rows from the bottom, this library from the top.
         occupancy = np.asarray(fields.data, np.int8).reshape(height, width)[::-1]
         if occupancy.min() < -1 or occupancy.max() > OCCUPIED:
-            return None, f"values from {occupancy.min()} to {occupancy.max()}, beyond -1 to 100"
-        origin = info.origin.position
-        frame = GridFrame(
-            height, width, resolution, float(origin.x), float(origin.y), yaw_of(_quaternion(info.origin.orientation))
-        )
-        return MapMessage(message.time, fields.header.frame_id.lstrip("/"), frame, occupancy), ""
+            raise _LostError(f"values from {occupancy.min()} to {occupancy.max()}, beyond -1 to 100")
+        x, y, _, *_ = _values(info.origin.position, info.origin.orientation)
+        frame = GridFrame(height, width, resolution, x, y, yaw_of(_quaternion(info.origin.orientation)))
+        return MapMessage(message.time, fields.header.frame_id.lstrip("/"), frame, occupancy)
 
     def _keep_map(self, message: RawMessage) -> None:
-        found, reason = self._map(message)
-        if found is None:
-            self._lose(message.topic, reason)
-            return
+        found = self._map(message)
         self.map_count += 1
         # By time, not by place in the file: a damaged bag is not in order.
         if self.last_map is None or found.time >= self.last_map.time:
@@ -282,11 +289,10 @@ class Log:
     def _keep_picture(self, message: RawMessage, fields: Any, index: int) -> None:
         try:
             # The header alone: sizes are wanted now, pixels later and not of all.
-            with Image.open(io.BytesIO(bytes(fields.data))) as image:
-                width, height = image.size
-        except (UnidentifiedImageError, OSError, ValueError):
-            self._lose(message.topic, f"format {fields.format!r} is no JPEG or PNG, or it is damaged")
-            return
+            with reading(self.path, LogError, "a picture"):
+                width, height = image_size(bytes(fields.data))
+        except LogError as error:
+            raise _LostError(f"format {short(fields.format)} is no JPEG or PNG, or it is damaged") from error
         time = self._time(message, fields.header.stamp)
         self.pictures.append(Picture(index, time, fields.header.frame_id.lstrip("/"), width, height))
 
@@ -305,6 +311,10 @@ class Log:
             self.transforms.add(transform.header.frame_id, transform.child_frame_id, time, values)
 
 
+class _LostError(LogError):
+    """A message that can be decoded and cannot be used; the text says why, as the log's problems count it."""
+
+
 def typestore(is_ros1: bool) -> Typestore:
     """Definitions of the messages that logs are read from; they are the same in all versions of ROS 2."""
     if not is_ros1:
@@ -317,7 +327,11 @@ def typestore(is_ros1: bool) -> Typestore:
 
 
 def _values(position: Any, orientation: Any) -> tuple[float, ...]:
-    return float(position.x), float(position.y), float(position.z), *_quaternion(orientation)
+    values = float(position.x), float(position.y), float(position.z), *_quaternion(orientation)
+    # NaN fails the comparison, too.
+    if not all(abs(value) <= LARGEST_NUMBER for value in values):
+        raise _LostError("coordinates that are no numbers, or beyond any building")
+    return values
 
 
 def _quaternion(turn: Any) -> Quaternion:

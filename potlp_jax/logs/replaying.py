@@ -15,6 +15,7 @@ from potlp_jax.logs.drive import Drive, PanoramaReader
 from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy, PolicyFunction
+from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import make_trial, run_robot
@@ -119,10 +120,14 @@ def replay(
 
     Raises:
         LogError: the policy needs panoramas and the log has none, or it needs no log.
-        CheckpointError: the estimator knows other propositions than the task, or none is shipped for them.
+        PropositionsError: the labels, the task and the estimator are not over the same propositions.
+        EstimatorError: no estimator is shipped for them.
     """
     if policy is Policy.KNOWN_MAP:
         raise LogError("the policy known-map knows all from the start: choose baseline, optimistic, oracle or potlp")
+    require_same_propositions(
+        task.propositions, drive.propositions, asker=f"the task {task.text!r}", knower="the labels of the log"
+    )
     config = TrialConfig() if config is None else config
     asked = estimator_of(policy, task.propositions, estimator)
     reader = None
@@ -141,7 +146,9 @@ def replay(
     # What was seen after the task was decided is no part of the trial.
     first_seen = np.where(drive.first_seen < len(run.path), drive.first_seen, NEVER_SEEN).astype(np.int32)
     environment = f"{LOG_PREFIX}{Path(drive.log.path).name}"
-    trial = make_trial(run, task, policy, config, asked, drive.world, first_seen, environment=environment, seed=None)
+    trial = make_trial(
+        run, task, policy, config, asked, drive.world, first_seen, environment=environment, world_number=None
+    )
     return trial, _panoramas(drive, trial, config.camera)
 
 

@@ -74,7 +74,7 @@ def write_trial(trial: Trial, out: Path, kind: BagFormat, labels: Path, height: 
         cell = jax.numpy.asarray(trial.path[step], jax.numpy.int32)
         return np.asarray(photograph(trial.world, cell, jax.random.key(step), config.camera, config.disturbance))
 
-    labels.write_text(labels_text(trial.world, trial.propositions), "utf-8")
+    labels.write_text(labels_text(trial.world), "utf-8")
     return write_drive(out, kind, trial.world, trial.path, trial.first_seen, panorama, config.camera, height)
 
 
@@ -117,7 +117,7 @@ def write_drive(
     # Time goes with the distance: diagonal moves take longer.
     travelled = np.cumsum([0.0, *step_lengths(path)])
     count = 0
-    with _Recorder(out, kind) as recorder:
+    with Recorder(out, kind) as recorder:
         recorder.transforms(FIXED_TOPIC, START, [("base_link", "panorama", (0.0, 0.0, 0.0), quaternion_of(0.0))])
         for step, cell in enumerate(path):
             time = START + round(travelled[step] * SECONDS_A_CELL * SECOND)
@@ -146,19 +146,19 @@ def frame_of(world: World) -> GridFrame:
     return GridFrame(height, width, resolution, -(column + 0.5) * resolution, -(height - row - 0.5) * resolution)
 
 
-def labels_text(world: World, propositions: Sequence[str]) -> str:
+def labels_text(world: World) -> str:
     """YAML of where the propositions of a world are, as rectangles."""
     frame, letters = frame_of(world), np.asarray(world.letters)
     # From centre to edge: rectangles of cells reach to the outer edges of the outermost ones.
     half = frame.resolution / 2
     regions: dict[str, list[dict[str, Any]]] = {}
-    for bit, name in enumerate(propositions):
+    for bit, name in enumerate(world.propositions):
         for (top, left), (bottom, right) in _rectangles((letters >> bit) & 1 == 1):
             (x0, y1), (x1, y0) = frame.cell_to_metres(top, left), frame.cell_to_metres(bottom, right)
             corners = [(x0 - half, y0 - half), (x1 + half, y0 - half), (x1 + half, y1 + half), (x0 - half, y1 + half)]
             regions.setdefault(name, []).append({"polygon": [[round(x, 4), round(y, 4)] for x, y in corners]})
     # A label file without a proposition would be refused when it is read: better here.
-    missing = [name for name in propositions if name not in regions]
+    missing = [name for name in world.propositions if name not in regions]
     if missing:
         raise LogError(f"the world has no place for {', '.join(missing)}: labels name every proposition's")
     return yaml.safe_dump({"propositions": regions}, default_flow_style=None, sort_keys=False)
@@ -195,7 +195,7 @@ def _turned(x: float, y: float, angle: float) -> tuple[float, float]:
     return cos * x - sin * y, sin * x + cos * y
 
 
-class _Recorder:
+class Recorder:
     """Writes messages of the topics above to a bag; a context manager."""
 
     def __init__(self, out: Path, kind: BagFormat) -> None:
@@ -206,7 +206,7 @@ class _Recorder:
         self._connections: dict[str, Any] = {}
         self.count = 0
 
-    def __enter__(self) -> "_Recorder":
+    def __enter__(self) -> "Recorder":
         self._writer.open()
         for topic, kind in TOPICS.items():
             self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)

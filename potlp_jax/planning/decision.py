@@ -3,6 +3,10 @@
 ``policies.decide`` asks an estimator in the middle of a decision. Here the decision is cut in two pure functions, so
 that whatever happens in between is the caller's: ``frontier_subgoals`` says where estimates are wanted, and
 ``decide_from_estimates`` takes them. Both run under jit, vmap and scan.
+
+Belief and task carry the names of their propositions, and are refused where these differ. What cannot be checked is
+what the caller alone knows: whether the letters of a belief were written with the names that it was given, and whether
+column ``c`` of the estimates answers outcome class ``c`` of this task.
 """
 
 import dataclasses
@@ -11,13 +15,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int32, PRNGKeyArray
 
+from potlp_jax.errors import ProblemError
 from potlp_jax.planning.commitment import Intention
-from potlp_jax.planning.estimates import Estimates
+from potlp_jax.planning.estimates import Estimates, check_shapes
 from potlp_jax.planning.move import Move
 from potlp_jax.planning.policies import search_move
-from potlp_jax.planning.situation import DecisionConfig, assess
+from potlp_jax.planning.situation import DecisionConfig, assess, is_in_map
 from potlp_jax.task.task import TaskArrays
-from potlp_jax.types import NO_SUBGOAL, UNREACHABLE, status_array
+from potlp_jax.types import NO_SUBGOAL, UNREACHABLE, Status, status_array, status_if
 from potlp_jax.world.frontiers import Subgoals
 from potlp_jax.world.grid import BeliefMap
 
@@ -40,6 +45,9 @@ def frontier_subgoals(
 
     Returns:
       Where estimates are wanted.
+
+    Raises:
+      PropositionsError: belief and task are not over the same propositions.
     """
     return assess(belief, cell, state, task, config.frontiers).subgoals
 
@@ -101,13 +109,44 @@ def decide_from_estimates(
         afresh.
 
     Returns:
-      The move, with what the search considered.
+      The move, with what the search considered. Where an input holds a value that is not allowed (an estimate of a real
+      subgoal and class, a real subgoal outside of the map, the cell, the state, a letter, the resolution), ``status``
+      has ``INVALID`` and ``action`` is ``NO_ACTION``. With wrong estimates alone the move is that of the baseline,
+      which asks none; otherwise there is none.
+
+    Raises:
+      EstimatesError: an array of the estimates has another shape than ``[S, C]``.
+      ProblemError: another argument has a wrong shape.
+      PropositionsError: belief and task are not over the same propositions.
     """
+    _check_shapes(belief, subgoals, cell, state)
+    check_shapes(estimates, subgoals.mask.shape[0], task.class_mask.shape[0])
     # Assessed again, although the caller may have called `frontier_subgoals`: arrays in between are the caller's.
     situation = assess(belief, cell, state, task, config.frontiers)
     # The frontiers themselves stay those of the belief: they count where no action is available.
     given = dataclasses.replace(situation.subgoals, cells=subgoals.cells, mask=subgoals.mask)
-    return search_move(dataclasses.replace(situation, subgoals=given), estimates, key, config, intention)
+    # Outside of the map an index would be clamped, and the distances of another cell be taken for those of the subgoal.
+    outside = status_if(jnp.any(subgoals.mask & ~is_in_map(subgoals.cells, belief)), Status.INVALID)
+    situation = dataclasses.replace(situation, subgoals=given, status=situation.status | outside)
+    return search_move(situation.with_status_of(estimates), estimates, key, config, intention)
+
+
+def _check_shapes(belief: BeliefMap, subgoals: Subgoals, cell: Int32[Array, "2"], state: Int32[Array, ""]) -> None:
+    """Check what the caller brings, while tracing; raises ProblemError for what does not fit the map or the mask."""
+    count, grid = subgoals.mask.shape, belief.cells.shape
+    expected = {
+        "belief.letters": (belief.letters, grid),
+        "belief.resolution": (belief.resolution, ()),
+        "belief.extent": (belief.extent, (2,)),
+        "subgoals.cells": (subgoals.cells, (*count, 2)),
+        "cell": (cell, (2,)),
+        "state": (state, ()),
+    }
+    for name, (array, shape) in expected.items():
+        if jnp.shape(array) != shape:
+            raise ProblemError(
+                f"{name} has shape {jnp.shape(array)}, expected {shape}: the map is {grid}, the subgoals' mask {count}"
+            )
 
 
 decide_from_estimates_jit = jax.jit(decide_from_estimates, static_argnames="config")

@@ -25,6 +25,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
 from potlp_jax.planning.problem import PlanningProblem, take_rows
+from potlp_jax.planning.rounding import rounded_product
 from potlp_jax.types import NO_CLASS, NO_STATE
 
 WORD_BITS: int = 32
@@ -280,9 +281,10 @@ def knowledge_terms(
         bits, cube_cost = rows.cube_bits[..., k, :], rows.cube_cost[..., k]
         failed = _overlaps(fails, bits)
         chance = jnp.where(_overlaps(holds, bits), 1.0, jnp.where(failed, 0.0, rows.cube_probability[..., k]))
-        share = (1.0 - probability) * chance
+        share = rounded_product(1.0 - probability, chance)
         total = probability + share
-        mean = (cost * probability + cube_cost * share) / jnp.where(total > 0, total, 1.0)
+        mean = rounded_product(cost, probability) + rounded_product(cube_cost, share)
+        mean = mean / jnp.where(total > 0, total, 1.0)
         # The first cube that can succeed is taken as it is, so that padding does not change a result by rounding.
         first = (probability == 0) & ((chance > 0) | (jnp.isinf(cost) & ~failed))
         cost = jnp.where(first, cube_cost, jnp.where(share > 0, mean, cost))

@@ -25,7 +25,7 @@ class MoveKind:
     ACTION = 2
     # To the nearest frontier, by a policy that does not search.
     FRONTIER = 3
-    # To the nearest frontier, because no high-level action is available.
+    # To the nearest frontier, because no high-level action is available or the estimates are invalid.
     FALLBACK = 4
     # Along the path that would be shortest if the unobserved suited the task.
     OPTIMISTIC = 5
@@ -38,7 +38,7 @@ class Search:
     Attributes:
       problem: the planning problem of the decision.
       plan: what the search found, before the commitment to an earlier choice is applied.
-      terms: D, P_S, R_S and R_F of every action at the root.
+      terms: D, P_S, R_S and R_F of every action at the root; no action is available where the problem is invalid.
     """
 
     problem: PlanningProblem
@@ -56,7 +56,8 @@ class Move:
       target_state: state of the automaton there.
       action: the high-level action that is carried out: that of ``search.plan``, or the one that the robot is committed
         to; ``NO_ACTION`` for policies that do not search.
-      value: expected cost to go; for policies that do not search the cost of the path, inf for NONE.
+      value: expected cost to go, inf where it is not known because the inputs are invalid; for policies that do not
+        search the cost of the path, inf for NONE.
       path: through known space, at most ``DecisionConfig.horizon`` moves of it.
       subgoals: of the current belief.
       search: what was considered; None for policies that do not search.
@@ -100,11 +101,12 @@ def move_to(
         action: index of the chosen action, where the policy searches.
         search: what it considered, where it searches.
         intention: for the next decision.
-        status: bits to report beside those of the subgoals.
+        status: bits to report beside those of the situation.
 
     Returns:
-        The move; its path has length 0 where the target is out of reach.
+        The move; its path has length 0 where the target is out of reach. NONE where the situation is not valid.
     """
+    kind = jnp.where(situation.is_valid, kind, MoveKind.NONE)
     # The path of a robot that stays leads to where it is, so that its length is 0.
     goes = kind != MoveKind.NONE
     cell = jnp.where(goes, target_cell, situation.cell).astype(jnp.int32)
@@ -120,7 +122,7 @@ def move_to(
         horizon=config.horizon(*situation.belief.cells.shape),
         resolution=situation.belief.resolution,
     )
-    # What was cut off among the subgoals concerns every move that was chosen among them.
+    # What was cut off among the subgoals, or forgotten by the estimator, concerns every move that was chosen here.
     bits = status_array() if status is None else status
     return Move(
         kind=kind.astype(jnp.int32),
@@ -132,5 +134,5 @@ def move_to(
         subgoals=situation.subgoals,
         search=search,
         intention=Intention.none() if intention is None else intention,
-        status=bits | situation.subgoals.status | status_if(~goes, Status.NO_FRONTIER),
+        status=bits | situation.status | status_if(~goes, Status.NO_FRONTIER),
     )

@@ -14,8 +14,9 @@ References:
 """
 
 import dataclasses
+import functools
 from enum import StrEnum
-from typing import Protocol, cast, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +34,7 @@ from potlp_jax.planning.distances.sweeping import Wildcard
 from potlp_jax.planning.estimates import Estimates, Estimator, ask
 from potlp_jax.planning.history import action_terms, initial_history
 from potlp_jax.planning.move import Move, MoveKind, Search, move_to
-from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.problem import PlanningProblem, screen
 from potlp_jax.planning.search.api import plan_actions
 from potlp_jax.planning.search.plan import Plan
 from potlp_jax.planning.situation import (
@@ -84,7 +85,7 @@ def decide(
         state: the automaton's state, the letter of the robot's cell read.
         task: arrays of the task.
         estimator: answers P_S, R_S and R_F for the policies that ask; None for the others.
-        key: drives the search.
+        key: for what the policy draws: of the searches ``UctConfig`` alone.
         intention: that of the move before; without one the robot chooses afresh.
         policy: one of the library's or a function of the user's; static.
         config: settings; static.
@@ -93,10 +94,13 @@ def decide(
         The move; its path has length 0 where the target is out of reach.
 
     Raises:
+        PropositionsError: belief, task and estimator are not over the same propositions.
         ValueError: the policy searches and there is no estimator.
+        EstimatesError: the estimator's answer has other shapes than were asked for.
     """
     situation = assess(belief, cell, state, task, config.frontiers)
     estimates = None if estimator is None else ask(estimator, belief, situation.subgoals, task, state)
+    situation = situation.with_status_of(estimates)
     intention = Intention.none() if intention is None else intention
     return policy_function(policy)(situation, estimates, key, config, intention)
 
@@ -136,10 +140,16 @@ def policy_function(policy: Policy | PolicyFunction) -> PolicyFunction:
     """The function of a policy: that of the name, or the function itself."""
     # A user's function is called like the library's own: there is one signature.
     if not isinstance(policy, Policy):
-        return policy
+        return functools.partial(_reported_move, policy)
     if policy.searches:
         return search_move
     return lambda situation, _estimates, _key, config, _intention: direct_move(situation, policy, config)
+
+
+def _reported_move(policy: PolicyFunction, situation: Situation, *arguments: Any) -> Move:
+    """The move of a user's function with the bits of its situation, also where it was not made by ``move_to``."""
+    move = policy(situation, *arguments)
+    return dataclasses.replace(move, status=move.status | situation.status)
 
 
 def direct_move(situation: Situation, policy: Policy, config: DecisionConfig) -> Move:
@@ -218,10 +228,12 @@ def search_move(
         intention: that of the decision before; None without one.
 
     Returns:
-        The move; toward the nearest frontier where no action is available.
+        The move; toward the nearest frontier where no action is available, that of the baseline where the estimates
+        are invalid.
 
     Raises:
         ValueError: there are no estimates.
+        ProblemError: an array of the estimates has another shape than subgoals and classes.
     """
     if estimates is None:
         raise ValueError("a policy that searches needs an estimator")
@@ -247,13 +259,16 @@ def planned_move(
     """
     # What the search found is recorded as found; the commitment is applied to what the robot does.
     task, subgoals = situation.task, situation.subgoals
-    search = Search(problem=problem, plan=plan, terms=action_terms(problem, initial_history(problem)))
+    screened, invalid = screen(problem)
+    search = Search(problem=problem, plan=plan, terms=action_terms(screened, initial_history(screened)))
     plan = apply_commitment(plan, intention, situation.state, subgoals, task, jnp.float32(config.commitment))
 
     # Without an available action the estimates say that the task is impossible. They may be wrong, so the robot
-    # explores as the baseline would, and the move is flagged.
+    # explores as the baseline would, and the move is flagged. Where they are invalid it does the same; then known space
+    # may already hold the end of the task, which needs no estimates.
     frontier_cell, frontier_state, frontier_cost = nearest_frontier(situation)
     finishes = plan.action == subgoals.mask.shape[0] * task.edge_mask.shape[0]
+    finishes |= invalid & jnp.isfinite(situation.finish_cost)
     acts = (plan.action != NO_ACTION) & ~finishes
     falls_back = (plan.action == NO_ACTION) & jnp.isfinite(frontier_cost)
     kind = jnp.where(falls_back, MoveKind.FALLBACK, jnp.where(acts, MoveKind.ACTION, MoveKind.NONE))
@@ -262,7 +277,7 @@ def planned_move(
     target_cell = jnp.where(finishes, situation.finish_cell, target_cell)
     target_state = jnp.where(acts, plan.from_state, frontier_state)
     target_state = jnp.where(finishes, situation.finish_state, target_state)
-    status = plan.status | status_if(falls_back, Status.FALLBACK)
+    status = plan.status | status_if(kind == MoveKind.FALLBACK, Status.FALLBACK)
     return move_to(
         situation,
         config,
@@ -305,6 +320,7 @@ def _optimistic(situation: Situation, config: DecisionConfig) -> Move:
     kind = jnp.where(jnp.isfinite(path.cost), MoveKind.OPTIMISTIC, MoveKind.NONE)
     # A path that needs nothing unobserved ends the task.
     kind = jnp.where(jnp.isfinite(situation.finish_cost) & (known.length == path.length), MoveKind.FINISH, kind)
+    kind = jnp.where(situation.is_valid, kind, MoveKind.NONE)
     return Move(
         kind=kind.astype(jnp.int32),
         target_cell=known.cells[known.length],
@@ -315,7 +331,7 @@ def _optimistic(situation: Situation, config: DecisionConfig) -> Move:
         subgoals=situation.subgoals,
         search=None,
         intention=Intention.none(),
-        status=situation.subgoals.status | status_if(kind == MoveKind.NONE, Status.NO_FRONTIER),
+        status=situation.status | status_if(kind == MoveKind.NONE, Status.NO_FRONTIER),
     )
 
 

@@ -5,6 +5,9 @@ A problem has ``S + 1`` nodes. Nodes ``0 .. S-1`` are the subgoals, node ``S`` i
 tries ``z' -> z''`` in the unknown space beyond; the last action, ``S * E``, finishes in known space (paper III-B).
 """
 
+import dataclasses
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -13,6 +16,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float32, Int32
 from potlp_jax.errors import ProblemError
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_CLASS
+
+COST_LIMIT: float = 1e30
+"""Costs from here on are refused like infinite ones: below it a sum of a hundred million costs is finite in float32."""
 
 
 @struct.dataclass(kw_only=True)
@@ -59,7 +65,8 @@ class PlanningProblem:
         subgoal_mask: ArrayLike,
         dead_end_cost: ArrayLike,
     ) -> "PlanningProblem":
-        """Bring the arrays to their types. Pure and traceable; ``check`` validates the values on the host.
+        """Bring the arrays to their types. Pure and traceable; ``check`` validates the values on the host, and the
+        searches validate them where they run (``screen``).
 
         Args:
           task: arrays of the task, ``Task.arrays`` or ``Task.padded(sizes)``.
@@ -104,34 +111,50 @@ class PlanningProblem:
         return self.subgoal_count * self.edge_count + 1
 
     def check(self) -> None:
-        """Validate one unbatched problem on the host.
+        """Validate one unbatched problem on the host: the rules of ``screen``, with a message.
 
         Raises:
-          ProblemError: shapes do not agree, a value is NaN, a travel or finish cost is negative, P_S lies outside
-            [0, 1], R_S is not positive, R_F is negative, or ``dead_end_cost`` is not positive. Estimates are checked
-            where subgoal and outcome class are real, travel and finish everywhere.
+          ProblemError: shapes do not agree, or a value is not allowed; the first such value is named.
         """
-        # Shapes first: the checks of values below rely on them.
-        _check_shapes(self)
-        task = self.task
-        # Padding may hold anything: no result depends on it.
-        real = np.asarray(self.subgoal_mask)[:, None] & np.asarray(task.class_mask)[None, :]
-        travel, finish = np.asarray(self.travel), np.asarray(self.finish)
-        _refuse("travel", travel, np.isnan(travel) | (travel < 0), "a cost is not negative, inf where unreachable")
-        _refuse("finish", finish, np.isnan(finish) | (finish < 0), "a cost is not negative, inf where unreachable")
-        probability = np.asarray(self.success_probability)
-        _refuse("success_probability", probability, real & ~((probability >= 0) & (probability <= 1)), "P_S in [0, 1]")
-        # R_S is positive: a success lies at least one move beyond its subgoal.
-        success, failure = np.asarray(self.success_cost), np.asarray(self.failure_cost)
-        _refuse("success_cost", success, real & ~((success > 0) & (success < np.inf)), "R_S is positive and finite")
-        _refuse("failure_cost", failure, real & ~((failure >= 0) & (failure < np.inf)), "R_F is finite, not negative")
-        dead_end = np.asarray(self.dead_end_cost)
-        _refuse("dead_end_cost", dead_end, ~((dead_end > 0) & (dead_end < np.inf)), "must be positive and finite")
-        # The index is clipped only to look it up; a state out of range is refused all the same.
-        state = np.asarray(self.dfa_state)
-        known = (state >= 0) & (state < task.state_mask.shape[-1])
-        known = known & np.asarray(task.state_mask)[np.clip(state, 0, task.state_mask.shape[-1] - 1)]
-        _refuse("dfa_state", state, ~known, "must be a state of the task's automaton")
+        # Shapes first: the masks of values below rely on them.
+        check_shapes(self)
+        for name, wrong in _wrong_entries(self).items():
+            _refuse(name, np.asarray(getattr(self, name)), np.asarray(wrong))
+
+
+def screen(problem: PlanningProblem) -> tuple[PlanningProblem, Bool[Array, ""]]:
+    """A problem that can be searched whatever its arrays hold, and whether they held something that is not allowed.
+
+    Pure, for jit and vmap. Entries that ``subgoal_mask`` (True: real) or the masks of the task mark as absent may hold
+    anything, NaN too: they are blanked and do not count. One wrong value among the others makes the whole problem
+    invalid: what it would change cannot be told from the rest.
+
+    Args:
+      problem: unbatched, of shapes that agree (``check_shapes``).
+
+    Returns:
+      The problem with absent entries blanked; where it is invalid, one without any action, which costs inf.
+      And True where it is invalid.
+    """
+    wrong = functools.reduce(jnp.logical_or, (jnp.any(entries) for entries in _wrong_entries(problem).values()))
+    # Blanked, not ignored: NaN times a weight of 0 is NaN, and would spread from padding into sums over subgoals.
+    blank = {"travel": jnp.inf, "finish": jnp.inf, "success_probability": 0.0, "success_cost": 1.0, "failure_cost": 0.0}
+    present = _present_entries(problem)
+    values = {
+        name: jnp.where(present[name] & ~wrong, getattr(problem, name), jnp.float32(value))
+        for name, value in blank.items()
+    }
+    task = problem.task
+    cleaned = dataclasses.replace(
+        problem,
+        # Otherwise a wrong number for the state could look like a task that is done.
+        task=dataclasses.replace(task, accepting=task.accepting & ~wrong),
+        dfa_state=jnp.where(wrong, 0, problem.dfa_state),
+        subgoal_mask=problem.subgoal_mask & ~wrong,
+        dead_end_cost=jnp.where(wrong, jnp.inf, problem.dead_end_cost),
+        **values,
+    )
+    return cleaned, wrong
 
 
 def enumerate_actions(problem: PlanningProblem) -> Bool[Array, "S E"]:
@@ -167,18 +190,25 @@ def action_index(problem: PlanningProblem, subgoal: int, edge: int) -> int:
 
 
 def take_rows(values: Array, index: Int32[Array, "*N"]) -> Array:
-    """``values[index]``: for a negative index the first row, and zeros where there is no row to take (a task without
-    conditions)."""
-    # Indexing an array without rows is an error even where no index is used.
-    if values.shape[0] == 0:
-        return jnp.zeros((*index.shape, *values.shape[1:]), values.dtype)
+    """``values[index]``; the first row for a negative index: a task has one class at least (``TaskSizes``)."""
     return values[jnp.maximum(index, 0)]
 
 
-def _check_shapes(problem: PlanningProblem) -> None:
-    # The mask and the task give the sizes that all other arrays have to have.
-    subgoals, task = problem.subgoal_count, problem.task
-    states, classes = task.state_mask.shape[-1], task.class_mask.shape[-1]
+def check_shapes(problem: PlanningProblem, batch: tuple[int, ...] = ()) -> None:
+    """Check that the arrays of a problem fit together; also while tracing, when shapes are all that is known.
+
+    Args:
+      problem: its subgoal mask and its task give the sizes that all other arrays must have.
+      batch: leading axes that every array has.
+
+    Raises:
+      ProblemError: an array has another shape; the message names it, its shape and the one expected.
+    """
+    # The mask gives S, so that it must be an array with an axis before anything is compared with it.
+    mask, task = problem.subgoal_mask.shape, problem.task
+    if len(mask) != len(batch) + 1 or mask[:-1] != batch:
+        raise ProblemError(f"subgoal_mask has shape {mask}, expected {(*batch, 'S')} for S subgoals")
+    subgoals, states, classes = mask[-1], task.state_mask.shape[-1], task.class_mask.shape[-1]
     expected = {
         "travel": (subgoals + 1, states, subgoals, states),
         "finish": (subgoals + 1, states),
@@ -186,23 +216,79 @@ def _check_shapes(problem: PlanningProblem) -> None:
         "success_cost": (subgoals, classes),
         "failure_cost": (subgoals, classes),
         "dfa_state": (),
-        "subgoal_mask": (subgoals,),
         "dead_end_cost": (),
     }
+    # Not left to broadcasting: [S, 1] would pass for the same answer to every class.
     for name, shape in expected.items():
         found = getattr(problem, name).shape
-        if found != shape:
+        if found != (*batch, *shape):
             raise ProblemError(
-                f"{name} has shape {found}, expected {shape}: {subgoals} subgoals (from subgoal_mask), "
+                f"{name} has shape {found}, expected {(*batch, *shape)}: {subgoals} subgoals (from subgoal_mask), "
                 f"{states} states and {classes} outcome classes (from the task)"
             )
 
 
-def _refuse(name: str, values: np.ndarray, wrong: np.ndarray | np.bool_, rule: str) -> None:
+def _present_entries(problem: PlanningProblem) -> dict[str, Bool[Array, "..."]]:
+    """Where each array means something: real subgoals, states and outcome classes."""
+    task, subgoals = problem.task, problem.subgoal_mask
+    # The robot's node comes after the subgoals, and is always real.
+    nodes, states = jnp.append(subgoals, True), task.state_mask
+    estimates = subgoals[:, None] & task.class_mask[None, :]
+    return {
+        "travel": (nodes[:, None] & states[None, :])[:, :, None, None]
+        & (subgoals[:, None] & states[None, :])[None, None, :, :],
+        "finish": nodes[:, None] & states[None, :],
+        "success_probability": estimates,
+        "success_cost": estimates,
+        "failure_cost": estimates,
+        "dfa_state": jnp.bool_(True),
+        "dead_end_cost": jnp.bool_(True),
+    }
+
+
+_RULES = {
+    "travel": "a path cost is not negative, inf where there is no path",
+    "finish": "a path cost is not negative, inf where there is no path",
+    "success_probability": "P_S lies in [0, 1]",
+    "success_cost": "R_S is positive and finite",
+    "failure_cost": "R_F is finite and not negative",
+    "dfa_state": "must be a state of the task's automaton",
+    "dead_end_cost": "must be positive and finite",
+}
+"""What every array must hold where it is real, in words; ``_wrong_entries`` has it in arrays."""
+
+
+def _wrong_entries(problem: PlanningProblem) -> dict[str, Bool[Array, "..."]]:
+    """Where each array of an unbatched problem holds a value that the model does not allow."""
+    # Each rule says what is right and is negated, because every comparison with NaN is false.
+    success, failure = problem.success_cost, problem.failure_cost
+    chance, dead_end, state = problem.success_probability, problem.dead_end_cost, problem.dfa_state
+    # Clipped only to look it up; a state out of range is wrong all the same.
+    states = problem.task.state_mask
+    known = (state >= 0) & (state < states.shape[-1]) & states[jnp.clip(state, 0, states.shape[-1] - 1)]
+    right = {
+        "travel": _is_path_cost(problem.travel),
+        "finish": _is_path_cost(problem.finish),
+        "success_probability": (chance >= 0.0) & (chance <= 1.0),
+        # R_S is positive: a success lies at least one move beyond its subgoal.
+        "success_cost": (success > 0.0) & (success < COST_LIMIT),
+        "failure_cost": (failure >= 0.0) & (failure < COST_LIMIT),
+        "dfa_state": known,
+        "dead_end_cost": (dead_end > 0.0) & (dead_end < COST_LIMIT),
+    }
+    present = _present_entries(problem)
+    return {name: present[name] & ~entries for name, entries in right.items()}
+
+
+def _is_path_cost(values: Float32[Array, "*N"]) -> Bool[Array, "*N"]:
+    return ((values >= 0.0) & (values < COST_LIMIT)) | (values == jnp.inf)
+
+
+def _refuse(name: str, values: np.ndarray, wrong: np.ndarray) -> None:
     """Raise for the first wrong value, if any."""
     if not np.any(wrong):
         return
     # One example says more than a count of all.
     index = tuple(int(i) for i in np.argwhere(wrong)[0])
     where = f"{name}[{', '.join(map(str, index))}]" if index else name
-    raise ProblemError(f"{where} is {values[index]}: {rule}")
+    raise ProblemError(f"{where} is {values[index]}: {_RULES[name]}")

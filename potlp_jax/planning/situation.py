@@ -7,8 +7,9 @@ References:
 import dataclasses
 
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
-from jaxtyping import Array, Float32, Int32
+from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
 from potlp_jax.planning.distances.product import (
     distance_table,
@@ -19,9 +20,10 @@ from potlp_jax.planning.distances.product import (
 )
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.problem import PlanningProblem
-from potlp_jax.planning.search.config import SearchConfig, UctConfig
+from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
+from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import TaskArrays
-from potlp_jax.types import NO_STATE
+from potlp_jax.types import NO_STATE, Status, status_if
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
 from potlp_jax.world.grid import BeliefMap
 
@@ -41,7 +43,7 @@ class DecisionConfig:
     """
 
     frontiers: FrontierConfig = FrontierConfig()
-    search: SearchConfig | UctConfig = SearchConfig()
+    search: BestFirstConfig | UctConfig = BestFirstConfig()
     dead_end_factor: float = 4.0
     commitment: float = 0.15
     path_horizon: int | None = None
@@ -71,6 +73,8 @@ class Situation:
       finish_cell: cell of the nearest accepting product state in known space.
       finish_state: its state.
       finish_cost: its path cost; inf where acceptance is out of reach.
+      status: bits of ``types.Status`` that every move decided here reports: those of the subgoals and of the estimates,
+        and ``INVALID`` where no decision can be taken from these inputs.
     """
 
     belief: BeliefMap
@@ -83,6 +87,18 @@ class Situation:
     finish_cell: Int32[Array, "*batch 2"]
     finish_state: Int32[Array, "*batch"]
     finish_cost: Float32[Array, "*batch"]
+    status: UInt32[Array, "*batch"]
+
+    @property
+    def is_valid(self) -> Bool[Array, "*batch"]:
+        """False where the inputs hold something that is not allowed: no move follows from them."""
+        return (self.status & np.uint32(int(Status.INVALID))) == 0
+
+    def with_status_of(self, estimates: Estimates | None) -> "Situation":
+        """The situation with what the estimator reports."""
+        if estimates is None or estimates.status is None:
+            return self
+        return dataclasses.replace(self, status=self.status | estimates.status)
 
 
 def assess(
@@ -99,7 +115,12 @@ def assess(
 
     Returns:
       What every policy decides from.
+
+    Raises:
+      PropositionsError: belief and task are not over the same propositions; while tracing, under jit.
     """
+    # Every decision, of every policy, begins here: what follows reads letters with the task's tables.
+    require_same_propositions(task.propositions, belief.propositions, knower="the belief")
     # Nothing remains to be done after acceptance: without moves of their own, accepting states need no sweep.
     moves = product_transitions(task, belief.letters, belief.free)
     transitions = jnp.where(task.accepting[None, None, :], NO_STATE, moves)
@@ -122,7 +143,28 @@ def assess(
         finish_cell=finish_cell,
         finish_state=finish_state,
         finish_cost=jnp.min(finish),
+        status=subgoals.status | status_if(~_can_be_assessed(belief, cell, state, task), Status.INVALID),
     )
+
+
+def _can_be_assessed(
+    belief: BeliefMap, cell: Int32[Array, "2"], state: Int32[Array, ""], task: TaskArrays
+) -> Bool[Array, ""]:
+    """Whether cell, state, letters and resolution are what the map and the task allow."""
+    # An index out of range is clamped on the device, and would be answered as if it were another.
+    states, letters = task.transitions.shape
+    is_cell = is_in_map(cell, belief)
+    is_state = (state >= 0) & (state < states) & task.state_mask[jnp.clip(state, 0, states - 1)]
+    are_letters = jnp.all((belief.letters >= 0) & (belief.letters < letters))
+    is_length = (belief.resolution > 0.0) & jnp.isfinite(belief.resolution)
+    return is_cell & is_state & are_letters & is_length
+
+
+def is_in_map(cells: Int32[Array, "*N 2"], belief: BeliefMap) -> Bool[Array, "*N"]:
+    """Whether rows and columns lie in the array of the map."""
+    height, width = belief.cells.shape
+    row, column = cells[..., 0], cells[..., 1]
+    return (row >= 0) & (row < height) & (column >= 0) & (column < width)
 
 
 def planning_problem(situation: Situation, estimates: Estimates, config: DecisionConfig) -> PlanningProblem:
@@ -153,7 +195,8 @@ def planning_problem(situation: Situation, estimates: Estimates, config: Decisio
         success_probability=estimates.success_probability,
         success_cost=estimates.success_cost,
         failure_cost=estimates.failure_cost,
-        dfa_state=situation.state,
+        # Without a state the problem is invalid too, so that nothing is chosen whatever the estimates say.
+        dfa_state=jnp.where(situation.is_valid, situation.state, NO_STATE),
         subgoal_mask=subgoals.mask,
         dead_end_cost=config.dead_end_factor * size * belief.resolution,
     )

@@ -19,6 +19,7 @@ from potlp_jax.learning.questions import LARGEST
 from potlp_jax.learning.recording import Pose
 from potlp_jax.planning.distances.paths import KnownPath, shortest_path
 from potlp_jax.planning.situation import Situation, assess
+from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.robot import SimulatedRobot
@@ -55,11 +56,13 @@ class ExplorerConfig:
 
 
 class Explorer:
-    """Wanders through one world. ``tasks`` are those it pursues, drawn with ``rng``; all have the same propositions."""
+    """Wanders through one world. ``tasks``, over its propositions, are those it pursues, drawn with ``rng``."""
 
     def __init__(
         self, world: World, tasks: Sequence[Task], rng: np.random.Generator, config: ExplorerConfig = ExplorerConfig()
     ) -> None:
+        for task in tasks:
+            require_same_propositions(task.propositions, world.propositions, asker=f"the task {task.text!r}")
         self._robot = SimulatedRobot(world, TrialConfig(sensor=config.sensor))
         self._limit = config.travel_factor * float(np.sum(world.extent))
         self._tasks, self._rng, self._config = tasks, rng, config

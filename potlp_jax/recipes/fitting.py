@@ -18,6 +18,7 @@ from typing import Any
 
 from potlp_jax.codec import differences
 from potlp_jax.errors import TrainingError
+from potlp_jax.files import MOST_TEXT, read_json, reading
 from potlp_jax.learning.dataset import Samples, decode
 from potlp_jax.learning.loss import DataScale, network_config
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, operation_counts, parameter_count
@@ -158,11 +159,14 @@ def planned_steps(folder: Path, epoch: int, config: FitConfig, measure: Callable
     asked = {"epochs": config.epochs, "minutes": config.minutes, "seed": config.training.seed}
     path = folder / "plan.json"
     if path.exists():
-        plan = json.loads(path.read_text())
-        found = differences(plan["asked"], asked)
+        plan = read_json(path, TrainingError, "the plan of a training", MOST_TEXT)
+        with reading(path, TrainingError, "the plan of a training"):
+            found, steps = differences(plan["asked"], asked), int(plan["steps"])
         if found:
             raise TrainingError(f"{path} was made for another training ({'; '.join(found)}): choose another folder")
-        return int(plan["steps"])
+        if steps < 1:
+            raise TrainingError(f"{path} plans {steps} steps: delete it to plan again")
+        return steps
     plan = {"asked": asked, "steps": config.epochs * epoch}
     if config.minutes is not None:
         plan["seconds_per_step"] = measure()

@@ -2,11 +2,14 @@
 
 import csv
 import dataclasses
+import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from tensorboardX import SummaryWriter
 
+from potlp_jax.errors import TrainingError
+from potlp_jax.files import MOST_RECORD, read_text, reading
 from potlp_jax.learning.training import Progress
 
 TABLE: str = "log.csv"
@@ -104,8 +107,13 @@ def _row_of(progress: Progress) -> Row:
 def _read_rows(path: Path) -> list[Row]:
     if not path.exists():
         return []
-    with path.open(newline="") as file:
-        return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+    text = read_text(path, TrainingError, MOST_RECORD)
+    with reading(path, TrainingError, "the table of a training"):
+        rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(io.StringIO(text))]
+        # Which rows are kept goes by it (`Journal.start`).
+        if not all("step" in row for row in rows):
+            raise ValueError("it has no column step")
+    return rows
 
 
 def describe(progress: Progress) -> str:

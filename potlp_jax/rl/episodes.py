@@ -27,6 +27,7 @@ from potlp_jax.errors import TaskError
 from potlp_jax.planning.move import Move, MoveKind, move_to
 from potlp_jax.planning.policies import Policy, direct_move
 from potlp_jax.planning.situation import Situation, assess
+from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig, config_in
 from potlp_jax.trials.record import Outcome
@@ -134,11 +135,14 @@ class TaskEnv:
             config: default: what the worlds call for.
 
         Raises:
+            PropositionsError: a world has other propositions than the task.
             TaskError: the task is decided before the first step, whatever the robot does.
         """
+        for world in worlds:
+            require_same_propositions(task.propositions, world.propositions, asker=f"the task {task.text!r}")
         if not len(task.edges):
             raise TaskError(f"there is nothing to do for {task.text!r}: its automaton has no transition to attempt")
-        # Their static parts (propositions, settings) must agree, which jax.tree.map checks.
+        # Their settings are static and must agree too, which jax.tree.map checks.
         self.worlds: World = jax.tree.map(lambda *leaves: jnp.stack(leaves), *worlds)
         self.task = task
         self.config: TrialConfig = config_in(worlds[0], config)

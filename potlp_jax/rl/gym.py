@@ -11,7 +11,6 @@ from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
 from potlp_jax.rl.episodes import OUTCOME_NAMES, EnvState, Observation, TaskEnv, TimeStep
 from potlp_jax.task.task import Task
-from potlp_jax.world.grid import MAX_LETTER
 
 try:
     import gymnasium
@@ -66,7 +65,7 @@ class GymTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
         return spaces.Dict(
             {
                 "cells": box(-1, 1, height, width, dtype=np.int8),
-                "letters": box(0, MAX_LETTER, height, width),
+                "letters": box(0, 2 ** len(self.env.task.propositions) - 1, height, width),
                 "position": box(0, longest, 2),
                 "state": box(0, states - 1),
                 "subgoals": box(0, longest, subgoals, 2),

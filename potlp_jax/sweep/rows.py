@@ -1,9 +1,12 @@
 """A finished trial as a row of the store."""
 
+import shlex
 import subprocess
+import sys
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -13,7 +16,8 @@ from potlp_jax.sweep.specification import configuration_hash
 from potlp_jax.sweep.store import Item, Row
 from potlp_jax.trials.batch import Finished
 from potlp_jax.trials.config import TrialConfig
-from potlp_jax.world.grid import World
+from potlp_jax.trials.loop import versions as library_versions
+from potlp_jax.world.grid import World, world_digest
 from potlp_jax.world.moves import NEIGHBOURS
 
 
@@ -53,6 +57,7 @@ def trial_row(
         versions=dict(versions),
         commit=source_commit(),
         seconds=trial.seconds,
+        world_digest=world_digest(world),
     )
 
 
@@ -91,6 +96,18 @@ def source_commit() -> str:
         return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--", str(folder)) else "")
     except (OSError, subprocess.CalledProcessError):
         return ""
+
+
+def provenance() -> dict[str, Any]:
+    """Where a result comes from: the command that runs, the commit of the package and the versions, JSON-able."""
+    # As it was typed, but without the folders of the interpreter and of an installed script.
+    interpreted = sys.orig_argv[1:2] != [] and not sys.orig_argv[1].startswith("-")
+    program, *arguments = sys.orig_argv[1:] if interpreted else ["python", *sys.orig_argv[1:]]
+    return {
+        "command": shlex.join([Path(program).name, *arguments]),
+        "commit": source_commit(),
+        "versions": library_versions(),
+    }
 
 
 def _words(key: PRNGKeyArray) -> tuple[int, int]:

@@ -200,7 +200,7 @@ class Sweep:
             self._key(item.world),
             self.specification.config,
             environment=f"{item.environment}/{self.specification.split.value}",
-            seed=item.world,
+            world_number=item.world,
             arrays=arrays,
             estimator=self._asked(item.environment, item.policy),
         )
@@ -236,7 +236,7 @@ class Sweep:
         return estimator_of(named_policy(policy), self._generator(environment).propositions, self._estimator)
 
     def _estimator_identity(self) -> str | None:
-        """Of all that policies ask, so that a store never mixes two. Raises CheckpointError where there is none."""
+        """Of all that policies ask, so that a store never mixes two. Raises EstimatorError where there is none."""
         environments = sorted({cell.environment for cell in self.specification.cells})
         asked = [self._asked(*pair) for pair in itertools.product(environments, self.specification.policies)]
         return ", ".join(dict.fromkeys(identity_of(estimator) for estimator in asked if estimator is not None)) or None

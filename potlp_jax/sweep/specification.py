@@ -26,6 +26,7 @@ from potlp_jax.codec import config_from_dict, json_copy, read_settings, settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
 from potlp_jax.errors import PluginError, SpecificationError, TaskError, WorldError
+from potlp_jax.files import short
 from potlp_jax.planning.policies import Policy, named_policy
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 
@@ -163,7 +164,7 @@ def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = 
 def _list(data: Mapping[str, Any], name: str, where: str) -> list[Any]:
     value = data[name]
     if not isinstance(value, list) or not value:
-        raise SpecificationError(f"{where}: {name}: give a list such as [{_EXAMPLES[name]}], found {value!r}")
+        raise SpecificationError(f"{where}: {name}: give a list such as [{_EXAMPLES[name]}], found {short(value)}")
     return value
 
 
@@ -174,7 +175,7 @@ def _number(data: Mapping[str, Any], name: str, least: int, where: str, default:
     value = data.get(name, default)
     # To Python, True is a whole number; in a file it is a mistake.
     if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= MAX_INDEX:
-        raise SpecificationError(f"{where}: {name}: give a whole number of at least {least}, found {value!r}")
+        raise SpecificationError(f"{where}: {name}: give a whole number of at least {least}, found {short(value)}")
     return value
 
 
@@ -212,6 +213,9 @@ def _split(name: Any, environments: Sequence[str], where: str) -> Split:
 def _formula(environment: str, task: Any, where: str) -> str:
     """A task by number as its formula, any other (a formula, a ``.hoa`` file) as it is. Raises for what is no task."""
     generator = make(environment)
+    # To Python, True is a whole number; and YAML reads `~`, dates and fractions as neither text nor number.
+    if isinstance(task, bool) or not isinstance(task, int | str):
+        raise SpecificationError(f"{where}: tasks: give numbers or formulas, found {short(task)}")
     # Compiled here only to be checked, so that a wrong task ends the command and not a worker.
     try:
         generator.task(task)

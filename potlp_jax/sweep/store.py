@@ -21,7 +21,7 @@ from potlp_jax.codec import differences, json_copy
 from potlp_jax.errors import StoreError
 
 # Counts up whenever the tables change; a store of another format is refused, not converted.
-FORMAT = "potlp-sweep-2"
+FORMAT = "potlp-sweep-3"
 
 # Ten minutes: trials take seconds, so that only a worker that is gone holds a claim so long.
 LEASE: float = 600.0
@@ -50,6 +50,7 @@ class Row:
     """The result of one trial. Costs are in units of the resolution; ``seconds`` is the wall time it took.
 
     ``key`` holds the words of the trial's key; ``path`` holds the cells that were entered (``rows.read_path``).
+    ``world_digest`` tells in which world that was (``world.grid.world_digest``), whatever its number means later.
     """
 
     item: Item
@@ -66,6 +67,7 @@ class Row:
     versions: Mapping[str, str]
     commit: str
     seconds: float
+    world_digest: str
 
 
 _SCHEMA = """
@@ -79,7 +81,7 @@ CREATE TABLE trials (
     outcome TEXT NOT NULL, cost REAL NOT NULL, budget REAL NOT NULL, steps INTEGER NOT NULL,
     decisions INTEGER NOT NULL, fallbacks INTEGER NOT NULL, status INTEGER NOT NULL, key TEXT NOT NULL,
     path TEXT NOT NULL, configuration TEXT NOT NULL, versions TEXT NOT NULL, "commit" TEXT NOT NULL,
-    seconds REAL NOT NULL,
+    seconds REAL NOT NULL, world_digest TEXT NOT NULL,
     PRIMARY KEY (environment, task, policy, world)
 ) WITHOUT ROWID;
 CREATE TABLE claims (

@@ -10,14 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from potlp_jax.errors import TaskError
-
-MAX_PROPOSITIONS: int = 16
-"""Propositions of a task, at most: tables are dense over ``2 ** n`` letters."""
+from potlp_jax.errors import SpotMissingError, TaskError
+from potlp_jax.task.propositions import check_propositions
 
 _INSTALL_SPOT = (
     "install it with 'pip install spottl' (Linux x86_64; the PyPI package called 'spot' is something else) or, on "
-    "other platforms, 'conda install -c conda-forge spot'; shipped tasks and HOA files need no Spot"
+    "other platforms, 'conda install -c conda-forge spot'; formulas of shipped tasks, however they are written, and "
+    "HOA files need no Spot"
 )
 _WORD_OR_STRING = re.compile(r'"(?:[^"\\]|\\.)*"|[A-Za-z_][A-Za-z0-9_.]*|.')
 _OPERATOR_PREFIX = re.compile(r"^[FGX]+")
@@ -58,37 +57,18 @@ def load_spot() -> Any:
     """The module ``spot``.
 
     Raises:
-        TaskError: Spot is missing, or another package of that name is installed.
+        SpotMissingError: Spot is missing, or another package of that name is installed.
     """
     # Imported by name: neither the type checker nor the tests of layers need Spot to be there.
     try:
         spot = importlib.import_module("spot")
     except ImportError as error:
-        raise TaskError(f"a formula needs Spot, which is not installed: {_INSTALL_SPOT}") from error
+        raise SpotMissingError(f"this formula needs Spot, which is not installed: {_INSTALL_SPOT}") from error
     except Exception as error:  # the namesake on PyPI is Python 2 code and fails in its own ways
-        raise TaskError(f"the installed module 'spot' is not the Spot library: {_INSTALL_SPOT}") from error
+        raise SpotMissingError(f"the installed module 'spot' is not the Spot library: {_INSTALL_SPOT}") from error
     if not (hasattr(spot, "translate") and hasattr(spot, "formula")):
-        raise TaskError(f"the installed module 'spot' is not the Spot library: {_INSTALL_SPOT}")
+        raise SpotMissingError(f"the installed module 'spot' is not the Spot library: {_INSTALL_SPOT}")
     return spot
-
-
-def check_propositions(propositions: Sequence[str]) -> tuple[str, ...]:
-    """Sigma as a tuple.
-
-    Raises:
-        TaskError: a single string, an empty or repeated name, or more than ``MAX_PROPOSITIONS`` names.
-    """
-    if isinstance(propositions, str):
-        raise TaskError(f"propositions must be a sequence of names, not the single text {propositions!r}")
-    names = tuple(propositions)
-    if any(not isinstance(name, str) or not name for name in names):
-        raise TaskError(f"propositions must be non-empty texts, got {names!r}")
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise TaskError(f"propositions are repeated: {', '.join(repeated)}")
-    if len(names) > MAX_PROPOSITIONS:
-        raise TaskError(f"{len(names)} propositions are too many: a task has at most {MAX_PROPOSITIONS}")
-    return names
 
 
 def parse_formula(text: str, propositions: Sequence[str] | None = None) -> Formula:
@@ -115,7 +95,7 @@ def parse_formula(text: str, propositions: Sequence[str] | None = None) -> Formu
     sigma = check_propositions(names if known is None else known)
     for name in names:
         if name not in sigma:
-            raise _unknown_proposition(name, sigma, line)
+            raise unknown_proposition(name, sigma, line)
     _check_co_safe(spot, parsed, line)
     return Formula(text=text, propositions=sigma, parsed=parsed)
 
@@ -157,7 +137,7 @@ def _quote_known_names(line: str, known: tuple[str, ...]) -> tuple[str, list[int
     return "".join(pieces), added
 
 
-def _unknown_proposition(name: str, known: tuple[str, ...], line: str) -> TaskError:
+def unknown_proposition(name: str, known: tuple[str, ...], line: str) -> TaskError:
     """Points at the name and lists the known propositions."""
     message = f"unknown proposition '{name}'; known: {', '.join(known) or 'none'}{_operator_hint(line)}"
     # The name as a whole word, perhaps in quotes, perhaps with operators written in front of it.

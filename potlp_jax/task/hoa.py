@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from potlp_jax.errors import TaskError
+from potlp_jax.files import one_line, short
 from potlp_jax.task.automaton import Dfa
-from potlp_jax.task.formula import MAX_PROPOSITIONS
 from potlp_jax.task.guards import Phi, minimal_cover
+from potlp_jax.task.propositions import check_propositions
 
 _TOKEN = re.compile(
     r"""(?P<skip>\s+|/\*.*?\*/)
@@ -30,6 +31,15 @@ _TOKEN = re.compile(
       | (?P<symbol>[\[\](){}!&|])""",
     re.VERBOSE | re.DOTALL,
 )
+MOST_ENTRIES: int = 1 << 22
+"""Entries of the table of successors, states times letters: 64 states over 16 propositions, 4,096 over 10."""
+
+DEEPEST: int = 30
+"""Parentheses within each other in a label; Spot writes none. More would exhaust the stack of a recursive descent."""
+
+_MOST_DIGITS = 9
+"""Digits of a number: what has more is beyond 32 bits, and no automaton has so many states."""
+
 _UNKNOWN = -1
 """A number that has not been read yet: successor of a letter, initial state."""
 
@@ -58,6 +68,10 @@ class _Token:
     kind: str
     text: str
     line: int
+
+    def __str__(self) -> str:
+        # As messages quote it: the text may be a name of a million characters.
+        return one_line(self.text, 40)
 
 
 @dataclass
@@ -146,7 +160,7 @@ def _tokens(text: str) -> list[_Token]:
     while position < len(text):
         match = _TOKEN.match(text, position)
         if match is None:
-            raise _error(line, f"cannot read {text[position : position + 20].splitlines()[0]!r}")
+            raise _error(line, f"cannot read {short(text[position : position + 20].partition(chr(10))[0])}")
         if match.lastgroup != "skip":
             tokens.append(_Token(str(match.lastgroup), match.group(), line))
         line += match.group().count("\n")
@@ -164,6 +178,7 @@ class _Reader:
     def __init__(self, tokens: list[_Token]):
         self._tokens = tokens
         self._position = 0
+        self._depth = 0
         self._header = _Header()
         # Without an ``AP:`` header there is one letter, in which no proposition holds.
         self._letters = np.zeros(1, dtype=np.int64)
@@ -195,15 +210,20 @@ class _Reader:
 
     def _expect(self, kind: str, what: str) -> _Token:
         if self._next.kind != kind:
-            raise self._error(f"expected {what}, found {self._next.text}")
+            raise self._error(f"expected {what}, found {self._next}")
         return self._take()
 
     def _expect_symbol(self, symbol: str) -> None:
         if not self._accept(symbol):
-            raise self._error(f"expected '{symbol}', found {self._next.text}")
+            raise self._error(f"expected '{symbol}', found {self._next}")
 
     def _number(self, what: str) -> int:
-        return int(self._expect("number", what).text)
+        return self._value(self._expect("number", what))
+
+    def _value(self, token: _Token) -> int:
+        if len(token.text) > _MOST_DIGITS:
+            raise _error(token.line, f"{token} is too large a number")
+        return int(token.text)
 
     def _error(self, message: str) -> TaskError:
         return _error(self._next.line, message)
@@ -215,7 +235,7 @@ class _Reader:
             raise self._error("the text does not begin with 'HOA: v1'")
         version = self._expect("name", "the version")
         if version.text != "v1":
-            raise _error(version.line, f"version {version.text} is not known; v1 is")
+            raise _error(version.line, f"version {version} is not known; v1 is")
         while self._next.text != "--BODY--":
             self._read_header_item(self._expect("header", "a header or --BODY--"))
         if self._header.initial == _UNKNOWN:
@@ -242,8 +262,8 @@ class _Reader:
                 header.name = _unquote(self._expect("string", "a name in quotes").text)
             case other if other[0].islower():  # by the format, such headers carry no meaning that may not be ignored
                 self._skip_header_item()
-            case other:
-                raise _error(token.line, f"header '{other}' is not supported")
+            case _:
+                raise _error(token.line, f"header '{token}' is not supported")
 
     def _skip_header_item(self) -> None:
         while self._next.kind not in ("header", "section", "end"):
@@ -265,9 +285,10 @@ class _Reader:
             names.append(_unquote(self._take().text))
         if len(names) != count or len(set(names)) != count:
             raise _error(token.line, f"'AP:' announces {count} distinct propositions, and lists {len(names)}")
-        if count > MAX_PROPOSITIONS:
-            raise _error(token.line, f"{count} propositions are too many: a task has at most {MAX_PROPOSITIONS}")
-        self._header.propositions = tuple(names)
+        try:
+            self._header.propositions = check_propositions(names)
+        except TaskError as error:
+            raise _error(token.line, str(error)) from error
         self._letters = np.arange(2**count)
         self._where = [(self._letters >> i & 1).astype(bool) for i in range(count)]
 
@@ -277,7 +298,8 @@ class _Reader:
             parts.append(self._take().text)
         condition = "".join(parts)
         if condition not in ("0t", "0f", "1Inf(0)"):
-            raise _error(token.line, f"acceptance '{' '.join(parts)}' is not supported: it must be Büchi, '1 Inf(0)'")
+            found = one_line(" ".join(parts), 40)
+            raise _error(token.line, f"acceptance '{found}' is not supported: it must be Büchi, '1 Inf(0)'")
         self._header.acceptance = condition
 
     # Labels: sets of letters. By the format ! binds stronger than &, and & stronger than |.
@@ -295,11 +317,21 @@ class _Reader:
         return letters
 
     def _literal(self) -> np.ndarray:
-        if self._accept("!"):
-            return ~self._literal()
+        # Counted, not called again for each: thousands of negations in a row are a text like any other.
+        negated = False
+        while self._accept("!"):
+            negated = not negated
+        letters = self._atom()
+        return ~letters if negated else letters
+
+    def _atom(self) -> np.ndarray:
         if self._accept("("):
+            self._depth += 1
+            if self._depth > DEEPEST:
+                raise self._error(f"more than {DEEPEST} parentheses within each other")
             letters = self._disjunction()
             self._expect_symbol(")")
+            self._depth -= 1
             return letters
         token = self._take()
         if token.kind == "number":
@@ -309,10 +341,10 @@ class _Reader:
         if token.text in ("t", "f"):
             return np.full(self._letters.size, token.text == "t")
         # A negation of nothing, an alias that comes later, a name where a number belongs: all end here.
-        raise _error(token.line, f"{token.text} is not a label: expected a proposition's number, an alias, t or f")
+        raise _error(token.line, f"{token} is not a label: expected a proposition's number, an alias, t or f")
 
     def _proposition(self, token: _Token) -> np.ndarray:
-        index = int(token.text)
+        index = self._value(token)
         if index >= len(self._where):
             raise _error(token.line, f"proposition {index} does not exist: 'AP:' lists {len(self._where)}")
         return self._where[index]
@@ -331,7 +363,7 @@ class _Reader:
         states: dict[int, _State] = {}
         while not self._accept("--END--"):
             if not self._accept("State:"):
-                raise self._error(f"expected 'State:' or --END--, found {self._next.text}")
+                raise self._error(f"expected 'State:' or --END--, found {self._next}")
             self._read_state(states)
         if self._next.kind != "end":
             raise self._error("there is text after --END--: one automaton is read, not several")
@@ -343,6 +375,10 @@ class _Reader:
         index = self._number("a state's number")
         if index in states:
             raise _error(line, f"state {index} is described twice")
+        if (len(states) + 1) * self._letters.size > MOST_ENTRIES:
+            raise _error(
+                line, f"more than {MOST_ENTRIES:,} entries, states times letters: use fewer states or propositions"
+            )
         if self._next.kind == "string":
             self._take()
         # Rows of the table are filled edge by edge, which shows both what is described twice and what is missing.

@@ -1,10 +1,11 @@
 """Tasks as users name them: a formula, the name of a shipped task, an automaton in a file."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 from potlp_jax.errors import TaskError
-from potlp_jax.task.task import Task, shipped_tasks
+from potlp_jax.files import read_text
+from potlp_jax.task.shipped import shipped_tasks
+from potlp_jax.task.task import Task
 
 
 def read_task(text: str, propositions: Sequence[str] | None = None, max_positive_literals: int | None = None) -> Task:
@@ -19,19 +20,7 @@ def read_task(text: str, propositions: Sequence[str] | None = None, max_positive
         TaskError: the file cannot be read, or what is named is no task over these propositions.
     """
     if text.endswith(".hoa"):
-        return Task.from_hoa(_read(Path(text)), propositions, max_positive_literals)
+        return Task.from_hoa(read_text(text, TaskError), propositions, max_positive_literals)
     if text in shipped_tasks():
         return Task.from_hoa(Task.shipped(text).to_hoa(), propositions, max_positive_literals)
-    if propositions is not None and max_positive_literals is None:
-        # Formulas of the shipped families come compiled, so that they need no Spot.
-        return Task.of_formula(text, propositions)
     return Task.from_formula(text, propositions, max_positive_literals)
-
-
-def _read(path: Path) -> str:
-    try:
-        return path.read_text("utf-8")
-    except OSError as error:
-        raise TaskError(f"{path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise TaskError(f"{path}: not a text file") from error

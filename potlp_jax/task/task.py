@@ -1,9 +1,9 @@
 """A task: a formula, its automaton and its outcome classes in one frozen object, and its arrays for the device."""
 
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass
-from functools import cache, cached_property
-from importlib import resources
+from functools import cached_property
 from typing import Any
 
 import flax.struct
@@ -12,12 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int8, Int32
 
-from potlp_jax.errors import TaskError
+from potlp_jax.errors import SpotMissingError, TaskError, TaskWarning, UnsatisfiableError
 from potlp_jax.task.automaton import Dfa, canonical_dfa, translate
-from potlp_jax.task.formula import MAX_PROPOSITIONS, check_propositions, parse_formula
+from potlp_jax.task.formula import parse_formula, unknown_proposition
 from potlp_jax.task.guards import Phi, minimal_cover
 from potlp_jax.task.hoa import HoaAutomaton, read_hoa, write_hoa
+from potlp_jax.task.language import UnreadableError, names_of, read_formula
 from potlp_jax.task.outcomes import Condition, OutcomeClass, Outcomes, find_outcomes
+from potlp_jax.task.propositions import MAX_PROPOSITIONS, check_propositions, require_same_propositions
+from potlp_jax.task.shipped import find_shipped, shipped_hoa
 from potlp_jax.types import NO_CLASS
 
 UNNAMED: str = "(unnamed automaton)"
@@ -48,6 +51,7 @@ class TaskArrays:
         condition_classes: the classes that make up a condition, increasing, then ``NO_CLASS``.
         condition_mask: True on real conditions.
         implies: ``[a, b]``: if a holds beyond a subgoal, so does b. Reflexive on real conditions, False on padding.
+        propositions: Sigma without padding; bit ``i`` of a letter is ``propositions[i]``. Static under jit.
     """
 
     transitions: Int32[Array, "*batch Z L"]
@@ -65,6 +69,8 @@ class TaskArrays:
     condition_classes: Int32[Array, "*batch M K"]
     condition_mask: Bool[Array, "*batch M"]
     implies: Bool[Array, "*batch M M"]
+    # Part of what JAX compiles for, so that a task that meets a map of other names is refused while tracing.
+    propositions: tuple[str, ...] = flax.struct.field(pytree_node=False)
 
 
 @dataclass(frozen=True)
@@ -118,7 +124,10 @@ class Task:
     def from_formula(
         cls, text: str, propositions: Sequence[str] | None = None, max_positive_literals: int | None = None
     ) -> "Task":
-        """Compiles a co-safe formula in Spot's syntax; needs Spot.
+        """Compiles a co-safe formula in Spot's syntax.
+
+        Without Spot, formulas of shipped tasks are recognised by their language, however they are written; the task is
+        the same as with Spot, because equal languages have equal automata here.
 
         Args:
             text: the formula. Names that begin with F, G or X, or hold spaces, stand in double quotes.
@@ -129,14 +138,21 @@ class Task:
             The task; its ``arrays`` are what the planner takes.
 
         Raises:
-            TaskError: anything wrong with the formula, with column and caret; Spot missing; acceptance unreachable
-                because of ``max_positive_literals``. A formula that no word satisfies is a task whose initial state
-                is a trap.
+            TaskError: anything wrong with the formula, with column and caret; Spot is missing and no shipped task has
+                this language; acceptance unreachable because of ``max_positive_literals``.
+            UnsatisfiableError: no word satisfies the formula.
+
+        Warns:
+            TaskWarning: every word satisfies the formula, so that there is nothing to do.
         """
-        formula = parse_formula(text, propositions)
-        # Through HOA text, so that formulas and files take one path and a shipped file is what Spot would deliver.
-        automaton = read_hoa(translate(formula))
-        return cls._compile(text, formula.propositions, automaton, max_positive_literals)
+        try:
+            formula = parse_formula(text, propositions)
+        except SpotMissingError as missing:
+            sigma, automaton = _without_spot(text, propositions, missing)
+        else:
+            # Through HOA text, so that formulas and files take one path and a shipped file is what Spot would deliver.
+            sigma, automaton = formula.propositions, read_hoa(translate(formula))
+        return cls._compile(text, sigma, automaton, max_positive_literals)
 
     @classmethod
     def from_hoa(
@@ -154,6 +170,10 @@ class Task:
 
         Raises:
             TaskError: what is wrong with the automaton, with the line where it has one.
+            UnsatisfiableError: no word satisfies the automaton.
+
+        Warns:
+            TaskWarning: every word satisfies the automaton, so that there is nothing to do.
         """
         automaton = read_hoa(text)
         sigma = automaton.propositions if propositions is None else propositions
@@ -161,36 +181,15 @@ class Task:
 
     @classmethod
     def shipped(cls, name: str) -> "Task":
-        """A task that comes with the package; needs no Spot. ``shipped_tasks()`` lists them.
+        """A task that comes with the package; needs no Spot. ``task.shipped.shipped_tasks()`` lists them.
 
         Raises:
             TaskError: there is no such task; names those that there are.
         """
-        texts = _shipped_hoa()
+        texts = shipped_hoa()
         if name not in texts:
             raise TaskError(f"there is no shipped task {name!r}; there are: {', '.join(texts)}")
         return cls.from_hoa(texts[name])
-
-    @classmethod
-    def of_formula(cls, text: str, propositions: Sequence[str]) -> "Task":
-        """The task of a formula over Sigma: without Spot where a task that ships has this very formula.
-
-        Args:
-            text: the formula.
-            propositions: Sigma, a superset of the formula's names.
-
-        Returns:
-            The same task with and without Spot: shipped automata were made by Spot and are read as such.
-
-        Raises:
-            TaskError: as ``from_formula``.
-        """
-        for hoa in _shipped_hoa().values():
-            shipped = read_hoa(hoa)
-            # A shipped automaton may have propositions that its formula does not mention, and Sigma not contain.
-            if shipped.name == text and set(shipped.propositions) <= set(propositions):
-                return cls.from_hoa(hoa, propositions)
-        return cls.from_formula(text, propositions)
 
     @classmethod
     def _compile(
@@ -206,6 +205,7 @@ class Task:
         letters = np.arange(2 ** len(propositions))
         own_letters = sum(((letters >> bit & 1) << i for i, bit in enumerate(bits)), np.zeros_like(letters))
         dfa = canonical_dfa(automaton.transitions[:, own_letters], automaton.accepting, automaton.initial)
+        _check_that_it_asks_for_something(text, dfa)
         return cls(
             text=text,
             propositions=propositions,
@@ -231,20 +231,22 @@ class Task:
 
     @property
     def sizes(self) -> TaskSizes:
-        """Sizes without padding."""
+        """The smallest arrays that the task fits into: one edge and one class at least, masked where it has none."""
+        # `X X fire` has neither: no letter keeps any of its states. An axis without rows cannot be indexed, not even
+        # where the result is masked, and would need a case of its own in every estimator and search.
         outcomes = self.outcomes
         return TaskSizes(
             states=self.dfa.num_states,
             propositions=len(self.propositions),
-            edges=len(outcomes.edges),
-            classes=len(outcomes.classes),
+            edges=max(len(outcomes.edges), 1),
+            classes=max(len(outcomes.classes), 1),
             compound=len(outcomes.conditions) - len(outcomes.classes),
             cubes=max((len(condition.classes) for condition in outcomes.conditions), default=1),
         )
 
     @cached_property
     def arrays(self) -> TaskArrays:
-        """The device form, without padding."""
+        """The device form, without more padding than ``sizes`` has."""
         return self.padded(self.sizes)
 
     def padded(self, sizes: TaskSizes) -> TaskArrays:
@@ -253,7 +255,7 @@ class Task:
         Raises:
             TaskError: the task does not fit, or there are too many propositions.
         """
-        return _on_device(_padded_fields(self, sizes))
+        return _on_device(_padded_fields(self, sizes), self.propositions)
 
     def to_hoa(self) -> str:
         """The automaton in HOA format, with the formula as its name. ``max_positive_literals`` is not part of it."""
@@ -306,6 +308,14 @@ class Task:
         }
 
 
+def _check_that_it_asks_for_something(text: str, dfa: Dfa) -> None:
+    # Planned with, such a task would end its trial at once with cost 0, which looks like a result.
+    if dfa.trap[dfa.initial]:
+        raise UnsatisfiableError(f"no robot can satisfy '{text}': its parts contradict each other in every word")
+    if dfa.accepting[dfa.initial]:
+        warnings.warn(f"'{text}' is satisfied by every word: there is nothing to do", TaskWarning, stacklevel=4)
+
+
 def stack_tasks(tasks: Sequence[Task], sizes: TaskSizes | None = None) -> TaskArrays:
     """Several tasks over the same propositions, padded and stacked along a new leading axis.
 
@@ -317,36 +327,52 @@ def stack_tasks(tasks: Sequence[Task], sizes: TaskSizes | None = None) -> TaskAr
         The arrays of all tasks, each field with the leading axis ``len(tasks)``.
 
     Raises:
-        TaskError: no task, different propositions, or a task that does not fit.
+        PropositionsError: they have different propositions.
+        TaskError: no task, or a task that does not fit.
     """
     # Tasks of other propositions could be padded too, but a letter would mean different things from row to row.
     if not tasks:
         raise TaskError("there is no task to stack")
     for task in tasks:
-        if task.propositions != tasks[0].propositions:
-            raise TaskError(
-                f"stacked tasks must have the same propositions in the same order: {tasks[0].propositions} and "
-                f"{task.propositions}"
-            )
+        require_same_propositions(
+            task.propositions,
+            tasks[0].propositions,
+            asker=f"the task {task.text!r}",
+            knower=f"the first task of the stack, {tasks[0].text!r},",
+            remedy="give all tasks of a stack the same ones, Task.from_formula(formula, names)",
+        )
     # Propositions are the same, so letters mean the same in every row of the stack; the other sizes may differ.
     if sizes is None:
         sizes = tasks[0].sizes
         for task in tasks:
             sizes = sizes.union(task.sizes)
     padded = [_padded_fields(task, sizes) for task in tasks]
-    return _on_device({name: np.stack([fields[name] for fields in padded]) for name in padded[0]})
+    stacked = {name: np.stack([fields[name] for fields in padded]) for name in padded[0]}
+    return _on_device(stacked, tasks[0].propositions)
 
 
-def shipped_tasks() -> Mapping[str, str]:
-    """Names of the tasks that come with the package, and their formulas."""
-    return {name: read_hoa(text).name for name, text in _shipped_hoa().items()}
+def _without_spot(
+    text: str, propositions: Sequence[str] | None, missing: SpotMissingError
+) -> tuple[tuple[str, ...], HoaAutomaton]:
+    """Sigma and the shipped automaton that has the language of a formula.
 
-
-@cache
-def _shipped_hoa() -> dict[str, str]:
-    files = resources.files("potlp_jax.task").joinpath("data").iterdir()
-    texts = {file.name.removesuffix(".hoa"): file.read_text("utf-8") for file in files if file.name.endswith(".hoa")}
-    return dict(sorted(texts.items()))
+    Raises:
+        SpotMissingError: none has.
+        TaskError: the formula holds a proposition that is not in Sigma.
+    """
+    try:
+        formula = read_formula(text)
+    except UnreadableError:
+        raise missing from None
+    names = names_of(formula)
+    sigma = names if propositions is None else check_propositions(propositions)
+    for name in names:
+        if name not in sigma:
+            raise unknown_proposition(name, sigma, text)
+    automaton = find_shipped(formula)
+    if automaton is None:
+        raise missing
+    return sigma, automaton
 
 
 def _cube_text(cube: Phi, propositions: Sequence[str]) -> str:
@@ -356,11 +382,12 @@ def _cube_text(cube: Phi, propositions: Sequence[str]) -> str:
     return " & ".join(("" if sign > 0 else "!") + names[i] for i, sign in enumerate(cube) if sign) or "true"
 
 
-def _on_device(fields: dict[str, np.ndarray]) -> TaskArrays:
+def _on_device(fields: dict[str, np.ndarray], propositions: tuple[str, ...]) -> TaskArrays:
     """Concrete arrays, also where a trace is under way: a task keeps its arrays, and may not keep tracers."""
     # ``Task.arrays`` is cached; a first use within a jitted function would otherwise cache that trace's constants.
     with jax.ensure_compile_time_eval():
-        return TaskArrays(**{name: jnp.asarray(value) for name, value in fields.items()})
+        arrays = {name: jnp.asarray(value) for name, value in fields.items()}
+    return TaskArrays(**arrays, propositions=propositions)
 
 
 def _padded_fields(task: Task, sizes: TaskSizes) -> dict[str, np.ndarray]:
@@ -387,24 +414,24 @@ def _state_fields(task: Task, sizes: TaskSizes) -> dict[str, np.ndarray]:
 
 
 def _edge_fields(task: Task, sizes: TaskSizes) -> dict[str, np.ndarray]:
-    outcomes, count = task.outcomes, task.sizes
+    outcomes, classes = task.outcomes, len(task.classes)
     # Conditions of several cubes follow the padded classes and so move up by the padding.
-    compound = outcomes.edge_condition >= count.classes
-    condition = outcomes.edge_condition + np.int32(sizes.classes - count.classes) * compound
+    compound = outcomes.edge_condition >= classes
+    condition = outcomes.edge_condition + np.int32(sizes.classes - classes) * compound
     return {
         "edges": _grow(outcomes.edges, sizes.edges, 0),
-        "edge_mask": np.arange(sizes.edges) < count.edges,
+        "edge_mask": np.arange(sizes.edges) < len(outcomes.edges),
         "edge_condition": _grow(condition.astype(np.int32), sizes.edges, 0),
     }
 
 
 def _condition_fields(task: Task, sizes: TaskSizes) -> dict[str, np.ndarray]:
     """Classes keep their indices; the conditions with several cubes follow the padded classes."""
-    outcomes, count = task.outcomes, task.sizes
+    outcomes, count, propositions = task.outcomes, len(task.classes), len(task.propositions)
     phi = np.zeros((sizes.classes, 2, sizes.propositions), dtype=np.int8)
-    phi[: count.classes, :, : count.propositions] = np.reshape(outcomes.classes, (count.classes, 2, count.propositions))
+    phi[:count, :, :propositions] = np.reshape(outcomes.classes, (count, 2, propositions))
     row_of = np.arange(len(outcomes.conditions))
-    row_of[count.classes :] += sizes.classes - count.classes
+    row_of[count:] += sizes.classes - count
     total = sizes.classes + sizes.compound
     classes = np.full((total, sizes.cubes), NO_CLASS, dtype=np.int32)
     for row, condition in zip(row_of, outcomes.conditions, strict=True):
@@ -412,20 +439,21 @@ def _condition_fields(task: Task, sizes: TaskSizes) -> dict[str, np.ndarray]:
     mask, implies = np.zeros(total, dtype=bool), np.zeros((total, total), dtype=bool)
     mask[row_of] = True
     implies[np.ix_(row_of, row_of)] = outcomes.implies
-    own = outcomes.conditions[: count.classes]
+    own = outcomes.conditions[:count]
     return {
         "class_phi": phi,
-        "class_stay": _class_letters([condition.stay for condition in own], count, sizes),
-        "class_go": _class_letters([condition.go for condition in own], count, sizes),
-        "class_mask": np.arange(sizes.classes) < count.classes,
+        "class_stay": _class_letters([condition.stay for condition in own], propositions, sizes),
+        "class_go": _class_letters([condition.go for condition in own], propositions, sizes),
+        "class_mask": np.arange(sizes.classes) < count,
         "condition_classes": classes,
         "condition_mask": mask,
         "implies": implies,
     }
 
 
-def _class_letters(guards: Sequence[np.ndarray], count: TaskSizes, sizes: TaskSizes) -> np.ndarray:
-    letters = np.reshape(guards, (count.classes, 2**count.propositions)).astype(bool)
+def _class_letters(guards: Sequence[np.ndarray], propositions: int, sizes: TaskSizes) -> np.ndarray:
+    # Without classes there is no row whose length would say how many letters there are.
+    letters = np.reshape(guards, (len(guards), 2**propositions)).astype(bool)
     return _grow(_ignore_padded_propositions(letters, sizes), sizes.classes, False)
 
 

@@ -20,8 +20,10 @@ from jaxtyping import Array, Bool, Int32, PRNGKeyArray
 from potlp_jax.errors import BatchError
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.memory import PanoramaMemory
+from potlp_jax.learning.serialization import require_propositions
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy, PolicyFunction, named_policy
+from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.trials import rules
 from potlp_jax.trials.config import TrialConfig, config_in
@@ -97,8 +99,10 @@ def run_batch(
         The trials in the order in which they end.
 
     Raises:
-        BatchError: a world or task has another shape than the first one, its world is of a family with other
-            propositions or settings, or ``potlp`` has no estimator.
+        PropositionsError: world, task and estimator of a trial are not over the same propositions, or are over others
+            than the first trial of the batch.
+        BatchError: a world or task has another shape than the first one, its world is of a family with other settings,
+            or ``potlp`` has no estimator.
     """
     policy = named_policy(policy)
     if slots < 1:
@@ -109,9 +113,12 @@ def run_batch(
     first = next(starts, None)
     if first is None:
         return
+    _check_start(first, first)
     config = rules.config_of(policy, config_in(first.world, config))
     asked = rules.asked_of(policy, estimator)
     network = asked.config if isinstance(asked, TrainedEstimator) else None
+    if isinstance(asked, TrainedEstimator):
+        require_propositions(asked.config, first.arrays.propositions, f"estimator {asked.name}")
     yield from _run(first, starts, Setup(policy=policy, config=config, network=network), slots, asked)
 
 
@@ -122,7 +129,7 @@ def _run(
     views, shared = None, asked
     if isinstance(asked, TrainedEstimator):
         # Parameters are the same in all slots; what a robot has seen is its own.
-        views, shared = asked.start(*first.world.shape).memory, asked.params
+        views, shared = asked.start(*first.world.shape, setup.config.panoramas).memory, asked.params
     slots: tuple[Scene, Progress] = _empty_slots(first, views, setup, count)
     # Which trial is in which slot is the host's matter; the device knows slots alone.
     held: list[Start | None] = [None] * count
@@ -130,7 +137,7 @@ def _run(
     while True:
         for slot in range(count):
             while held[slot] is None and (start := next(starts, None)) is not None:
-                _check_shapes(start, first)
+                _check_start(start, first)
                 slots = _fill(slots, jnp.int32(slot), start.world, start.arrays, start.key, views, setup=setup)
                 held[slot], seconds[slot] = start, 0.0
         occupied = [slot for slot, start in enumerate(held) if start is not None]
@@ -150,12 +157,21 @@ def _run(
                 held[slot] = None
 
 
-def _check_shapes(start: Start, first: Start) -> None:
-    for what in ("propositions", "settings"):
-        mine, other = getattr(start.world, what), getattr(first.world, what)
-        # They are static parts of the arrays: JAX could not put both into one batch, and would say so obscurely.
-        if mine != other:
-            raise BatchError(f"trial {start.name!r}: its world has the {what} {mine}, the first of the batch {other}")
+def _check_start(start: Start, first: Start) -> None:
+    asker = f"the task of trial {start.name!r}"
+    require_same_propositions(start.arrays.propositions, start.world.propositions, asker=asker, knower="its world")
+    # They are static parts of the arrays, as settings are: JAX could not put both into one batch, and would say so
+    # obscurely.
+    require_same_propositions(
+        start.arrays.propositions,
+        first.arrays.propositions,
+        asker=asker,
+        knower="that of the first trial of the batch",
+        remedy="run trials over other ones in a batch of their own",
+    )
+    mine, other = start.world.settings, first.world.settings
+    if mine != other:
+        raise BatchError(f"trial {start.name!r}: its world has the settings {mine}, the first of the batch {other}")
     # Another shape would compile anew in the middle of the batch, without a word: refused instead.
     for what, mine, other in (("world", start.world, first.world), ("task", start.arrays, first.arrays)):
         found, expected = ([leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (mine, other))

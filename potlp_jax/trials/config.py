@@ -23,6 +23,8 @@ class TrialConfig:
         sensor: what a simulated robot observes.
         camera: the panoramas of a simulated robot.
         disturbance: of these panoramas.
+        panoramas: how many an estimator with a camera remembers. Where that is too few for the frontiers that are open
+            the trial's status has ``VIEW_OVERFLOW``.
         replan_distance: cells travelled after which a changed map is worth a new decision.
         budget_factor: times the map's ``height + width`` is the number of cells that may be travelled.
         revealed: whether a simulated robot knows the whole map from the start.
@@ -32,10 +34,16 @@ class TrialConfig:
     sensor: SensorConfig = SensorConfig()
     camera: CameraConfig = CameraConfig()
     disturbance: Disturbance = Disturbance()
+    # Panoramas that still show a frontier: at most 9 in fire-fighting buildings (docs/estimator.md, "Panoramas").
+    panoramas: int = 32
     # Both are part of the model (docs/model.md section 7): another value gives other trials.
     replan_distance: float = 4.0
     budget_factor: float = 20.0
     revealed: bool = False
+
+    def __post_init__(self) -> None:
+        if self.panoramas < 1:
+            raise ValueError(f"panoramas is {self.panoramas}, must be at least 1")
 
 
 def trial_config_for(source: World | Generator) -> TrialConfig:

@@ -18,6 +18,7 @@ from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.move import Move, MoveKind
 from potlp_jax.planning.policies import Policy, PolicyFunction, decide, named_policy, policy_name
+from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials import rules
 from potlp_jax.trials.config import TrialConfig, config_in
@@ -45,7 +46,7 @@ def run_trial(
     config: TrialConfig | None = None,
     *,
     environment: str = "",
-    seed: int | None = None,
+    world_number: int | None = None,
     arrays: TaskArrays | None = None,
     estimator: TrainedEstimator | Estimator | None = None,
 ) -> Trial:
@@ -55,10 +56,10 @@ def run_trial(
         world: the true map.
         task: what to do there.
         policy: one of the library's, or a function of one's own (``planning.policies.PolicyFunction``).
-        key: drives the planner's search and the camera's disturbance.
+        key: drives the search where it samples (``UctConfig``), and the camera's disturbance.
         config: settings; by default those that the world calls for (``World.settings``).
         environment: where the world comes from, for the record.
-        seed: which world of it, for the record.
+        world_number: which world of it, for the record.
         arrays: the task's arrays where they shall be padded; by default ``task.arrays``.
         estimator: what the policy asks: one read from a file, or any ``Estimator``. By default ``potlp`` asks the one
             that is shipped for the task's propositions, and a policy of one's own asks none.
@@ -67,15 +68,20 @@ def run_trial(
         The record of the trial.
 
     Raises:
-        CheckpointError: the estimator knows other propositions than the task, or none is shipped for them.
+        PropositionsError: world, task and estimator are not over the same propositions.
+        EstimatorError: no estimator is shipped for the task's propositions.
     """
+    # Before anything is compiled, and by the world's own name.
+    require_same_propositions(task.propositions, world.propositions, asker=f"the task {task.text!r}")
     policy = named_policy(policy)
     config = rules.config_of(policy, config_in(world, config))
     # One key for everything, and a use of its own for each: disturbing the camera does not change the search.
     robot = SimulatedRobot(world, config, rules.sensing_key(key))
     asked = rules.estimator_of(policy, task.propositions, estimator)
     run = run_robot(robot, task, policy, key, config, arrays=arrays, estimator=asked, world=world)
-    return make_trial(run, task, policy, config, asked, world, robot.first_seen, environment=environment, seed=seed)
+    return make_trial(
+        run, task, policy, config, asked, world, robot.first_seen, environment=environment, world_number=world_number
+    )
 
 
 def run_robot(
@@ -95,7 +101,7 @@ def run_robot(
         robot: observes and advances.
         task: what to do.
         policy: one of the library's, or a function of one's own (``planning.policies.PolicyFunction``).
-        key: drives the planner's search.
+        key: drives the search where it samples (``UctConfig``).
         config: settings; the sensor, the camera and ``revealed`` are the simulator's and matter not here.
         arrays: the task's arrays where they shall be padded; by default ``task.arrays``.
         estimator: what the policy asks, as in ``run_trial``.
@@ -106,22 +112,28 @@ def run_robot(
         out.
 
     Raises:
-        CheckpointError: the estimator knows other propositions than the task, or none is shipped for them.
+        PropositionsError: the robot's map, task, estimator and ``world`` are not over the same propositions.
+        EstimatorError: no estimator is shipped for the task's propositions.
         PotlpError: the policy is ``oracle`` and there is no ``world``.
     """
     policy = named_policy(policy)
-    # Nothing is asked of the robot's map but its shape: the loop observes for itself.
+    # Nothing is asked of the robot's map but its names and shape: the loop observes for itself.
+    belief = robot.observe()[0]
+    require_same_propositions(
+        task.propositions, belief.propositions, asker=f"the task {task.text!r}", knower="the robot's map"
+    )
     asked = rules.estimator_of(policy, task.propositions, estimator)
     # An estimator that remembers where it was needs to know how large the map is.
-    height, width = robot.observe()[0].cells.shape
+    height, width = belief.cells.shape
+    config = TrialConfig() if config is None else config
     loop = _Loop(
         robot,
         task,
         task.arrays if arrays is None else arrays,
         policy,
-        rules.first_estimator(policy, asked, (height, width), world),
+        rules.first_estimator(policy, asked, (height, width), config.panoramas, world),
         key,
-        TrialConfig() if config is None else config,
+        config,
     )
     return loop.run()
 
@@ -247,7 +259,7 @@ def make_trial(
     first_seen: Int32[np.ndarray, "H W"],
     *,
     environment: str,
-    seed: int | None,
+    world_number: int | None,
 ) -> Trial:
     """The record of a run whose true map is known.
 
@@ -257,7 +269,7 @@ def make_trial(
         world: the true map.
         first_seen: index into the path at which each cell was first observed, or ``NEVER_SEEN``.
         environment: where the world comes from.
-        seed: which world of it.
+        world_number: which world of it.
 
     Returns:
         The trial.
@@ -271,7 +283,7 @@ def make_trial(
         propositions=task.propositions,
         policy=policy_name(policy),
         environment=environment,
-        seed=seed,
+        world_number=world_number,
         config=dataclasses.asdict(config),
         versions=versions(estimator),
     )

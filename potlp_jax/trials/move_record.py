@@ -1,6 +1,8 @@
 """What a move leaves in the record: a ``Decision`` in plain host values."""
 
 import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import jax
 import numpy as np
@@ -15,14 +17,10 @@ from potlp_jax.trials.record import ActionRecord, Decision
 from potlp_jax.types import NO_ACTION
 from potlp_jax.world.moves import Cell, as_cell
 
-_KIND_NAMES = {
-    MoveKind.NONE: "none",
-    MoveKind.FINISH: "finish",
-    MoveKind.ACTION: "action",
-    MoveKind.FRONTIER: "frontier",
-    MoveKind.FALLBACK: "fallback",
-    MoveKind.OPTIMISTIC: "optimistic",
-}
+KIND_NAMES: Mapping[int, str] = MappingProxyType(
+    {value: name.lower() for name, value in vars(MoveKind).items() if name.isupper()}
+)
+"""What records call the kinds of moves: ``Decision.kind``."""
 
 _observation_numbers = jax.jit(observation_of_subgoals)
 
@@ -61,7 +59,7 @@ def decision_of(
         cell=cell,
         state=state,
         key=tuple(int(word) for word in jax.random.key_data(key)),
-        kind=_KIND_NAMES[kind],
+        kind=KIND_NAMES[kind],
         # The action that is carried out; ``preferred`` is the one that the search found.
         choice=_recorded_index(move, int(move.action)),
         target=as_cell(move.target_cell) if goes else None,

@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int32
 
-from potlp_jax.codec import finite_or_text
-from potlp_jax.errors import RecordError
-from potlp_jax.types import status_names
+from potlp_jax.codec import config_from_dict, finite_or_text
+from potlp_jax.errors import PotlpError, RecordError
+from potlp_jax.files import read_json, reading, short
+from potlp_jax.task.propositions import check_propositions, require_same_propositions
+from potlp_jax.types import status_names, status_of
 from potlp_jax.world.grid import (
     BeliefMap,
     World,
@@ -151,7 +153,7 @@ class Trial(RunRecord):
         world: the true map.
         task_text, task_hoa, propositions: the task, also as an automaton, so that it is read without Spot.
         policy: a name, or ``module:attribute`` of a function.
-        environment, seed: where the world comes from.
+        environment, world_number: where the world comes from; None where it has no number.
         config: the settings, as ``dataclasses.asdict`` makes them.
         versions: of what the figures depend on.
     """
@@ -163,7 +165,7 @@ class Trial(RunRecord):
     propositions: tuple[str, ...]
     policy: str
     environment: str
-    seed: int | None
+    world_number: int | None
     config: Mapping[str, Any]
     versions: Mapping[str, str]
 
@@ -182,7 +184,7 @@ class Trial(RunRecord):
             "policy": self.policy,
             "task": self.task_text,
             "environment": self.environment,
-            "world": self.seed,
+            "world": self.world_number,
             "status": list(status_names(self.status)),
         }
 
@@ -195,14 +197,16 @@ class Trial(RunRecord):
         }
         data["outcome"] = str(self.outcome)
         # Arrays are packed; everything else is readable JSON.
-        data["decisions"] = [dataclasses.asdict(decision) for decision in self.decisions]
+        data["decisions"] = [_decision_to_dict(decision) for decision in self.decisions]
+        data["status"] = list(status_names(self.status))
         data["first_seen"] = pack_array(self.first_seen)
         data["world"] = world_to_dict(self.world)
         return finite_or_text({"format": FORMAT, **data})
 
     def save(self, path: Path) -> None:
         """Write the record as JSON."""
-        path.write_text(json.dumps(self.to_dict(), allow_nan=False))
+        data = self.to_dict()
+        path.write_text(json.dumps({**data, "checksum": record_checksum(data)}, allow_nan=False))
 
 
 def belief_seen_by(world: World, first_seen: Int32[np.ndarray, "H W"], step: int) -> BeliefMap:
@@ -215,23 +219,42 @@ def belief_seen_by(world: World, first_seen: Int32[np.ndarray, "H W"], step: int
     letters = np.where(seen, np.asarray(world.letters), 0)
     # The extent is known from the start, whatever the padding: budget and dead ends are counted by it.
     height, width = (int(size) for size in world.extent)
-    return belief_from_numpy(cells, letters, float(world.resolution), (height, width))
+    return belief_from_numpy(cells, letters, float(world.resolution), (height, width), world.propositions)
+
+
+def record_checksum(data: Mapping[str, Any]) -> int:
+    """Of the values of a record, whatever the order of its entries and the spaces between them."""
+    said = {name: value for name, value in data.items() if name != "checksum"}
+    return zlib.crc32(json.dumps(said, sort_keys=True).encode())
 
 
 def load_trial(path: Path) -> Trial:
-    """Read a record written by ``Trial.save``. Raises RecordError where the file is not one."""
-    try:
-        data = json.loads(path.read_text())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise RecordError(f"{path}: cannot be read as a trial record: {error}") from error
+    """Read a record written by ``Trial.save``. Raises RecordError where the file is not one, or was changed."""
+    data = read_json(path, RecordError, "a trial record")
     # Another format is told apart from damage: the remedies differ.
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         found = data.get("format") if isinstance(data, dict) else type(data).__name__
-        raise RecordError(f"{path}: not a trial record of format {FORMAT!r} (found {found!r}); run `potlp run` again")
+        raise RecordError(
+            f"{path}: not a trial record of format {FORMAT!r} (found {short(found)}); run `potlp run` again"
+        )
+    # A flipped bit in a number is a number: only the checksum tells that another robot was somewhere else.
+    with reading(path, RecordError, "a trial record"):
+        checksum = record_checksum(data)
+    if data.get("checksum") != checksum:
+        raise RecordError(f"{path}: the trial record is damaged, or was changed by hand: its checksum differs")
     try:
-        return _trial_from_dict(data)
-    except (KeyError, TypeError, ValueError, zlib.error) as error:
-        raise RecordError(f"{path}: the trial record is damaged: {error!r}") from error
+        with reading(path, RecordError, "a trial record"):
+            return _trial_from_dict(data)
+    except RecordError:
+        raise
+    # What is wrong with a world, a task or its propositions says so, but not in which file.
+    except PotlpError as error:
+        raise RecordError(f"{path}: the trial record is damaged: {error}") from error
+
+
+def _decision_to_dict(decision: Decision) -> dict[str, Any]:
+    # Names, as everywhere that people read; a number would have to be looked up in the program.
+    return {**dataclasses.asdict(decision), "status": list(status_names(decision.status))}
 
 
 def _trial_from_dict(data: Mapping[str, Any]) -> Trial:
@@ -241,20 +264,47 @@ def _trial_from_dict(data: Mapping[str, Any]) -> Trial:
     values["path"] = _cells(data["path"])
     values["word"] = tuple(data["word"])
     values["states"] = tuple(data["states"])
-    values["propositions"] = tuple(data["propositions"])
-    values["decisions"] = tuple(_decision_from_dict(decision) for decision in data["decisions"])
+    values["status"] = status_of(data["status"])
+    values["propositions"] = check_propositions(data["propositions"])
+    values["decisions"] = tuple(
+        _decision_from_dict(decision, f"decision {index}") for index, decision in enumerate(data["decisions"])
+    )
     values["first_seen"] = unpack_array(data["first_seen"])
     # Lists become tuples throughout: records are compared, and used as keys.
     values["world"] = world_from_dict(data["world"])
-    return Trial(**values)
+    require_same_propositions(values["propositions"], values["world"].propositions, remedy="run the trial again")
+    trial = Trial(**values)
+    _check(trial)
+    return trial
 
 
-def _decision_from_dict(data: Mapping[str, Any]) -> Decision:
+def _check(trial: Trial) -> None:
+    """Refuse values that no trial has, and that would fail later, in a picture or a page. Raises ValueError."""
+    for name in ("task_text", "task_hoa", "policy", "environment"):
+        if not isinstance(getattr(trial, name), str):
+            raise ValueError(f"{name} is no text")
+    if not (isinstance(trial.config, Mapping) and isinstance(trial.versions, Mapping)):
+        raise ValueError("config and versions are no mappings")
+    if not all(type(number) is int and number >= 0 for number in (*trial.word, *trial.states)):
+        raise ValueError("word and states are no numbers from 0")
+    if not len(trial.path) == len(trial.word) == len(trial.states) > 0:
+        raise ValueError("path, word and states have other lengths than each other, or none")
+    height, width = trial.world.shape
+    if not all(0 <= row < height and 0 <= column < width for row, column in trial.path):
+        raise ValueError("the path leaves the map")
+    if trial.first_seen.shape != trial.world.shape or trial.first_seen.dtype != np.int32:
+        raise ValueError("first_seen is not of the map's shape")
+    if not all(0 <= decision.step < len(trial.path) for decision in trial.decisions):
+        raise ValueError("a decision is not on the path")
+
+
+def _decision_from_dict(data: Mapping[str, Any], where: str) -> Decision:
     values = dict(data)
     values["cell"] = tuple(data["cell"])
     values["target"] = None if data["target"] is None else tuple(data["target"])
     values["key"] = tuple(data["key"])
     values["value"] = float(data["value"])
+    values["status"] = status_of(data["status"])
     values["subgoals"] = _cells(data["subgoals"])
     values["path"] = _cells(data["path"])
     values["observations"] = tuple(data["observations"])
@@ -264,7 +314,9 @@ def _decision_from_dict(data: Mapping[str, Any]) -> Decision:
     for name in ("choice", "preferred"):
         if values[name] is not None and values[name] not in listed:
             raise ValueError(f"decision {values['index']}: {name} {values[name]} is none of its actions")
-    return Decision(**values)
+    # By the types that the classes state, at every depth.
+    values["actions"] = [dataclasses.asdict(action) for action in values["actions"]]
+    return config_from_dict(Decision, values, where)
 
 
 def _action_from_dict(data: Mapping[str, Any]) -> ActionRecord:

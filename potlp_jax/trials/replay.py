@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Int32, UInt8
 
 from potlp_jax.codec import config_from_dict
-from potlp_jax.errors import CheckpointError, RecordError
+from potlp_jax.errors import EstimatorError, RecordError
 from potlp_jax.learning.estimator import TrainedEstimator, identity_of, observe_panorama
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.estimates import Estimator, ask
@@ -43,7 +43,7 @@ def replay_decision(
 
     Raises:
         RecordError: the trial has no such decision, or its policy does not search.
-        CheckpointError: the estimator is not the trial's.
+        EstimatorError: the estimator is not the trial's.
     """
     if not 0 <= index < len(trial.decisions):
         raise RecordError(f"the trial has decisions 0 to {len(trial.decisions) - 1}; there is no decision {index}")
@@ -78,14 +78,14 @@ def _replayed_estimator(
     assert given is not None, "potlp asks an estimator"
     # Another estimator would answer otherwise, and the replay would explain a decision that was never taken.
     if trial.versions.get("estimator") != identity_of(given):
-        raise CheckpointError(
+        raise EstimatorError(
             f"the trial was made with the estimator {trial.versions.get('estimator')}, not {identity_of(given)}: "
             "give that one"
         )
     if not isinstance(given, TrainedEstimator):
         # A function of the belief alone: it has seen nothing that would have to be seen again.
         return given
-    asked = given.start(*trial.world.shape)
+    asked = given.start(*trial.world.shape, config.panoramas)
     # The decision's own panorama included: it is taken before the decision.
     for decision in trial.decisions[: index + 1]:
         cell = jnp.asarray(decision.cell, jnp.int32)

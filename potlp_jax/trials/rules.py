@@ -21,6 +21,7 @@ from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.move import Move, MoveKind
 from potlp_jax.planning.policies import Policy, PolicyFunction
+from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import Outcome
@@ -91,7 +92,8 @@ def estimator_of(
         The estimator, or None where the policy asks none.
 
     Raises:
-        CheckpointError: a trained estimator knows other propositions, or none is shipped for these.
+        EstimatorError: none is shipped for these propositions.
+        PropositionsError: a trained estimator knows other ones.
     """
     # The shipped one is read late, so that policies which ask nothing need none.
     asked = asked_of(policy, given)
@@ -114,6 +116,7 @@ def first_estimator(
     policy: Policy | PolicyFunction,
     asked: TrainedEstimator | Estimator | None,
     shape: tuple[int, int],
+    panoramas: int,
     world: World | None,
 ) -> Estimator | None:
     """What is called in the first decision of a trial, nothing seen yet.
@@ -122,6 +125,7 @@ def first_estimator(
         policy: of the trial.
         asked: from ``estimator_of``.
         shape: rows and columns of the map.
+        panoramas: how many are remembered (``TrialConfig.panoramas``).
         world: the true map, which ``oracle`` asks; None where nobody knows it.
 
     Returns:
@@ -135,7 +139,7 @@ def first_estimator(
         if world is None:
             raise PotlpError("policy oracle asks the true map: give it as world, or choose another policy")
         return TrueMapEstimator(world=world)
-    return asked.start(*shape) if isinstance(asked, TrainedEstimator) else asked
+    return asked.start(*shape, panoramas) if isinstance(asked, TrainedEstimator) else asked
 
 
 # When a robot that follows a path hands back control.
@@ -286,7 +290,13 @@ class Tally:
 
 
 def first_tally(belief: BeliefMap, cell: Int32[Array, "2"], task: TaskArrays) -> Tally:
-    """Of a trial that has not begun: the letter of the robot's first cell is read."""
+    """Of a trial that has not begun: the letter of the robot's first cell is read.
+
+    Raises:
+        PropositionsError: belief and task are not over the same propositions.
+    """
+    # The first letter that a table of the task is asked about, in a batch and in an environment for learning too.
+    require_same_propositions(task.propositions, belief.propositions, knower="the map")
     # The word begins with the letter of the first cell: a start may satisfy or violate the task.
     height, width = belief.cells.shape
     letter = belief.letters[cell[0], cell[1]]

@@ -45,7 +45,8 @@ def run(
         PluginError: there is no such environment, policy or estimator.
         TaskError: there is no such task.
         WorldError: there is no such world.
-        CheckpointError: no estimator is shipped for the task, or the one given is for other propositions.
+        EstimatorError: no estimator is shipped for the task.
+        PropositionsError: the task, or the estimator, is over other propositions than the environment.
     """
     generator = make(environment) if isinstance(environment, str) else environment
     chosen = Split(default_split(generator.name) if split is None else split)
@@ -56,7 +57,7 @@ def run(
         trial_key(world, seed),
         config,
         environment=f"{environment if isinstance(environment, str) else generator.name}/{chosen}",
-        seed=world,
+        world_number=world,
         estimator=named_estimator(estimator) if isinstance(estimator, str) else estimator,
     )
 

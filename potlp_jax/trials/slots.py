@@ -255,6 +255,7 @@ def _consider(
             return ask(estimator, progress.belief, subgoals, scene.task, progress.tally.state)
 
         estimates = _phase(running, estimate, dataclasses.replace(progress, views=views), situation.subgoals, scene)
+        situation = situation.with_status_of(estimates)
     # As in the loop: by the number of the decision.
     return views, situation, estimates, decision_key(scene.planning, progress.tally.decisions)
 

@@ -1,5 +1,8 @@
 """Check a finished trial against the truth, independently of the planner: also that of a planner of one's own.
 
+The truth is a world that the caller makes anew, from its environment, split and number: a record that was made in
+another one, or whose copy of the world was changed, is found by that.
+
 The word is judged by ``potlp_jax.verify.semantics``, an evaluator of the formula's semantics; moves, letters, cost and
 what was observed when are checked against the world by rules of this file alone. Nothing of how the library plans,
 moves or simulates is used: a mistake made there is not made here again.
@@ -9,6 +12,7 @@ import math
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int32
@@ -17,6 +21,7 @@ from potlp_jax.task.task import Task
 from potlp_jax.trials.record import NEVER_SEEN, Outcome, Trial
 from potlp_jax.verify.semantics import word_satisfies, word_violates
 from potlp_jax.world.grid import World
+from potlp_jax.world.settings import Settings
 
 Cell = tuple[int, int]
 Node = tuple[Cell, int]
@@ -29,18 +34,35 @@ Cells = list[list[bool]]
 _TOLERANCE = 1e-9
 
 
-def problems_of(trial: Trial, task: Task) -> list[str]:
+def problems_of(trial: Trial, task: Task, world: World) -> list[str]:
     """What is wrong with a trial in simulation; an empty list if nothing is.
 
-    Checks the path, the cost and the outcome as ``problems_of_path`` does, that the recorded word is the path's, that
-    no cell was entered before it had been observed, and that the trial ended satisfied where docs/model.md section 7
-    promises it.
+    Checks the path, the cost and the outcome as ``problems_of_path`` does, that the record is of this world and this
+    task, that its word, its states and its decisions are those of the path, that no cell was entered before it had
+    been observed, and that the trial ended satisfied where docs/model.md section 7 promises it.
+
+    Args:
+        trial: the record to be judged.
+        task: what was to be done.
+        world: the true map, made anew from its environment, split and number. The record's own copy is judged as the
+            rest of it is: a trial in another world is a problem.
+
+    Returns:
+        One sentence for each problem. One about a violation of the task begins with ``violates``.
     """
-    word = _word_of(trial.world, trial.path)
-    found = problems_of_path(trial.world, trial.path, trial.cost, trial.outcome, task.text, task.propositions)
+    found = _world_differences(trial.world, world) + _task_differences(trial, task)
+    found += problems_of_path(world, trial.path, trial.cost, trial.outcome, task.text)
+    # What follows looks cells up in the map and letters in the automaton, and needs both to be the trial's.
+    if found or trial.first_seen.shape != world.shape:
+        return found or ["the table of first observations has another shape than the map"]
+    word = _word_of(world, trial.path)
     if list(trial.word) != word:
         found.append("the word is not that of the path")
-    found += _entered_before_observed(trial)
+    if list(trial.states) != _states_of(task, word):
+        found.append("the states are not those of the word")
+    elif any(task.dfa.accepting[state] for state in trial.states[:-1]):
+        found.append("goes on after the task was satisfied")
+    found += _decision_differences(trial) + _entered_before_observed(trial)
     # Ends that are nobody's fault - the task cannot be done here, or a branch was a mistake that could not be known -
     # are no problem. Where nothing can go wrong, not ending satisfied is a fault of the planner.
     if trial.outcome is not Outcome.SATISFIED and satisfaction_is_promised(trial, task):
@@ -54,22 +76,28 @@ def problems_of_path(
     cost: float,
     outcome: str,
     formula: str,
-    propositions: Sequence[str],
 ) -> list[str]:
     """What is wrong with a path that some planner took; an empty list if nothing is.
 
     Args:
-        world: the true map.
+        world: the true map. Its ``propositions`` say what the bits of its letters mean.
         path: cells entered in order, the start first.
         cost: what the planner says that the path costs, in the unit of the world's resolution.
         outcome: how the planner says that the trial ended; ``"satisfied"`` is the value that matters.
-        formula: the task, co-safe linear temporal logic.
-        propositions: names of the bits of the world's letters.
+        formula: the task, co-safe linear temporal logic over the world's propositions.
 
     Returns:
         One sentence for each problem. One about a violation of the task begins with ``violates``.
     """
-    cells = [(int(row), int(column)) for row, column in np.asarray(path)]
+    cells = [(int(row), int(column)) for row, column in path]
+    start = (int(world.start[0]), int(world.start[1]))
+    height, width = world.shape
+    # A path of another world is told by where it begins, long before a wall of this one is in its way.
+    if not cells or cells[0] != start:
+        return [f"begins in {cells[0] if cells else 'no cell'}, the start of the world is {start}"]
+    outside = [cell for cell in cells if not (0 <= cell[0] < height and 0 <= cell[1] < width)]
+    if outside:
+        return [f"enters {outside[0]}, outside of the {height}x{width} map"]
     found = []
     true_cost = path_cost(world, cells)
     if true_cost is None:
@@ -77,12 +105,77 @@ def problems_of_path(
     elif not math.isclose(true_cost, cost, rel_tol=_TOLERANCE, abs_tol=_TOLERANCE):
         found.append(f"the cost is said to be {cost}, the moves cost {true_cost}")
     word = _word_of(world, cells)
-    if word_satisfies(formula, propositions, word) != (outcome == Outcome.SATISFIED):
+    if word_satisfies(formula, world.propositions, word) != (outcome == Outcome.SATISFIED):
         found.append(f"outcome {outcome} is not what the word says")
     # A start that violates is nobody's move.
-    if len(word) > 1 and word_violates(formula, propositions, word):
+    if len(word) > 1 and word_violates(formula, world.propositions, word):
         found.append("violates the formula")
     return found
+
+
+def _world_differences(claimed: World, world: World) -> list[str]:
+    """What differs between the world that a record holds and the true one, in words."""
+    # Everything that a trial depends on: also what a camera sees, and the settings that the world calls for.
+    pairs = {
+        name: (getattr(claimed, name), getattr(world, name))
+        for name in ("occupied", "letters", "start", "resolution", "extent", "propositions", "settings")
+    }
+    pairs |= {name: (value, vars(world.appearance)[name]) for name, value in vars(claimed.appearance).items()}
+    differing = [name for name, (mine, true) in pairs.items() if not _is_same(mine, true)]
+    return [f"was in another world: {', '.join(differing)} differ"] if differing else []
+
+
+def _is_same(mine: Any, true: Any) -> bool:
+    if isinstance(true, tuple | Settings):
+        return mine == true
+    return np.array_equal(np.asarray(mine), np.asarray(true))
+
+
+def _task_differences(trial: Trial, task: Task) -> list[str]:
+    """What differs between the task that a record holds and the one that was to be done."""
+    found = []
+    if trial.task_text != task.text:
+        found.append(f"was for the task {trial.task_text!r}, not for {task.text!r}")
+    # Names and order: the same formula over other bits is another task.
+    if trial.propositions != task.propositions or trial.propositions != trial.world.propositions:
+        found.append(
+            f"was for a task over {trial.propositions} in a world over {trial.world.propositions}, not over "
+            f"{task.propositions}"
+        )
+        return found
+    claimed, true = Task.from_hoa(trial.task_hoa, trial.propositions).dfa, task.dfa
+    # Both are minimal with their states in one canonical order: equal languages have equal tables.
+    tables = ((claimed.transitions, true.transitions), (claimed.accepting, true.accepting))
+    if claimed.initial != true.initial or not all(np.array_equal(mine, other) for mine, other in tables):
+        found.append("its automaton is not that of the task")
+    return found
+
+
+def _states_of(task: Task, word: Sequence[int]) -> list[int]:
+    """The automaton's state after each letter of a word."""
+    states, state = [], int(task.dfa.initial)
+    for letter in word:
+        state = int(task.dfa.transitions[state, letter])
+        states.append(state)
+    return states
+
+
+def _decision_differences(trial: Trial) -> list[str]:
+    """The first decision that was not taken on the path, or after which the robot went elsewhere."""
+    # Each leg of the path is the beginning of what its decision handed out: no cell of it can be exchanged for another.
+    steps, last = [decision.step for decision in trial.decisions], len(trial.path) - 1
+    # From the start, in order, none after the end; without any decision there is no move.
+    if [*steps, last] != sorted([*steps, last]) or (steps[0] if steps else last) != 0:
+        return ["the decisions do not cover the path"]
+    for number, (decision, end) in enumerate(zip(trial.decisions, [*steps[1:], last], strict=False)):
+        if decision.index != number:
+            return [f"decision {number} has the number {decision.index}"]
+        if decision.cell != trial.path[decision.step] or decision.state != trial.states[decision.step]:
+            return [f"decision {number} was not taken where the path is at step {decision.step}"]
+        leg = trial.path[decision.step : end + 1]
+        if leg != decision.path[: len(leg)]:
+            return [f"after decision {number} the path is not the one that was chosen"]
+    return []
 
 
 def path_cost(world: World, path: Sequence[Cell]) -> float | None:

@@ -144,7 +144,7 @@ def _world_in_words(trial: Trial) -> str:
     # Environments made from files are named KIND:PATH,SETTINGS/SPLIT. The heading has no room for folders and settings;
     # the record has them.
     environment = re.sub(r"^(map|floorplan|parcels):(?:[^,]*/)?([^/,]+)/?(,.*)?(/\w+)$", r"\1:\2\4", trial.environment)
-    return environment if trial.seed is None else f"{environment}, world {trial.seed}"
+    return environment if trial.world_number is None else f"{environment}, world {trial.world_number}"
 
 
 def _draw_walk(axes: Axes, trial: Trial, *, inches_per_cell: float) -> None:

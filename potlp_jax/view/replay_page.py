@@ -106,7 +106,7 @@ def replay_data(trial: Trial, panoramas: Mapping[int, UInt8[np.ndarray, "rows co
 
 
 def _facts(trial: Trial) -> str:
-    world = "" if trial.seed is None else f", world {trial.seed}"
+    world = "" if trial.world_number is None else f", world {trial.world_number}"
     return (
         f"{trial.environment or 'no named environment'}{world}; policy {trial.policy}: {trial.outcome} at cost "
         f"{trial.cost:.1f} after {len(trial.path) - 1} steps and {len(trial.decisions)} decisions"

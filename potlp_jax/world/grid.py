@@ -1,8 +1,9 @@
 """The grid: what is there (``World``) and what has been seen of it (``BeliefMap``).
 
 Cells are ``(row, column)`` with row 0 at the top. A letter is an integer whose bit ``i`` says that proposition ``i``
-of the environment family is true in the cell; labelled cells are free cells (a fire can be seen through and driven
-into, it merely has a letter).
+is true in the cell; labelled cells are free cells (a fire can be seen through and driven into, it merely has a
+letter). Worlds and beliefs carry the names of these bits, in order, so that a task over other ones is refused
+(``task.propositions``).
 
 Fields are annotated with ``*batch`` in front of their dimensions: a stack of worlds, or what vmap returns, has the same
 class. Functions take one world unless they say otherwise.
@@ -10,8 +11,11 @@ class. Functions take one world unless they say otherwise.
 
 import base64
 import dataclasses
+import hashlib
+import json
+import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -20,10 +24,11 @@ from flax import struct
 from jaxtyping import Array, Bool, Float32, Int, Int8, Int32, Num, Shaped, UInt8
 
 from potlp_jax.errors import WorldError
+from potlp_jax.files import one_line
+from potlp_jax.task.propositions import check_propositions, in_order
+from potlp_jax.task.reading import read_task
+from potlp_jax.task.task import Task
 from potlp_jax.world.settings import NO_SETTINGS, Settings
-
-MAX_LETTER: int = 2**16 - 1
-"""Largest letter: sixteen propositions."""
 
 # What environments without colours of their own look like.
 _FLOOR_COLOUR = (150, 150, 150)
@@ -91,7 +96,7 @@ class World:
         resolution: the length of a cell's side in the unit of cost (1: costs are in cells).
         extent: rows and columns of the map without padding; budgets and dead-end costs refer to it.
         appearance: what a camera sees.
-        propositions: bit ``i`` of a letter is ``propositions[i]``; None where nobody said. Static under jit.
+        propositions: bit ``i`` of a letter is ``propositions[i]``. Static under jit.
         settings: what trials in this world need to be different from the defaults. Static under jit.
     """
 
@@ -101,7 +106,7 @@ class World:
     resolution: Float32[Array, "*batch"]
     extent: Int32[Array, "*batch 2"]
     appearance: Appearance
-    propositions: tuple[str, ...] | None = struct.field(pytree_node=False, default=None)
+    propositions: tuple[str, ...] = struct.field(pytree_node=False)
     settings: Settings = struct.field(pytree_node=False, default=NO_SETTINGS)
 
     @property
@@ -109,6 +114,14 @@ class World:
         """Rows and columns."""
         height, width = self.occupied.shape[-2:]
         return height, width
+
+    def task(self, text: str) -> Task:
+        """A task over the world's propositions: a formula, the name of a shipped task, or a ``.hoa`` file.
+
+        Raises:
+            TaskError: it is none, or it names a proposition that the world does not have.
+        """
+        return read_task(text, self.propositions)
 
 
 @struct.dataclass(kw_only=True)
@@ -120,6 +133,7 @@ class BeliefMap:
         letters: the letter of each cell, 0 where it is not observed.
         resolution: the length of a cell's side in the unit of cost.
         extent: rows and columns of the map without padding.
+        propositions: bit ``i`` of a letter is ``propositions[i]``. Static under jit.
     """
 
     UNKNOWN: ClassVar[int] = -1
@@ -130,6 +144,7 @@ class BeliefMap:
     letters: Int32[Array, "*batch H W"]
     resolution: Float32[Array, "*batch"]
     extent: Int32[Array, "*batch 2"]
+    propositions: tuple[str, ...] = struct.field(pytree_node=False)
 
     @property
     def free(self) -> Bool[Array, "*batch H W"]:
@@ -154,13 +169,20 @@ class BeliefMap:
             letters=jnp.zeros(world.letters.shape, jnp.int32),
             resolution=world.resolution,
             extent=world.extent,
+            propositions=world.propositions,
         )
 
     @classmethod
     def revealed(cls, world: World) -> "BeliefMap":
         """Everything seen."""
         cells = jnp.where(world.occupied, jnp.int8(BeliefMap.OCCUPIED), jnp.int8(BeliefMap.FREE))
-        return cls(cells=cells, letters=world.letters, resolution=world.resolution, extent=world.extent)
+        return cls(
+            cells=cells,
+            letters=world.letters,
+            resolution=world.resolution,
+            extent=world.extent,
+            propositions=world.propositions,
+        )
 
 
 def make_world(
@@ -169,6 +191,7 @@ def make_world(
     start: tuple[int, int],
     resolution: float = 1.0,
     appearance: Appearance | None = None,
+    propositions: Sequence[str] = (),
 ) -> World:
     """Check the arrays and close the border.
 
@@ -177,19 +200,23 @@ def make_world(
 
     Args:
         occupied: True on obstacles.
-        letters: bit ``i`` says that proposition ``i`` holds in the cell; any integer type.
+        letters: bit ``i`` says that ``propositions[i]`` holds in the cell; any integer type.
         start: row and column of the robot's first cell.
         resolution: length of a cell's side in the unit of cost.
         appearance: what a camera sees; default: plain.
+        propositions: names of the bits of a letter, in order; by default there are none, and no letters.
 
     Returns:
         A world with a closed border.
 
     Raises:
-        WorldError: where the shapes disagree, a letter is out of range, the start is outside or on an obstacle, or the
-            resolution is not a positive number.
+        WorldError: where the shapes disagree, a letter has a bit without a name, the start is outside or on an
+            obstacle, or the resolution is not a positive number.
+        TaskError: where the propositions are no distinct names, or too many.
     """
+    names = check_propositions(propositions)
     _check(occupied, letters, start, resolution, appearance)
+    _check_letters(letters, names)
     row, column = (int(entry) for entry in start)
     height, width = occupied.shape
     appearance = Appearance.plain(height, width) if appearance is None else appearance
@@ -208,6 +235,7 @@ def make_world(
         resolution=jnp.asarray(np.float32(resolution)),
         extent=jnp.asarray(np.array(occupied.shape, np.int32)),
         appearance=appearance,
+        propositions=names,
     )
 
 
@@ -244,6 +272,7 @@ def belief_from_numpy(
     letters: Int[np.ndarray, "H W"],
     resolution: float = 1.0,
     extent: tuple[int, int] | None = None,
+    propositions: Sequence[str] = (),
 ) -> BeliefMap:
     """A belief from host arrays.
 
@@ -252,23 +281,30 @@ def belief_from_numpy(
         letters: the letter of each cell in any integer type, 0 where it is not observed.
         resolution: length of a cell's side in the unit of cost.
         extent: rows and columns without padding; default: those of the arrays.
+        propositions: names of the bits of a letter, in order. A task of other ones is refused, so that a robot names
+            all that it could meet, whether it has seen it or not.
 
     Returns:
         The belief as the planner takes it.
 
     Raises:
-        WorldError: where an entry of ``cells`` is none of the three, or an unobserved cell has a letter.
+        WorldError: where an entry of ``cells`` is none of the three, an unobserved cell has a letter, or a letter has
+            a bit without a name.
+        TaskError: where the propositions are no distinct names, or too many.
     """
+    names = check_propositions(propositions)
     if not np.isin(cells, (BeliefMap.UNKNOWN, BeliefMap.FREE, BeliefMap.OCCUPIED)).all():
         raise WorldError(f"a belief's cells must be -1, 0 or 1, found {np.unique(cells).tolist()[:8]}")
     # Goals of which the robot is told beforehand would be letters of unobserved cells; the model has none.
     if np.any((cells == BeliefMap.UNKNOWN) & (letters != 0)):
         raise WorldError("a belief has letters in cells that were not observed; set them to 0")
+    _check_letters(letters, names)
     return BeliefMap(
         cells=jnp.asarray(cells.astype(np.int8)),
         letters=jnp.asarray(letters.astype(np.int32)),
         resolution=jnp.asarray(np.float32(resolution)),
         extent=jnp.asarray(np.array(cells.shape if extent is None else extent, np.int32)),
+        propositions=names,
     )
 
 
@@ -281,10 +317,24 @@ def world_to_dict(world: World) -> dict[str, Any]:
         "start": np.asarray(world.start).tolist(),
         "resolution": float(world.resolution),
         "extent": np.asarray(world.extent).tolist(),
-        "propositions": None if world.propositions is None else list(world.propositions),
+        "propositions": list(world.propositions),
         "settings": world.settings.to_dict(),
         "appearance": {name: pack_array(np.asarray(getattr(appearance, name))) for name in _APPEARANCE_FIELDS},
     }
+
+
+def world_digest(world: World) -> str:
+    """Sixteen hexadecimal digits that differ for worlds in which anything differs: 64 bits of a SHA-256."""
+    digest = hashlib.sha256()
+    # Names, types and shapes as well as bytes, so that no two fields can be taken for one.
+    arrays = {name: getattr(world, name) for name in ("occupied", "letters", "start", "resolution", "extent")}
+    arrays |= {name: getattr(world.appearance, name) for name in _APPEARANCE_FIELDS}
+    for name, values in arrays.items():
+        array = np.ascontiguousarray(values)
+        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        digest.update(array.tobytes())
+    digest.update(json.dumps([world.propositions, world.settings.to_dict()], sort_keys=True).encode())
+    return digest.hexdigest()[:16]
 
 
 def world_from_dict(data: Mapping[str, Any]) -> World:
@@ -294,24 +344,27 @@ def world_from_dict(data: Mapping[str, Any]) -> World:
         appearance = {name: jnp.asarray(unpack_array(values)) for name, values in data["appearance"].items()}
         row, column = (int(entry) for entry in data["start"])
         rows, columns = (int(size) for size in data["extent"])
-        propositions = None if data["propositions"] is None else tuple(data["propositions"])
-        settings = Settings(data["settings"])
+        settings, propositions = Settings(data["settings"]), data["propositions"]
+        # A mapping has keys where a list has names, and a text has letters.
+        if not isinstance(propositions, list):
+            raise TypeError(f"propositions is a list of names, found {propositions!r}")
         world = make_world(
             unpack_array(data["occupied"]),
             unpack_array(data["letters"]),
             (row, column),
             float(data["resolution"]),
             Appearance(**appearance),
+            propositions,
         )
     except WorldError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError, zlib.error) as error:
-        raise WorldError(f"not the values of a world: {error!r}") from error
+        raise WorldError(f"not the values of a world: {one_line(repr(error))}") from error
     if not (0 < rows <= world.shape[0] and 0 < columns <= world.shape[1]):
         raise WorldError(f"the extent {rows}x{columns} does not fit the {world.shape[0]}x{world.shape[1]} grid")
     # The border was closed when the world was made, so ``make_world`` has added no ring; padding is told by the extent.
     extent = jnp.asarray(np.array([rows, columns], np.int32))
-    return dataclasses.replace(world, extent=extent, propositions=propositions, settings=settings)
+    return dataclasses.replace(world, extent=extent, settings=settings)
 
 
 def pack_array(array: Shaped[np.ndarray, "..."]) -> dict[str, Any]:
@@ -325,8 +378,15 @@ def pack_array(array: Shaped[np.ndarray, "..."]) -> dict[str, Any]:
 def unpack_array(data: Mapping[str, Any]) -> Shaped[np.ndarray, "..."]:
     """The array that ``pack_array`` wrote."""
     # A copy, because an array over ``bytes`` cannot be written to.
-    raw = zlib.decompress(base64.b64decode(data["zlib"]))
-    return np.frombuffer(raw, dtype=np.dtype(data["dtype"])).reshape(data["shape"]).copy()
+    dtype, shape = np.dtype(data["dtype"]), tuple(int(size) for size in data["shape"])
+    # No more is unpacked than the shape says, and one byte: a kilobyte can unpack to a gigabyte.
+    size = dtype.itemsize * math.prod(shape)
+    unpacker = zlib.decompressobj()
+    raw = unpacker.decompress(base64.b64decode(data["zlib"]), size + 1)
+    # Only at its end is the stream's checksum compared.
+    if not unpacker.eof or len(raw) != size:
+        raise ValueError(f"an array of shape {shape} and type {dtype} has other than {size} bytes")
+    return np.frombuffer(raw, dtype=dtype).reshape(shape).copy()
 
 
 def _check(
@@ -342,8 +402,6 @@ def _check(
         raise WorldError(f"occupied must be boolean, letters integers; found {occupied.dtype} and {letters.dtype}")
     if letters.shape != occupied.shape or occupied.ndim != 2 or occupied.size == 0:
         raise WorldError(f"occupied {occupied.shape} and letters {letters.shape} must have one shape [H, W], not empty")
-    if letters.min() < 0 or letters.max() > MAX_LETTER:
-        raise WorldError(f"letters must lie in 0..{MAX_LETTER}, found {letters.min()}..{letters.max()}")
     row, column = start
     height, width = occupied.shape
     if not (0 <= row < height and 0 <= column < width):
@@ -354,6 +412,16 @@ def _check(
         raise WorldError(f"the resolution must be a positive number, found {resolution}")
     if appearance is not None:
         _check_appearance(appearance, occupied.shape)
+
+
+def _check_letters(letters: np.ndarray, propositions: tuple[str, ...]) -> None:
+    """Raises WorldError where a letter has a bit that no proposition names."""
+    # A table that is indexed with such a letter answers for another one: JAX clips indices and says nothing.
+    if letters.size and (letters.min() < 0 or letters.max() >= 2 ** len(propositions)):
+        raise WorldError(
+            f"letters of {in_order(propositions)} must lie in 0..{2 ** len(propositions) - 1}, found "
+            f"{letters.min()}..{letters.max()}; name every bit, propositions=(...)"
+        )
 
 
 def _check_appearance(appearance: Appearance, shape: tuple[int, ...]) -> None:

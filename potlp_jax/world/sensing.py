@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, Int32, UInt8
 
+from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.moves import dilate
 
@@ -88,7 +89,13 @@ def observe(belief: BeliefMap, world: World, cell: Int32[Array, "2"], config: Se
 
     Returns:
         The belief after the observation; what was observed before stays.
+
+    Raises:
+        PropositionsError: belief and world do not name the same propositions.
     """
+    require_same_propositions(
+        belief.propositions, world.propositions, asker="the belief", remedy="begin with BeliefMap.unobserved(world)"
+    )
     seen = visible(world.occupied, cell, config)
     truth = jnp.where(world.occupied, jnp.int8(BeliefMap.OCCUPIED), jnp.int8(BeliefMap.FREE))
     return dataclasses.replace(

@@ -1,4 +1,4 @@
-"""Slow and obvious planning: Eq. 3 as a literal recursion over histories, and PO-UCT with dictionaries.
+"""Slow and obvious planning: Eq. 3 as a literal recursion over histories, and searches that sample, with dictionaries.
 
 Everything here is derived from the text of the model (sections 3 to 5) with lists, sets and dictionaries; nothing of
 the library is used but the arrays that describe a problem. A history is a list of ``(action, outcome)``; whatever is
@@ -186,8 +186,8 @@ class Recursion:
         return min((self.q(history, a) for a in self.problem.actions(history)), default=self.problem.dead_end_cost)
 
 
-def dictionary_pouct(problem, simulations, exploration, seed=0):
-    """PO-UCT as published, but for expected backups: {action: Q} and {action: visits} at the root.
+def sampled_search(problem, simulations, exploration, seed=0):
+    """UCT on histories, but with expected instead of mean costs: {action: Q} and {action: visits} at the root.
 
     Nodes are dictionaries keyed by the history; a new action is valued by a rollout's cost, each action first of all
     tried once.
@@ -231,7 +231,7 @@ def dictionary_pouct(problem, simulations, exploration, seed=0):
 
 
 def literal_pouct(problem, simulations, exploration, uniform):
-    """PO-UCT as in the authors' code: visits and mean cost of each action at the root.
+    """PO-UCT, literally as in the paper and its authors' code: visits and mean cost of each action at the root.
 
     Every new history ends a simulation and is worth nothing beyond the cost so far. ``uniform(simulation, level)`` are
     the random numbers.

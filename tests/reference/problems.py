@@ -90,7 +90,10 @@ def padded_problem(task, fields, sizes, subgoals):
         padded[name] = np.full((subgoals, sizes.classes), fill)
         padded[name][:real, :classes] = fields[name]
     padded["subgoal_mask"] = np.arange(subgoals) < real
-    return PlanningProblem.from_arrays(task.padded(sizes), **padded)
+    # A search reads no letters. Names of propositions are static, so with the same ones for all formulas their problems
+    # can be stacked, and share a compilation.
+    arrays = task.padded(sizes).replace(propositions=tuple(f"p{i}" for i in range(sizes.propositions)))
+    return PlanningProblem.from_arrays(arrays, **padded)
 
 
 def plan_many(problems, keys, config):

@@ -54,7 +54,7 @@ def write_tour(folder):
     seen = first_seen_along(WORLD, tour())
     for kind in FORMATS:
         write_drive(folder / name_of(kind), kind, WORLD, tour(), seen, panorama_of, CAMERA, height=180)
-    (folder / "labels.yaml").write_text(labels_text(WORLD, TOY.propositions))
+    (folder / "labels.yaml").write_text(labels_text(WORLD))
     return folder
 
 

@@ -3,7 +3,11 @@
 import importlib.util
 from collections.abc import Iterable
 
-NEEDS: dict[str, list[str]] = {"numba": ["numba"], "pomdp-py": ["numba", "pomdp_py"], "mctx": ["mctx"]}
+NEEDS: dict[str, list[str]] = {
+    "po-uct-numba": ["numba"],
+    "po-uct-pomdp-py": ["numba", "pomdp_py"],
+    "mctx": ["mctx"],
+}
 """Modules that an opponent needs beyond the library's own dependencies; the extra 'bench' brings them."""
 
 

@@ -1,6 +1,6 @@
-"""pomdp-py's POUCT (Cython) on our planning problems.
+"""pomdp-py's PO-UCT (its class ``POUCT``, in Cython) on our planning problems.
 
-The model is the belief MDP of the paper's rollouts: a state is a history (what is settled, where the robot is), the
+The model is the belief MDP of the paper's rollouts: a state is a history (what is known, where the robot is), the
 observation says whether an action succeeded, and the outcome is drawn with P_S from the planner's own generator. That
 is equivalent to drawing all conditions of a world beforehand and looking them up, and cheaper. Histories and their
 actions are made once and kept, so that what a simulation costs is pomdp-py's own work and one look-up a step.

@@ -10,7 +10,7 @@ untried actions first, by index. The answer is the action tried most often.
 
 What is available, what it costs and what follows from an outcome is that of ``potlp_jax.planning.history``, conditions
 of several cubes included. A node keeps its history as bit masks, and lists its actions - availability, P_S and costs
-settled once - when it is visited for the second time, since most leaves never are. Arrays are few and passed one by
+worked out once - when it is visited for the second time, since most leaves never are. Arrays are few and passed one by
 one: reaching into tuples of arrays costs Numba several times what the search itself does.
 
 References:

@@ -122,7 +122,7 @@ class Delivery(Generator):
     """Generator of academic floors with people to find: by default the three of section V-B.
 
     Attributes:
-        name: the family's; it separates the seeds.
+        name: the family's; it goes into the keys of its worlds.
         errand: who is to be found, and where they can be.
     """
 

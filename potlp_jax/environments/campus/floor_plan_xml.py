@@ -20,9 +20,10 @@ from importlib import resources
 from pathlib import Path
 
 from potlp_jax.environments.campus.furnishing import Kind
-from potlp_jax.environments.ros.map_files import read_yaml
+from potlp_jax.environments.ros.map_files import LARGEST_NUMBER, read_yaml
 from potlp_jax.environments.ros.places import Point
 from potlp_jax.errors import MapError
+from potlp_jax.files import MOST_TEXT, one_line, read_bytes, reading, short
 
 _METRES = {"cm": 0.01, "m": 1.0, "mm": 0.001}
 
@@ -92,15 +93,14 @@ def read_plan(file: Path | str) -> FloorPlan:
             sense; the message names the room.
     """
     file = Path(file)
-    try:
-        building = ElementTree.fromstring(file.read_bytes())
-    except OSError as error:
-        raise MapError(file, "", f"cannot be read ({error.strerror})") from error
-    except ElementTree.ParseError as error:
-        raise MapError(file, "", f"is not valid XML: {error}") from error
+    text = read_bytes(file, MapError, MOST_TEXT)
+    with reading(file, MapError, "valid XML"):
+        building = ElementTree.fromstring(text)
     # The corpus has legends in the same folder, which are XML, too.
     if building.tag != "building":
-        raise MapError(file, building.tag, "the file must hold a building: is it a legend, or another format?")
+        raise MapError(
+            file, one_line(building.tag), "the file must hold a building: is it a legend, or another format?"
+        )
     floors = building.findall("floor")
     if len(floors) != 1:
         raise MapError(file, "floor", f"there are {len(floors)}; put each floor into a file of its own")
@@ -228,5 +228,7 @@ def _number(file: Path, field: str, text: str | None) -> float:
         # Refused below, together with the infinities that ``float`` reads.
         value = math.nan
     if not math.isfinite(value):
-        raise MapError(file, field, f"{text!r} is not a finite number")
+        raise MapError(file, one_line(field), f"{short(text)} is not a finite number")
+    if abs(value) > LARGEST_NUMBER:
+        raise MapError(file, one_line(field), f"{value:g} is beyond {LARGEST_NUMBER:g}, the largest that is read")
     return value

@@ -77,8 +77,9 @@ PARCELS: Errand = Errand(
 )
 """Bradley et al. 2021, section V-C: a document and a package for two people, in any order or the document first."""
 
-MANY_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 32}}})
-"""Settings of trials: from a hallway one sees 18 to 27 doors at a time, in the mean of a trial."""
+MANY_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 32}}, "panoramas": 64})
+"""Settings of trials: from a hallway one sees 18 to 27 doors at a time, in the mean of a trial; and up to 28 panoramas
+still showed a frontier at a time (docs/estimator.md, "Panoramas")."""
 
 _WALL_COLOURS = {
     Kind.HALLWAY: (208, 204, 194),
@@ -211,7 +212,7 @@ def furnish(
     placement = _place_people(floor, people_rng, errand, config)
     look = _appearance(floor, placement, look_rng, config)
     letters = _letters(floor, placement, config)
-    world = make_world(floor.occupied, letters, placement.start, floor.resolution, look)
+    world = make_world(floor.occupied, letters, placement.start, floor.resolution, look, errand.propositions)
     return dataclasses.replace(world, extent=jnp.asarray(np.array(extent, np.int32))), placement
 
 

@@ -37,7 +37,9 @@ import numpy as np
 import yaml
 from jaxtyping import Bool, Float64, Int8, Int64, Shaped
 
+from potlp_jax import files
 from potlp_jax.errors import MapError, MapWarning
+from potlp_jax.files import short
 
 MODES = ("trinary", "scale", "raw")
 OCCUPIED = 100
@@ -57,6 +59,15 @@ PLATEAU_GREYS = 8
 
 BOUNDARY_DECIMALS = 6
 """Cell coordinates are rounded to so many decimals: a point on a cell's edge stays there in spite of floating point."""
+
+LONGEST_NUMBER = 60
+"""Characters of a number: those that programs write have at most 24."""
+
+LARGEST_NUMBER = 1e9
+"""Metres from the origin of a map at which floats still tell micrometres; maps in UTM coordinates reach 1e7."""
+
+SMALLEST_PIXEL, LARGEST_PIXEL = 1e-4, 100.0
+"""Metres a pixel between which a map can be one of a building."""
 
 _REQUIRED_KEYS = ("image", "resolution", "origin")
 _OPTIONAL_KEYS = ("mode", "negate", "occupied_thresh", "free_thresh")
@@ -197,8 +208,12 @@ def load_settings(file: Path | str) -> MapSettings:
         occupied_thresh=_parse_threshold(file, fields, "occupied_thresh", DEFAULT_OCCUPIED_THRESH),
         free_thresh=_parse_threshold(file, fields, "free_thresh", DEFAULT_FREE_THRESH),
     )
-    if settings.resolution <= 0:
-        raise MapError(file, "resolution", f"{fields['resolution']} must be positive (metres a pixel)")
+    if not SMALLEST_PIXEL <= settings.resolution <= LARGEST_PIXEL:
+        raise MapError(
+            file,
+            "resolution",
+            f"{fields['resolution']} must lie between {SMALLEST_PIXEL:g} and {LARGEST_PIXEL:g} (metres a pixel)",
+        )
     if settings.occupied_thresh <= settings.free_thresh:
         raise MapError(
             file,
@@ -213,7 +228,7 @@ def load_settings(file: Path | str) -> MapSettings:
     return settings
 
 
-class _TextLoader(yaml.BaseLoader):
+class _TextLoader(yaml.CBaseLoader if yaml.__with_libyaml__ else yaml.BaseLoader):
     """Leaves every scalar as its text, so that numbers stay exact, and refuses a key that is given twice."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
@@ -233,12 +248,7 @@ def read_yaml(file: Path) -> dict[str, Any]:
     Raises:
         MapError: the file is missing, is no YAML, or holds something else than a mapping of names.
     """
-    try:
-        fields = yaml.load(file.read_bytes(), Loader=_TextLoader)
-    except OSError as error:
-        raise MapError(file, "", f"cannot be read ({error.strerror})") from error
-    except yaml.YAMLError as error:
-        raise MapError(file, "", f"is not valid YAML: {error}") from error
+    fields = files.read_yaml(file, MapError, _TextLoader)
     if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
         raise MapError(file, "", "must hold lines of the form 'key: value'")
     return fields
@@ -257,10 +267,14 @@ def parse_number(file: Path, field: str, text: Any) -> Fraction:
     Raises:
         MapError: it is not a finite decimal number.
     """
-    # An exponent of more than three digits would make a fraction of millions of digits.
-    if not isinstance(text, str) or not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", text.strip()):
-        raise MapError(file, field, f"{text!r} is not a finite number")
-    return Fraction(text.strip())
+    # An exponent of more than three digits would make a fraction of millions of digits, and so would the digits alone.
+    pattern = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?"
+    if not isinstance(text, str) or len(text) > LONGEST_NUMBER or not re.fullmatch(pattern, text.strip(), re.ASCII):
+        raise MapError(file, field, f"{short(text)} is not a finite number of at most {LONGEST_NUMBER} characters")
+    value = Fraction(text.strip())
+    if abs(value) > LARGEST_NUMBER:
+        raise MapError(file, field, f"{text} is beyond {LARGEST_NUMBER:g}, the largest number that is read")
+    return value
 
 
 def parse_numbers(file: Path, field: str, value: Any, names: tuple[str, ...]) -> tuple[float, ...]:
@@ -278,7 +292,7 @@ def parse_numbers(file: Path, field: str, value: Any, names: tuple[str, ...]) ->
         MapError: it is something else.
     """
     if not isinstance(value, list) or len(value) != len(names):
-        raise MapError(file, field, f"{value!r} must be a list [{', '.join(names)}]")
+        raise MapError(file, field, f"{short(value)} must be a list [{', '.join(names)}]")
     return tuple(float(parse_number(file, field, item)) for item in value)
 
 
@@ -293,13 +307,14 @@ def _check_keys(file: Path, fields: Mapping[str, Any]) -> None:
 
 def _find_image(file: Path, text: Any) -> Path:
     if not isinstance(text, str) or not text.strip():
-        raise MapError(file, "image", f"{text!r} must be the name of an image file")
+        raise MapError(file, "image", f"{short(text)} must be the name of an image file")
     image = file.parent / text.strip()  # an absolute path stays as it is
-    if image.is_file():
-        return image
+    with files.reading(file, MapError, "the name of an image file"):
+        if image.exists():
+            return image
     # Maps that were copied from another machine often keep the absolute path of their image.
     sibling = file.parent / image.name
-    if sibling.is_file():
+    if sibling.exists():
         _warn(file, "image", f"{image} does not exist; using {sibling}")
         return sibling
     looked_at = f"{image} does not exist" + ("" if sibling == image else f", nor does {sibling}")
@@ -313,7 +328,7 @@ def _parse_origin(file: Path, value: Any) -> tuple[float, float, float]:
 
 def _parse_choice(file: Path, field: str, text: Any, choices: tuple[str, ...]) -> str:
     if not isinstance(text, str) or text.strip().lower() not in choices:
-        raise MapError(file, field, f"{text!r} must be one of {', '.join(choices)}")
+        raise MapError(file, field, f"{short(text)} must be one of {', '.join(choices)}")
     return text.strip().lower()
 
 
@@ -333,16 +348,13 @@ def _warn(file: Path, field: str, message: str) -> None:
 
 def _read_image(file: Path) -> tuple[Shaped[np.ndarray, "H W C"], int]:
     """Pixels, and the value that stands for white."""
-    try:
-        content = file.read_bytes()
-    except OSError as error:
-        raise MapError(file, "", f"cannot be read ({error.strerror})") from error
+    content = files.read_bytes(file, MapError, files.MOST_IMAGE)
     # Magic numbers of the two kinds of PGM.
     if content[:2] in (b"P2", b"P5"):
-        return _read_pgm(file, content)
-    pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content else None
-    if pixels is None:
-        raise MapError(file, "", "cannot be decoded as an image: cut short, or not PGM, PNG or BMP")
+        with files.reading(file, MapError, "a PGM image"):
+            return _read_pgm(file, content)
+    with files.reading(file, MapError, "an image (PGM, PNG or BMP)"):
+        pixels = files.decode_image(content, cv2.IMREAD_UNCHANGED, whole=True)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise MapError(file, "", f"has pixels of type {pixels.dtype}; needed are 8 or 16 bits a channel")
     return pixels.reshape(*pixels.shape[:2], -1), int(np.iinfo(pixels.dtype).max)
@@ -357,6 +369,8 @@ def _read_pgm(file: Path, content: bytes) -> tuple[Int64[np.ndarray, "H W 1"], i
     width, height, white = (int(text) for text in re.sub(rb"#[^\n]*\n", b" ", header[0])[2:].split())
     if width == 0 or height == 0 or not 0 < white < 2**16:
         raise MapError(file, "", f"has an invalid PGM header: {width} x {height} pixels, maximum {white}")
+    if width * height > files.MOST_PIXELS:
+        raise MapError(file, "", f"has {width:,} x {height:,} pixels; at most {files.MOST_PIXELS:,} are read")
     body = content[header.end() :]
     values = _ascii_values(file, body) if content[:2] == b"P2" else _binary_values(body, white)
     # A file with more is accepted, as by every reader; one with less has lost a part of the building.
@@ -448,23 +462,37 @@ def _raw_occupancy(
 def _check_classes(
     settings: MapSettings, shade: _Shade, free: Bool[np.ndarray, "H W"], occupied: Bool[np.ndarray, "H W"]
 ) -> None:
-    for field, pixels, kind, advice in (
-        (
-            "occupied_thresh",
-            occupied,
-            "no obstacle",
-            "set it below the value of walls, free_thresh below that of unknown",
-        ),
-        ("free_thresh", free, "nothing free", "set it above the value of free space"),
-    ):
+    for field, pixels, kind in (("occupied_thresh", occupied, "no obstacle"), ("free_thresh", free, "nothing free")):
         if not pixels.any():
             value = float(getattr(settings, field))
             raise MapError(
                 settings.file,
                 field,
                 f"{value} leaves {kind} in {settings.image.name}, where {_commonest(settings, shade)}; "
-                f"{advice}, and check mode and negate",
+                f"check mode and negate, {_advise(settings, shade)}",
             )
+
+
+def _advise(settings: MapSettings, shade: _Shade) -> str:
+    """Thresholds under which the image has free space and obstacles, where there are any."""
+    if settings.mode == "raw":
+        known = shade.greys()[shade.opaque]
+        values, full = known[known <= OCCUPIED], OCCUPIED
+    else:
+        darkness = shade.darkness[shade.opaque]
+        values, full = shade.full - darkness if settings.negate else darkness, shade.full
+    if not values.size or values.min() == values.max():
+        return "and the image: no thresholds tell free space from obstacles in it"
+    # Both at once: advice on one alone may ask for a value that the other forbids.
+    lightest, darkest = (Fraction(int(value), full) for value in (values.min(), values.max()))
+    third = (darkest - lightest) / 3
+    # More digits where the image's greys are closer than three digits can tell.
+    digits = 3 if third > Fraction(1, 500) else 9
+    return (
+        f"or set free_thresh and occupied_thresh between the lightest, {float(lightest):.{digits}f}, and the darkest, "
+        f"{float(darkest):.{digits}f}, such as free_thresh: {float(lightest + third):.{digits}f} and "
+        f"occupied_thresh: {float(darkest - third):.{digits}f}"
+    )
 
 
 def _commonest(settings: MapSettings, shade: _Shade) -> str:
@@ -494,8 +522,17 @@ def _warn_of_unknown_as_free(settings: MapSettings, shade: _Shade, free: Bool[np
     if counts[SAVED_UNKNOWN]:
         suspects.add(SAVED_UNKNOWN)
     for grey in sorted(suspects):
+        exact = _occupancy_of_grey(settings, grey)
+        # Where this grey is all the free space, a lower threshold would leave none.
+        if not any(_occupancy_of_grey(settings, int(other)) < exact for other in np.flatnonzero(counts)):
+            _warn(
+                settings.file,
+                "free_thresh",
+                f"all that is free has the value {grey}, which map servers write for 'unknown': look at the image",
+            )
+            continue
         # Rounded down, so that the number in the message really excludes the grey.
-        at_most = math.floor(1000 * _occupancy_of_grey(settings, grey)) / 1000
+        at_most = math.floor(1000 * exact) / 1000
         _warn(
             settings.file,
             "free_thresh",

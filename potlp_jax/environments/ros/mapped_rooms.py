@@ -2,7 +2,7 @@
 
 The third experiment of Bradley et al. 2021 (section V-C), with a simulated robot: a document and a package are for two
 people in two rooms, drawn at random; those rooms are lit, others are dark. ``parcels:FILE.yaml`` takes the rooms from
-``FILE.rooms.yaml`` beside it, in map metres and in the form of ``environments.places``:
+``FILE.rooms.yaml`` beside it, in map metres and in the form of ``environments.ros.places``:
 
     rooms:
       "3.422": [{polygon: [[12.0, 3.5], [15.2, 3.5], [15.2, 8.0], [12.0, 8.0]]}]
@@ -150,7 +150,9 @@ def _settings(resolution: float) -> Settings:
     lengths = {name: getattr(camera, name) * scale for name in ("far", "eye_height", "wall_height", "texture_reach")}
     frontiers = {"max_subgoals": MANY_SLIVERS, **NARROW_DOORS["decision"]["frontiers"]}
     replan_distance = REPLAN_DISTANCE / resolution
-    return Settings({"decision": {"frontiers": frontiers}, "camera": lengths, "replan_distance": replan_distance})
+    return Settings(
+        {**NARROW_DOORS, "decision": {"frontiers": frontiers}, "camera": lengths, "replan_distance": replan_distance}
+    )
 
 
 def _floor(

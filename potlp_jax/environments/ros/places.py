@@ -27,6 +27,7 @@ from scipy import ndimage
 
 from potlp_jax.environments.ros.map_files import GridFrame, parse_number, parse_numbers, read_yaml
 from potlp_jax.errors import MapError
+from potlp_jax.files import short
 
 MAX_PROPOSITIONS = 16
 """As many as a letter has bits."""
@@ -302,7 +303,7 @@ def _region(file: Path, field: str, value: Any) -> Region:
             raise MapError(file, f"{field}: polygon", "needs three vertices [x, y] or more")
         return Polygon(tuple(_point(file, f"{field}: polygon", corner) for corner in corners))
     raise MapError(
-        file, field, f"{value!r} is no region; write {{point: [x, y], radius: r}} or {{polygon: [[x, y], ...]}}"
+        file, field, f"{short(value)} is no region; write {{point: [x, y], radius: r}} or {{polygon: [[x, y], ...]}}"
     )
 
 

@@ -47,9 +47,10 @@ class RosMapConfig:
     radius: float = 0.1
 
 
-NARROW_DOORS: Settings = Settings({"decision": {"frontiers": {"min_size": 1}}})
+NARROW_DOORS: Settings = Settings({"decision": {"frontiers": {"min_size": 1}}, "panoramas": 128})
 """Settings of trials: after resampling, a door of a real building may be as narrow as one cell, and a frontier is to be
-dropped only where it is smaller than any passage (docs/model.md section 6)."""
+dropped only where it is smaller than any passage (docs/model.md section 6). Slivers that stay open are remembered: up
+to 59 panoramas still showed a frontier at a time (docs/estimator.md, "Panoramas")."""
 
 
 class RosMap(Generator):
@@ -82,7 +83,7 @@ class RosMap(Generator):
         self.places = places
         self.clean = clean_map(self.image_map, config.resolution, config.radius, places.start, places.source)
         _warn_of_cut_off(config, self.clean)
-        # Not the path as typed: the name separates the seeds, and a map is the same map from every folder.
+        # Not the path as typed: the name goes into the keys of its worlds, and a map is the same map from every folder.
         self.name = f"{PREFIX}{Path(config.file).stem}"
         self.propositions = places.names
         self.tasks = dict(places.tasks)
@@ -107,7 +108,13 @@ class RosMap(Generator):
         else:
             row, col = self._free_cells[host_generators(key, 1)[0].integers(len(self._free_cells))]
             start = int(row), int(col)
-        return make_world(~self.clean.free, self._letters, start, resolution=self.clean.frame.resolution)
+        return make_world(
+            ~self.clean.free,
+            self._letters,
+            start,
+            resolution=self.clean.frame.resolution,
+            propositions=self.propositions,
+        )
 
     def metres_to_cell(self, x: float | int, y: float | int) -> tuple[int, int]:
         """Cell (row, col) of the worlds that holds a point in map metres; outside of the grid where the point is."""

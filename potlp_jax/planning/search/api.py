@@ -2,12 +2,13 @@
 
 The type of the configuration chooses the search:
 
-* ``SearchConfig``, the default: **best-first search on bounds** over a graph of histories (``search.best_first``), of
-  the family of AO*. Deterministic: the key changes nothing.
-* ``UctConfig``: **PO-UCT as published** (``search.uct``), which samples with the caller's key.
+* ``BestFirstConfig``, the default: **best-first search on bounds** over a graph of histories
+  (``search.best_first``), of the family of AO*. It is not the paper's search. Deterministic: the key changes nothing.
+* ``UctConfig``: **PO-UCT**, the paper's search (``search.uct``), which samples with the caller's key.
 
 References:
   Bradley et al., Learning and Planning for Temporally Extended Tasks in Unknown Environments, ICRA 2021, III-C.
+  Nilsson, Principles of Artificial Intelligence, 1980 (AO*).
 """
 
 import time
@@ -17,9 +18,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key, PRNGKeyArray, UInt32
 
-from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.problem import PlanningProblem, check_shapes
 from potlp_jax.planning.search.best_first import BEST_FIRST
-from potlp_jax.planning.search.config import SearchConfig, UctConfig
+from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
 from potlp_jax.planning.search.graph import Tree
 from potlp_jax.planning.search.lockstep import SearchMethod, run_search
 from potlp_jax.planning.search.plan import Plan
@@ -27,23 +28,28 @@ from potlp_jax.planning.search.uct import UCT, UctTree
 
 
 def plan_actions(
-    problem: PlanningProblem, key: PRNGKeyArray, config: SearchConfig | UctConfig = SearchConfig()
+    problem: PlanningProblem, key: PRNGKeyArray, config: BestFirstConfig | UctConfig = BestFirstConfig()
 ) -> Plan:
     """Search one problem for the action of least expected cost.
 
     Pure; jit with ``config`` static. ``jax.vmap`` over ``problem``, ``key`` or both runs the rows in lockstep. The
-    result depends neither on padding nor on other rows of a batch. Ties go to the lowest index. A root without
-    available action, or satisfied, is flagged in ``status``. The exact solution (``planning.exact``) runs on the host
-    and is the yardstick of both searches.
+    result depends, to the last bit, neither on padding nor on the size of the batch nor on its other rows. Ties go to
+    the lowest index. A root without available action, or satisfied, is flagged in ``status``, and so is a problem with
+    a value that is not allowed (``problem.screen``): nothing is chosen then. The exact solution (``planning.exact``)
+    runs on the host and is the yardstick of both searches.
 
     Args:
       problem: unbatched.
-      key: consumed by ``UctConfig``; without effect under ``SearchConfig``.
+      key: consumed under ``UctConfig``. Under ``BestFirstConfig`` nothing is drawn and any key gives the same plan; the
+        argument is there so that one call serves both.
       config: which search, and its settings. Best-first search ends by itself on a small problem, on a large one after
-        ``config.simulations``; ``Plan.gap`` tells which. PO-UCT always runs all simulations.
+        ``config.simulations``; ``Plan.optimism_gap`` is 0 in the first case. PO-UCT always runs all simulations.
 
     Returns:
       The plan.
+
+    Raises:
+      ProblemError: the shapes of the problem's arrays do not agree.
     """
     return search_tree(problem, key, config)[0]
 
@@ -51,7 +57,7 @@ def plan_actions(
 def search_tree(
     problem: PlanningProblem,
     key: PRNGKeyArray,
-    config: SearchConfig | UctConfig = SearchConfig(),
+    config: BestFirstConfig | UctConfig = BestFirstConfig(),
     tree: Tree | UctTree | None = None,
 ) -> tuple[Plan, Any]:
     """``plan_actions`` together with the searched tree.
@@ -64,8 +70,12 @@ def search_tree(
         search goes on with it for ``config.simulations`` more, and ends where one search of all of them would.
 
     Returns:
-      The plan and the tree: ``Tree`` under ``SearchConfig``, ``UctTree`` under ``UctConfig``.
+      The plan and the tree: ``Tree`` under ``BestFirstConfig``, ``UctTree`` under ``UctConfig``.
+
+    Raises:
+      ProblemError: the shapes of the problem's arrays do not agree.
     """
+    check_shapes(problem)
     # One problem is a batch of one: there is one kernel.
     problems, seeds, trees = jax.tree.map(lambda leaf: leaf[None], (problem, _seed(key), tree))
     return jax.tree.map(lambda leaf: leaf[0], run_search(_search_for(config), config, problems, seeds, trees))
@@ -74,7 +84,7 @@ def search_tree(
 def search(
     problems: PlanningProblem,
     keys: Key[Array, "B"],
-    config: SearchConfig | UctConfig = SearchConfig(),
+    config: BestFirstConfig | UctConfig = BestFirstConfig(),
     trees: Tree | UctTree | None = None,
 ) -> tuple[Plan, Any]:
     """``search_tree`` for a batch.
@@ -87,12 +97,16 @@ def search(
 
     Returns:
       Plans and trees with the leading axis B.
+
+    Raises:
+      ProblemError: the shapes of the problems' arrays do not agree.
     """
+    check_shapes(problems, keys.shape)
     return run_search(_search_for(config), config, problems, jax.vmap(_seed)(keys), trees)
 
 
 def plan_within(
-    problem: PlanningProblem, key: PRNGKeyArray, seconds: float, config: SearchConfig | UctConfig = SearchConfig()
+    problem: PlanningProblem, key: PRNGKeyArray, seconds: float, config: BestFirstConfig | UctConfig = BestFirstConfig()
 ) -> tuple[Plan, Any]:
     """Search one problem until the time is up, the tree is full, or more simulations change nothing.
 
@@ -121,19 +135,19 @@ def plan_within(
     jax.block_until_ready(_more(problem, key, warm, config=config))
     spent, plan, tree = _timed(_first, problem, key, config=config)
     # A round begins as long as time is left, so the last one may end late by its own length.
-    while spent < seconds and float(plan.gap) > 0 and int(tree.size) < config.tree_capacity:
+    while spent < seconds and float(plan.optimism_gap) > 0 and int(tree.size) < config.tree_capacity:
         step, plan, tree = _timed(_more, problem, key, tree, config=config)
         spent += step
     return plan, tree
 
 
-def _timed(function: Any, *arguments: Any, config: SearchConfig | UctConfig) -> tuple[float, Plan, Any]:
+def _timed(function: Any, *arguments: Any, config: BestFirstConfig | UctConfig) -> tuple[float, Plan, Any]:
     began = time.perf_counter()
     plan, tree = jax.block_until_ready(function(*arguments, config=config))
     return time.perf_counter() - began, plan, tree
 
 
-def _search_for(config: SearchConfig | UctConfig) -> SearchMethod:
+def _search_for(config: BestFirstConfig | UctConfig) -> SearchMethod:
     return UCT if isinstance(config, UctConfig) else BEST_FIRST
 
 

@@ -1,5 +1,12 @@
 """Best-first search on bounds over a graph of histories: the default search, of the family of AO*.
 
+This is not the search of the paper, which is PO-UCT (``search.uct``). It is deterministic: nothing is sampled, and no
+key is used. AO* grows a graph of choices (OR) and outcomes (AND) along the policy that looks best, and backs up
+expectations and minima, as this does. Three things are different. The leaf to expand is found as in bounded real-time
+dynamic programming and HSVI, by following the widest gap, but without their random outcomes. The estimates at leaves
+are guesses, which may be too high, so that AO*'s guarantee is lost; the bounds discount them by a fixed fraction
+instead of being admissible. And the search ends when it is spent, proven or not.
+
 Values are those of Eq. 3 itself: expectations over both outcomes, minima over actions. Outcomes that have no node yet
 have a guessed value (``search.guess``). Every node also has a **bound**: its value if every guess were too high by the
 fraction ``optimism``. One simulation of all rows of a batch is
@@ -11,13 +18,15 @@ fraction ``optimism``. One simulation of all rows of a batch is
 
 Once no gap is left at the root the search ends: what could be best under the optimistic guesses has been examined. All
 reads of a simulation come before its writes, so that XLA updates the arrays in place and the cost of a simulation does
-not depend on their size. Nothing is sampled.
+not depend on their size.
 
 References:
   Nilsson, Principles of Artificial Intelligence, 1980 (AO*).
-  Martelli and Montanari, Additive AND/OR graphs, IJCAI 1973.
+  Martelli and Montanari, Additive AND/OR graphs, IJCAI 1973; Optimizing decision trees through heuristically guided
+    search, CACM 1978.
   Hansen and Zilberstein, LAO*: a heuristic search algorithm that finds solutions with loops, AIJ 2001.
-  McMahan, Likhachev and Gordon, Bounded real-time dynamic programming, ICML 2005: outcomes chosen by their gap.
+  Smith and Simmons, Heuristic search value iteration for POMDPs, UAI 2004 (HSVI): outcomes chosen by their gap.
+  McMahan, Likhachev and Gordon, Bounded real-time dynamic programming, ICML 2005: the same for known states.
 """
 
 import dataclasses
@@ -29,8 +38,9 @@ from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
 from potlp_jax.planning.history import ActionTables, History, terms_of_all
 from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.rounding import rounded_product
 from potlp_jax.planning.search.arrays import first_of_least, least_of_each, status_of_rows
-from potlp_jax.planning.search.config import SearchConfig
+from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.search.graph import NewNode, NodeValues, Tree, add_node, find, plant_tree
 from potlp_jax.planning.search.guess import Rule, guess_outcomes, make_rule
 from potlp_jax.planning.search.lockstep import SearchMethod
@@ -175,12 +185,12 @@ class Leaf:
     bound: Float32[Array, "B"]
 
 
-def prepare(problems: PlanningProblem, seeds: UInt32[Array, "B 2"], config: SearchConfig) -> Context:
+def prepare(problems: PlanningProblem, seeds: UInt32[Array, "B 2"], config: BestFirstConfig) -> Context:
     """Tables, guessing rule and optimism of a batch of problems.
 
     Args:
       problems: every leaf has the leading axis B.
-      seeds: not used: nothing is sampled.
+      seeds: without effect: nothing is sampled, but every search has the same verbs.
       config: ``guess_failures`` and ``optimism`` matter.
 
     Returns:
@@ -209,7 +219,7 @@ def prepare(problems: PlanningProblem, seeds: UInt32[Array, "B 2"], config: Sear
     )
 
 
-def plant(context: Context, config: SearchConfig) -> Tree:
+def plant(context: Context, config: BestFirstConfig) -> Tree:
     """Graphs of the roots alone."""
     # The root is a node like any other: its values are guesses until it is searched.
     root = _new_node(context, context.model.root, config)
@@ -222,7 +232,7 @@ def is_open(context: Context, tree: Tree) -> Bool[Array, "B"]:
     return value > bound
 
 
-def simulate(context: Context, tree: Tree, config: SearchConfig) -> Tree:
+def simulate(context: Context, tree: Tree, config: BestFirstConfig) -> Tree:
     """One descent of all rows that are open.
 
     Args:
@@ -256,7 +266,7 @@ def _root_value(context: Context, tree: Tree) -> tuple[Float32[Array, "B"], Floa
     return values.on_arrival(context.model.root.pending_cost, context.model.dead_end_cost)
 
 
-def _descend(context: Context, tree: Tree, config: SearchConfig) -> Descent:
+def _descend(context: Context, tree: Tree, config: BestFirstConfig) -> Descent:
     """Follow the graph from the root to an outcome without a node, or to the rollout's end."""
     batch = tree.size.shape[0]
     nowhere = jnp.zeros((batch,), jnp.bool_)
@@ -443,13 +453,14 @@ def _follow_gap(
     # Nothing is to be learnt from satisfying the task, and a certain success cannot fail.
     success = (success & ~accepts) | (chance >= 1.0)
     # Eq. 3 without the part that the followed outcome contributes: that is added during the backup.
-    known = attempt.path_cost + chance * attempt.success_cost + (1.0 - chance) * attempt.failure_cost
+    known = attempt.path_cost + rounded_product(chance, attempt.success_cost)
+    known += rounded_product(1.0 - chance, attempt.failure_cost)
     weight, rest = jnp.where(success, chance, 1.0 - chance), jnp.where(success, 1.0 - chance, chance)
     return _Step(
         success=success,
         pending_cost=jnp.where(success, attempt.success_cost, attempt.failure_cost),
-        base=known + rest * jnp.where(success, failure_value, success_value),
-        base_bound=known + rest * jnp.where(success, failure_bound, success_bound),
+        base=known + rounded_product(rest, jnp.where(success, failure_value, success_value)),
+        base_bound=known + rounded_product(rest, jnp.where(success, failure_bound, success_bound)),
         weight=weight,
     )
 
@@ -469,7 +480,7 @@ def _outcome_value(
     return jnp.where(new, guessed, value), jnp.where(new, (1.0 - context.optimism) * guessed, bound)
 
 
-def _expand(context: Context, tree: Tree, descent: Descent, config: SearchConfig) -> tuple[Tree, Leaf]:
+def _expand(context: Context, tree: Tree, descent: Descent, config: BestFirstConfig) -> tuple[Tree, Leaf]:
     """Add the node that the descent reached, unless another order of the same events has led there before."""
     model = context.model
     # Rows that do not expand compute a history too; nothing of it is kept.
@@ -498,7 +509,7 @@ def _expand(context: Context, tree: Tree, descent: Descent, config: SearchConfig
     return dataclasses.replace(tree, status=tree.status | overflow), leaf
 
 
-def _new_node(context: Context, history: History, config: SearchConfig) -> NewNode:
+def _new_node(context: Context, history: History, config: BestFirstConfig) -> NewNode:
     """The numbers of one node per row when nothing below it has been seen."""
     # The pending cost is left out of a node's numbers; the guess needs it, to know what the next action pays.
     free = dataclasses.replace(history, pending_cost=jnp.zeros_like(history.pending_cost))
@@ -514,11 +525,13 @@ def _new_node(context: Context, history: History, config: SearchConfig) -> NewNo
         config.guess_failures,
     )
     # Eq. 3 with guessed values, and the same with the guesses reduced by the optimism.
-    known = terms.distance + chance * terms.success_cost + (1.0 - chance) * terms.failure_cost
-    guessed = chance * success_values + (1.0 - chance) * failure_values
+    known = terms.distance + rounded_product(chance, terms.success_cost)
+    known += rounded_product(1.0 - chance, terms.failure_cost)
+    guessed = rounded_product(chance, success_values) + rounded_product(1.0 - chance, failure_values)
+    optimistic = rounded_product(1.0 - context.optimism[:, None], guessed)
     return NewNode(
         q_values=jnp.where(available, known + guessed, jnp.inf),
-        bounds=jnp.where(available, known + (1.0 - context.optimism[:, None]) * guessed, jnp.inf),
+        bounds=jnp.where(available, known + optimistic, jnp.inf),
         chances=chance,
         success_costs=terms.success_cost,
         failure_values=failure_values,
@@ -535,7 +548,8 @@ def _back_up(tree: Tree, descent: Descent, leaf: Leaf) -> Tree:
         step = jax.tree.map(lambda records: records[level], descent.path)
         # Rows with a shorter descent wait at their leaf until the level of their last action.
         taken = step.nodes < tree.capacity
-        q_value, low = step.base + step.weight * value, step.base_bound + step.weight * bound
+        q_value = step.base + rounded_product(step.weight, value)
+        low = step.base_bound + rounded_product(step.weight, bound)
         values = _with_action(step, q_value, low)
         value = jnp.where(taken, jnp.minimum(step.pending_cost + values.leave, values.stay), value)
         bound = jnp.where(taken, jnp.minimum(step.pending_cost + values.leave_bound, values.stay_bound), bound)
@@ -588,8 +602,8 @@ def _count(tree: Tree, descent: Descent) -> Tree:
     )
 
 
-def _optimism(problems: PlanningProblem, config: SearchConfig) -> Float32[Array, "B"]:
-    """``SearchConfig.optimism`` of each problem; by its number of actions where the configuration names none."""
+def _optimism(problems: PlanningProblem, config: BestFirstConfig) -> Float32[Array, "B"]:
+    """``BestFirstConfig.optimism`` of each problem; by its number of actions where the configuration names none."""
     # A Python value of the configuration is known when the search is compiled.
     subgoals = jnp.sum(problems.subgoal_mask, axis=1, dtype=jnp.int32)
     if config.optimism is not None:

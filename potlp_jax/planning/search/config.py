@@ -8,8 +8,8 @@ from typing import Literal
 
 
 @dataclasses.dataclass(frozen=True)
-class SearchConfig:
-    """Settings of the best-first search on bounds (``search.best_first``), the default.
+class BestFirstConfig:
+    """Settings of best-first search on bounds (``search.best_first``), the default; deterministic.
 
     Attributes:
       simulations: descents per search; each adds at most one node. The search ends earlier once no gap between value
@@ -36,7 +36,7 @@ class SearchConfig:
         _check_kind(self, "best-first")
         _check_at_least_one(self, "simulations", "max_depth", "tree_capacity", "guess_failures")
         if self.optimism is not None and not 0 <= self.optimism <= 1:
-            raise ValueError(f"SearchConfig.optimism is {self.optimism}, must lie in [0, 1]")
+            raise ValueError(f"BestFirstConfig.optimism is {self.optimism}, must lie in [0, 1]")
 
     @property
     def capacity(self) -> int:
@@ -51,7 +51,7 @@ class SearchConfig:
 
 @dataclasses.dataclass(frozen=True)
 class UctConfig:
-    """Settings of PO-UCT as published (``search.uct``).
+    """Settings of PO-UCT, the paper's search (``search.uct``).
 
     Attributes:
       simulations: sampled rollouts per search; each adds at most one node. PO-UCT has no criterion to end earlier, and
@@ -83,13 +83,13 @@ class UctConfig:
         return self.simulations + 1 if self.tree_capacity is None else self.tree_capacity
 
 
-def _check_kind(config: SearchConfig | UctConfig, kind: str) -> None:
+def _check_kind(config: BestFirstConfig | UctConfig, kind: str) -> None:
     # A wrong kind would be written to records, and read back as another search.
     if config.kind != kind:
         raise ValueError(f"{type(config).__name__}.kind is {config.kind!r}, must be {kind!r}")
 
 
-def _check_at_least_one(config: SearchConfig | UctConfig, *names: str) -> None:
+def _check_at_least_one(config: BestFirstConfig | UctConfig, *names: str) -> None:
     for name in names:
         value = getattr(config, name)
         if value is not None and value < 1:

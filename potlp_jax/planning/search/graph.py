@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
 from potlp_jax.planning.history import History
 from potlp_jax.planning.search.arrays import least_of_each, mix
-from potlp_jax.planning.search.config import SearchConfig
+from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.search.model import Model
 
 PROBES: int = 8
@@ -167,7 +167,7 @@ class NewNode:
     success_values: Float32[Array, "*B A"]
 
 
-def plant_tree(model: Model, root: NewNode, config: SearchConfig) -> Tree:
+def plant_tree(model: Model, root: NewNode, config: BestFirstConfig) -> Tree:
     """Graphs of the roots alone.
 
     Args:

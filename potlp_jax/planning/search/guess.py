@@ -21,6 +21,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 
 from potlp_jax.planning.history import ActionTables
+from potlp_jax.planning.rounding import rounded_product
 from potlp_jax.planning.search.arrays import first_of_least
 from potlp_jax.types import NO_STATE
 
@@ -211,8 +212,9 @@ def _costs_without(chain: _Chain) -> Float32[Array, "L N"]:
     def skip(carry, level):
         # What the levels before cost, and then the rest of the chain behind the level that is left out.
         spent, reached = carry
-        left_out = spent + reached * chain.rest[level + 1]
-        return (spent + reached * chain.cost[level], reached * (1.0 - chain.chance[level])), left_out
+        left_out = spent + rounded_product(reached, chain.rest[level + 1])
+        spent += rounded_product(reached, chain.cost[level])
+        return (spent, reached * (1.0 - chain.chance[level])), left_out
 
     levels, count = chain.action.shape
     nothing_yet = jnp.zeros((count,), jnp.float32), jnp.ones((count,), jnp.float32)
@@ -321,7 +323,8 @@ def _attempt_cost(
 ) -> Float32[Array, "N A"]:
     """Expected cost of each attempt without the path to it: what follows success is included, what follows failure
     is not."""
-    return chance * (success_cost + rule.after_success[problem]) + (1.0 - chance) * rule.failure_cost[problem]
+    succeeds = rounded_product(chance, success_cost + rule.after_success[problem])
+    return succeeds + rounded_product(1.0 - chance, rule.failure_cost[problem])
 
 
 def _follow_chain(rule: Rule, starts: _Starts, length: int) -> _Chain:
@@ -346,7 +349,7 @@ def _follow_chain(rule: Rule, starts: _Starts, length: int) -> _Chain:
 
     def add(rest, level):
         # From the chain's end backward. Levels that a chain did not reach cost nothing and cannot succeed.
-        rest = walk.cost[level] + (1.0 - walk.chance[level]) * rest
+        rest = walk.cost[level] + rounded_product(1.0 - walk.chance[level], rest)
         return rest, rest
 
     # A chain that is cut, or that has no action left, ends at a dead end.

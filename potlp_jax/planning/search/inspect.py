@@ -63,7 +63,7 @@ class _TreeViewer:
 
     def _paid(self, history: History) -> np.ndarray:
         """What each action pays of the pending cost: nothing where it stays in the unknown region, otherwise all."""
-        location, state, edges = int(history.location), int(history.state), max(self._problem.edge_count, 1)
+        location, state, edges = int(history.location), int(history.state), self._problem.edge_count
         paid = np.full(self._problem.action_count, float(history.pending_cost))
         if location < self._problem.subgoal_count:
             inside = np.asarray(self._problem.task.edges)[:, 0] == state
@@ -83,9 +83,8 @@ class _TreeViewer:
     def _action(
         self, index: int, action: int, q_value: float, terms: ActionTerms, history: History, depth: int
     ) -> dict[str, Any]:
-        # Problems without edges have the finish action alone.
         finish = action == self._problem.action_count - 1
-        subgoal, edge = divmod(action, max(self._problem.edge_count, 1))
+        subgoal, edge = divmod(action, self._problem.edge_count)
         ends = [None, None] if finish else np.asarray(self._problem.task.edges)[edge].tolist()
         probability = float(terms.success_probability[action])
         costs = {True: float(terms.success_cost[action]), False: float(terms.failure_cost[action])}

@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, UInt32
 
-from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.problem import PlanningProblem, screen
 from potlp_jax.planning.search.plan import Plan
+from potlp_jax.types import Status, status_array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,6 +99,8 @@ def _search_batch(
     problems: PlanningProblem, seeds: UInt32[Array, "B 2"], tree: Any, *, search: SearchMethod, config: Any
 ) -> tuple[Plan, Any]:
     """Simulate until no row is open or the simulations are spent, then choose."""
+    # A row with an invalid input becomes a dead end: nothing is planned with it, and no other row waits for it.
+    problems, invalid = jax.vmap(screen)(problems)
     # Not part of the tree: a search that goes on prepares again, which costs a fraction of a search.
     context = search.prepare(problems, seeds, config)
     tree = search.plant(context, config) if tree is None else tree
@@ -112,7 +115,9 @@ def _search_batch(
         return count + 1, search.simulate(context, tree, config)
 
     _, tree = jax.lax.while_loop(unfinished, advance, (jnp.int32(0), tree))
-    return search.choose(context, tree), tree
+    plan = search.choose(context, tree)
+    status = jnp.where(invalid, status_array(Status.INVALID), plan.status)
+    return dataclasses.replace(plan, status=status), tree
 
 
 def _arrays_of(value: Any) -> list[Array]:

@@ -18,15 +18,18 @@ class Plan:
       subgoal: the action's subgoal, ``NO_SUBGOAL`` for finish and for none.
       from_state: state z' in which to reach the subgoal, ``NO_STATE`` for finish and for none.
       to_state: state z'' to try for beyond it, ``NO_STATE`` for finish and for none.
-      value: expected cost of the action; 0 where the task is satisfied, the dead-end cost at a dead end.
+      value: expected cost of the action; 0 where the task is satisfied, the dead-end cost at a dead end, inf where the
+        problem is invalid.
       q_values: expected cost of each action, inf where it is not available (under ``UctConfig`` also where no rollout
         took it).
       visits: simulations that began with each action.
-      gap: fraction of ``value`` by which it would still fall if every guess that it rests on were too high by the
-        search's optimism (``SearchConfig``). It says whether the search has converged: 0 means that more simulations
-        change nothing. It is **no bound on the error**: a guess may be too high by more than the optimism. Only with
-        an optimism of 1, a gap of 0 and no overflow in ``status`` is ``value`` the optimum. inf from ``UctConfig``,
-        which has no bounds.
+      optimism_gap: fraction of ``value`` by which it would fall if every guess that it rests on were too high by the
+        search's optimism (``BestFirstConfig``). Above 0 it is **no bound on the error**: it looks down only, a guess
+        may also be too low, and it may be too high by more than the optimism. 0 says two things. More simulations
+        change nothing. And if the optimism is not 0, ``value`` rests on no guess: it is what the plan's own policy
+        costs, so that the optimum is no higher, but it may be lower. With an optimism of 1 and no overflow in
+        ``status`` it is then the optimum. inf from ``UctConfig``, which has no bounds. ``planning.exact`` gives
+        certified intervals.
       status: bits of ``types.Status``.
     """
 
@@ -37,7 +40,7 @@ class Plan:
     value: Float32[Array, "*B"]
     q_values: Float32[Array, "*B A"]
     visits: Int32[Array, "*B A"]
-    gap: Float32[Array, "*B"]
+    optimism_gap: Float32[Array, "*B"]
     status: UInt32[Array, "*B"]
 
 
@@ -74,7 +77,8 @@ def plan_of_least_score(
     rows = jnp.arange(action.shape[0], dtype=jnp.int32)
     value = jnp.where(available, q_values[rows, action], model.dead_end_cost)
     value = jnp.where(accepted, 0.0, value)
-    # Relative to the value; where that is 0 nothing is divided.
+    # Relative to the value; where that is 0 nothing is divided. Where it is 0, the action of least Q has a bound of the
+    # same size, so that no guess enters either.
     gap = (value - root_bound) / jnp.where(value > 0, value, 1.0)
     ended = status_of_rows(accepted, Status.ACCEPTING_ROOT) | status_of_rows(~available & ~accepted, Status.DEAD_END)
     return Plan(
@@ -85,6 +89,6 @@ def plan_of_least_score(
         value=value,
         q_values=q_values,
         visits=visits,
-        gap=jnp.where(available, gap, 0.0),
+        optimism_gap=jnp.where(available, gap, 0.0),
         status=status | ended,
     )

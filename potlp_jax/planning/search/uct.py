@@ -1,21 +1,29 @@
-"""PO-UCT as published: sampled outcomes, mean costs, upper confidence bounds, the most visited action.
+"""PO-UCT, the search of the paper: sampled outcomes, mean costs, upper confidence bounds, the most visited action.
 
-This is the search of the authors' code, kept as the baseline of the default search (``search.best_first``). They differ
-in every step: here nothing is guessed, so that a new node costs nothing beyond the rollout so far; Q is the mean cost
-of the rollouts that took an action; every history has a node of its own, in whatever order its events came. One
-simulation of all rows of a batch is
+``search: uct`` in settings. It is a choice beside the default, best-first search (``search.best_first``), and differs
+from that in every step: here nothing is guessed, so that a new node costs nothing beyond the rollout so far; Q is the
+mean cost of the rollouts that took an action; every history has a node of its own, in whatever order its events came.
+One simulation of all rows of a batch is
 
 1. **descend**: from the root, take an action that was never taken, otherwise the one of least
    ``Q - exploration * sqrt(log(n) / n_a)``; sample its outcome with P_S; until an outcome without a node is reached.
 2. **expand**: give that outcome a node (the tree grows by one node per simulation).
 3. **back up** the sampled cost: visits and means of the actions taken.
 
+From the paper (III-C): nodes are histories of actions and outcomes; at each iteration an action of A(b_h) and its
+outcome, with P_S given the history, are sampled, and D and R_S or R_F accrue as in Eq. 3. The paper leaves open how an
+action is selected, how it is valued at a new node, and which is taken in the end. These follow the authors' code: UCB1
+with a constant of 50, untried actions first; no rollout beyond a new node; the most visited action. The last two differ
+from PO-UCT of Silver and Veness, which plays random actions from a new node and takes the action of best mean. What the
+paper does not have: a dead end has a cost, what a rollout knows is closed under what follows from it (docs/model.md,
+sections 4 and 5), and the limits on depth and nodes, which set a bit of ``status`` where they are met.
+
 The random numbers are a function of the caller's key, the simulation and the level, so that rows of a batch do not
 depend on each other, and a search that goes on with its tree equals one search of all simulations.
 
 References:
   Bradley et al., Learning and Planning for Temporally Extended Tasks in Unknown Environments, ICRA 2021, III-C.
-  Silver and Veness, Monte-Carlo planning in large POMDPs, NIPS 2010.
+  Silver and Veness, Monte-Carlo planning in large POMDPs, NIPS 2010 (PO-UCT).
   Kocsis and Szepesvári, Bandit based Monte-Carlo planning, ECML 2006.
 """
 
@@ -28,6 +36,7 @@ from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
 from potlp_jax.planning.history import ActionTerms, History, terms_of_all
 from potlp_jax.planning.problem import PlanningProblem
+from potlp_jax.planning.rounding import rounded_product
 from potlp_jax.planning.search.arrays import first_of_least, status_of_rows, uniform
 from potlp_jax.planning.search.config import UctConfig
 from potlp_jax.planning.search.lockstep import SearchMethod
@@ -321,7 +330,9 @@ def _select_action(
     q_values, visits, total = tree.q_values[rows, node], tree.visits[rows, node], tree.node_visits[rows, node]
     # log(n) with n >= 2: at the first visit every action is untried, and the width does not matter.
     log = jnp.log(jnp.maximum(total.astype(jnp.float32) + 1.0, 2.0))
-    width = exploration * jnp.sqrt(log)[:, None] * jax.lax.rsqrt(jnp.maximum(visits, 1).astype(jnp.float32))
+    # A root of the quotient, which every program rounds alike; a reciprocal root may be an approximation.
+    root = jnp.sqrt(log[:, None] / jnp.maximum(visits, 1).astype(jnp.float32))
+    width = rounded_product(jnp.float32(exploration), root)
     # Each action is tried once before any is tried twice. inf stays inf where an action is not available.
     score = jnp.where(jnp.isinf(q_values), jnp.inf, jnp.where(visits == 0, -jnp.inf, q_values - width))
     action, least = first_of_least(score)

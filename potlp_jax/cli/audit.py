@@ -1,0 +1,86 @@
+"""``potlp audit``: trials judged against worlds that are made anew."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from potlp_jax.cli.group import Command, command_app
+from potlp_jax.cli.options import Json
+from potlp_jax.cli.output import FAILED, console, fail, print_json, progress_bar
+
+app = command_app()
+
+
+@app.command(
+    "audit",
+    cls=Command,
+    epilog="""
+[bold]Examples[/bold]
+
+[cyan]potlp audit out/validation[/cyan] - every trial of a sweep
+
+[cyan]potlp audit out/fire[/cyan] - the trial that `potlp run --out out/fire` wrote
+
+[dim]Ends with exit code 1 if anything is wrong.[/dim]
+""",
+)
+def audit(
+    path: Annotated[Path, typer.Argument(help="Folder of a sweep or of a trial, or a trial's record.", metavar="PATH")],
+    json: Json = False,
+) -> None:
+    """Check trials against their worlds, made anew: start, moves, cost, outcome, and violations of the task."""
+    from potlp_jax.sweep.runner import RESULTS
+
+    count, found = _sweep(path) if (path / RESULTS).is_file() else _trial(path)
+    violations = sum(problem.startswith("violates") for _, problem in found)
+    if json:
+        problems = [{"trial": trial, "problem": problem} for trial, problem in found]
+        print_json({"trials": count, "violations": violations, "problems": problems})
+    else:
+        for trial, problem in found:
+            console().print(f"{trial}: {problem}", markup=False)
+        console().print(f"{count} trials, {len(found)} problems, {violations} violations of the task", markup=False)
+    if found:
+        raise typer.Exit(FAILED)
+
+
+def _sweep(folder: Path) -> tuple[int, list[tuple[str, str]]]:
+    """How many trials a sweep has, and what is wrong with which."""
+    from potlp_jax.cli.inputs import open_store
+    from potlp_jax.sweep.audit import audit_rows
+    from potlp_jax.sweep.specification import specification_from_store
+
+    with open_store(folder) as store:
+        specification, rows = specification_from_store(store.facts()["specification"]), store.rows()
+
+    def judged() -> Iterator[tuple[str, str]]:
+        for row, problem in audit_rows(rows, specification.split, specification.seed):
+            item = row.item
+            yield f"{item.environment}, {item.task}, {item.policy}, world {item.world}", problem
+
+    with progress_bar() as progress:
+        progress.add_task(f"judging {len(rows)} trials", total=None)
+        return len(rows), list(judged())
+
+
+def _trial(path: Path) -> tuple[int, list[tuple[str, str]]]:
+    """One, and what is wrong with it."""
+    from potlp_jax.cli.inputs import record_file
+    from potlp_jax.environments.registry import make
+    from potlp_jax.environments.splits import Split
+    from potlp_jax.trials.record import LOG_PREFIX, load_trial
+    from potlp_jax.verify.audit import problems_of
+
+    file = record_file(path)
+    trial = load_trial(file)
+    if trial.environment.startswith(LOG_PREFIX):
+        fail(f"{file}: the trial is the replay of a robot's log: nobody but the log knows the world")
+    # As `potlp run` and `run` write it; the name of an environment may have slashes of its own.
+    environment, _, split = trial.environment.rpartition("/")
+    if not environment or split not in list(Split) or trial.world_number is None:
+        fail(f"{file}: does not say from which environment, split and number its world is: {trial.environment!r}")
+    generator = make(environment)
+    problems = problems_of(trial, generator.task(trial.task_text), generator.world(trial.world_number, Split(split)))
+    return 1, [(str(file), problem) for problem in problems]

@@ -1,0 +1,379 @@
+"""Files that are read: every reader of the library begins here, so that a bad file ends in one clear line, and soon.
+
+A reader asks for the contents (`read_bytes`, `read_text`, `read_json`, `read_yaml`, `read_npz`, `decode_image`), or,
+where another library opens the file itself, for `require_file`; and it parses within `reading`. Both raise the
+reader's own kind of `PotlpError`. What they see to:
+
+- only regular files are opened: a FIFO would wait for ever, and /dev/zero has no end;
+- sizes are checked before anything is read, unpacked or decoded, against limits that the message names;
+- whatever a parser raises on damaged input, an error of recursion or memory included, becomes one line.
+"""
+
+import contextlib
+import io
+import json
+import stat
+import warnings
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from jaxtyping import Shaped
+from PIL import Image, UnidentifiedImageError
+
+from potlp_jax.errors import PotlpError
+
+MIB = 1 << 20
+
+MOST_TEXT: int = 4 * MIB
+"""Bytes of a text that people or small programs write: automata, plans, manifests."""
+
+MOST_YAML: int = MIB // 2
+"""Bytes of a YAML file. Parsing takes seconds per megabyte; 400 rooms with 20 corners each are 120 kB."""
+
+MOST_RECORD: int = 256 * MIB
+"""Bytes of a JSON file that the library wrote: a trial of 1,000 decisions has some 10 MiB."""
+
+MOST_IMAGE: int = 256 * MIB
+"""Bytes of an image file."""
+
+MOST_PIXELS: int = 1 << 25
+"""Pixels of an image: 5,792 squared, nearly 300 m of building at 0.05 m a pixel. Reading takes some 40 bytes each."""
+
+MOST_ARRAYS: int = 1024 * MIB
+"""Bytes that the arrays of an .npz file may have when they are unpacked."""
+
+DEEPEST: int = 50
+"""Levels of YAML within each other; what is nested deeper is damage, and would exhaust the stack of the parser."""
+
+MOST_VALUES: int = 200_000
+"""Values of a YAML file with its aliases written out: ten lines of aliases of aliases can stand for billions."""
+
+# No setting has a longer name, and messages quote names whole.
+_LONGEST_NAME = 100
+_LONGEST_INTEGER = 63
+_LONGEST_REASON = 200
+"""Characters of another library's message that are passed on."""
+
+# What map savers and cameras write. Formats that run programs or fetch other files (EPS) are not among them.
+_IMAGE_FORMATS = ("PNG", "BMP", "JPEG", "TIFF", "WEBP", "PPM")
+_LIBYAML = yaml.__with_libyaml__
+
+
+def one_line(value: object, longest: int = _LONGEST_REASON) -> str:
+    """A text or an error for a message: on one line, printable, and not longer than ``longest`` characters."""
+    text = " ".join(str(value).split()) or type(value).__name__
+    text = text if len(text) <= longest else f"{text[: longest - 3]}..."
+    # Bytes of a damaged file may be escape sequences, which a terminal would obey.
+    return "".join(char if char.isprintable() else char.encode("unicode_escape").decode() for char in text)
+
+
+def short(value: object, longest: int = 80) -> str:
+    """A value as Python writes it, cut where it is long."""
+    # A file may hold a list of a million entries, and `repr` of a structure that holds itself or is deep fails.
+    with contextlib.suppress(RecursionError, ValueError):
+        return one_line(repr(value), longest)
+    return f"a {type(value).__name__}"
+
+
+@contextlib.contextmanager
+def reading(path: Path | str, error: type[PotlpError], what: str) -> Iterator[None]:
+    """Turn whatever reading a file raises into one error that names the file.
+
+    Parsers of damaged files fail in as many ways as files can be damaged, so all exceptions count here; hence only
+    parsing belongs within, not work with what was read.
+
+    Args:
+        path: the file, for the message.
+        error: what is raised.
+        what: that the file should have been, with its article: ``"a trial record"``.
+
+    Raises:
+        PotlpError: of the kind ``error``; errors of that family that the block raises itself pass through.
+    """
+    try:
+        yield
+    except PotlpError:
+        raise
+    except Exception as cause:
+        # Libraries raise OSError for damage, too; that of the system alone has a text for its number.
+        if isinstance(cause, OSError) and cause.strerror:
+            why = f"cannot be read ({cause.strerror})"
+        elif isinstance(cause, RecursionError):
+            why = f"is not {what}: it is nested too deeply"
+        elif isinstance(cause, MemoryError):
+            why = f"is not {what}, or is damaged: it asks for more memory than there is"
+        else:
+            why = f"is not {what}, or is damaged ({one_line(cause)})"
+        raise error.of_file(path, why) from cause
+
+
+def require_file(path: Path | str, error: type[PotlpError], most: int | None = None) -> Path:
+    """Check that a path is a regular file of at most so many bytes.
+
+    Args:
+        path: of the file.
+        error: what is raised.
+        most: bytes; None: any number, for formats that are read piece by piece.
+
+    Returns:
+        The path.
+
+    Raises:
+        PotlpError: of the kind ``error``: it is missing, something else than a file, or too large.
+    """
+    path = Path(path)
+    try:
+        found = path.stat()
+    # A null byte in a name is a ValueError, a name of 5,000 characters an OSError.
+    except (OSError, ValueError) as cause:
+        why = cause.strerror if isinstance(cause, OSError) else one_line(cause)
+        raise error.of_file(one_line(path), f"cannot be read ({why})") from cause
+    if not stat.S_ISREG(found.st_mode):
+        kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a device or pipe"
+        raise error.of_file(path, f"is {kind}; give a file")
+    if most is not None and found.st_size > most:
+        raise error.of_file(path, f"has {found.st_size:,} bytes; at most {most:,} are read")
+    return path
+
+
+def read_bytes(path: Path | str, error: type[PotlpError], most: int) -> bytes:
+    """The contents of a file.
+
+    Args:
+        path: of the file.
+        error: what is raised.
+        most: bytes that it may have.
+
+    Returns:
+        All its bytes.
+
+    Raises:
+        PotlpError: of the kind ``error``: it cannot be read, or is too large.
+    """
+    with reading(path, error, "a file"), require_file(path, error, most).open("rb") as stream:
+        # Files of /proc say that they have no bytes, and others grow while they are read.
+        contents = stream.read(most + 1)
+    if len(contents) > most:
+        raise error.of_file(path, f"has more than {most:,} bytes, which is all that is read")
+    return contents
+
+
+def read_text(path: Path | str, error: type[PotlpError], most: int = MOST_TEXT) -> str:
+    """The contents of a text file in UTF-8; see `read_bytes`."""
+    contents = read_bytes(path, error, most)
+    try:
+        return contents.decode("utf-8")
+    except UnicodeDecodeError as cause:
+        raise error.of_file(path, f"is no text in UTF-8 (byte {cause.start})") from cause
+
+
+def read_json(path: Path | str, error: type[PotlpError], what: str, most: int = MOST_RECORD) -> Any:
+    """The value in a JSON file; see `read_bytes` and `reading`."""
+    contents = read_bytes(path, error, most)
+    with reading(path, error, what):
+        return json.loads(contents)
+
+
+def read_yaml(path: Path | str, error: type[PotlpError], loader: type[Any] | None = None) -> Any:
+    """The value in a YAML file.
+
+    Args:
+        path: of the file.
+        error: what is raised.
+        loader: makes values of the text; None: those of ``yaml.safe_load``.
+
+    Returns:
+        The value.
+
+    Raises:
+        PotlpError: of the kind ``error``: it cannot be read, is no YAML, or is too large or too deep.
+    """
+    text = read_text(path, error, MOST_YAML)
+    with reading(path, error, "YAML"):
+        try:
+            return parse_yaml(text, loader)
+        # PyYAML's own words say where; the others (of dates, or of numbers with 5,000 digits) do not.
+        except yaml.YAMLError as cause:
+            why = one_line(cause, 400).replace('in "<unicode string>", line', "at line")
+            raise error.of_file(path, f"is not valid YAML: {why}") from cause
+
+
+def parse_yaml(text: str, loader: type[Any] | None = None) -> Any:
+    """The value of a YAML text. Raises YAMLError, or whatever a value that is out of range makes its type raise."""
+    _check_events(text)
+    return yaml.load(text, Loader=loader or (yaml.CSafeLoader if _LIBYAML else yaml.SafeLoader))
+
+
+def _check_events(text: str) -> None:
+    """Refuse nesting and aliases that would take the stack or the memory. Events come one by one and take neither."""
+    sizes: dict[str, int] = {}
+    # Of every collection that is open: its anchor, and its values so far.
+    open_collections: list[tuple[str | None, int]] = [(None, 0)]
+    for event in yaml.parse(text, Loader=yaml.CLoader if _LIBYAML else yaml.Loader):
+        added, anchor = 0, getattr(event, "anchor", None)
+        if isinstance(event, yaml.CollectionStartEvent):
+            open_collections.append((anchor, 0))
+            if len(open_collections) > DEEPEST:
+                raise yaml.YAMLError(f"more than {DEEPEST} levels within each other, line {event.start_mark.line + 1}")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, inside = open_collections.pop()
+            added = inside + 1
+        elif isinstance(event, yaml.AliasEvent):
+            # An alias within its own anchor has no size yet: a structure that holds itself has no end.
+            if anchor not in sizes:
+                raise yaml.YAMLError(f"alias {short(anchor)} stands for nothing, line {event.start_mark.line + 1}")
+            added, anchor = sizes[anchor], None
+        elif isinstance(event, yaml.ScalarEvent):
+            added = 1
+        if anchor is not None and added:
+            sizes[anchor] = added
+        outer, count = open_collections[-1]
+        open_collections[-1] = outer, count + added
+        if count + added > MOST_VALUES:
+            raise yaml.YAMLError(f"more than {MOST_VALUES:,} values, aliases written out")
+
+
+def read_npz(path: Path | str, error: type[PotlpError], what: str, most: int = MOST_ARRAYS) -> dict[str, np.ndarray]:
+    """The arrays of an ``.npz`` file.
+
+    Args:
+        path: of the file.
+        error: what is raised.
+        what: the file should have been, with its article.
+        most: bytes that its arrays may have when they are unpacked.
+
+    Returns:
+        The arrays by name. The checksums of the zip have been compared: a flipped bit does not go unnoticed.
+
+    Raises:
+        PotlpError: of the kind ``error``: it cannot be read, is something else, damaged, or too large.
+    """
+    require_file(path, error, most)
+    with reading(path, error, what), zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        # By the directory of the zip, before anything is unpacked: no member yields more than it says there.
+        size = sum(member.file_size for member in members)
+        if size > most:
+            raise error.of_file(path, f"would unpack to {size:,} bytes; at most {most:,} are read")
+        return {member.filename.removesuffix(".npy"): _array(archive.read(member)) for member in members}
+
+
+def _array(contents: bytes) -> np.ndarray:
+    """The array of an ``.npy`` file; its header is compared with its size before memory is taken."""
+    stream = io.BytesIO(contents)
+    version = np.lib.format.read_magic(stream)
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = header(stream)
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects")
+    # In Python's integers, which do not overflow: a shape of (2**40, 2**40) is damage, not zero bytes.
+    count = 1
+    for size in shape:
+        count *= size
+    found = len(contents) - stream.tell()
+    if count * dtype.itemsize != found:
+        raise ValueError(f"an array of shape {shape} and type {dtype} does not have {found} bytes")
+    array = np.frombuffer(contents, dtype, count, stream.tell())
+    return array.reshape(shape, order="F" if fortran else "C")
+
+
+def decode_image(contents: bytes, flags: int, whole: bool = False) -> Shaped[np.ndarray, "H W *C"]:
+    """Pixels of an encoded image, as OpenCV orders its channels.
+
+    Args:
+        contents: a file of one of the usual formats.
+        flags: of ``cv2.imdecode``.
+        whole: refuse what is cut short in any format, at the price of decoding twice.
+
+    Returns:
+        The pixels.
+
+    Raises:
+        ValueError: it has more than `MOST_PIXELS`, as its header says before anything is decoded; or it is damaged. PNG
+            has checksums: none of its damage goes unnoticed. So do other errors of Pillow.
+    """
+    # OpenCV passes over the checksums of PNG, and shows grey for what is missing of a JPEG; Pillow does neither.
+    with _header(contents) as image:
+        width, height = image.size
+        if image.format == "PNG":
+            image.verify()
+        elif whole:
+            image.load()
+    pixels = _decoded(contents, flags)
+    # Either of the two libraries may reject what the other reads.
+    if pixels is None or pixels.shape[:2] not in ((height, width), (width, height)):
+        raise ValueError("its pixels cannot be decoded")
+    return pixels
+
+
+def _decoded(contents: bytes, flags: int) -> np.ndarray | None:
+    # OpenCV writes its own lines about damage to the error stream, beside the one that the reader's error is.
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        return cv2.imdecode(np.frombuffer(contents, np.uint8), flags)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
+def image_size(contents: bytes) -> tuple[int, int]:
+    """Width and height of an encoded image, by its header. Raises ValueError, and whatever Pillow raises."""
+    with _header(contents) as image:
+        return image.size
+
+
+def _header(contents: bytes) -> Image.Image:
+    """An image of which only the header is read. Raises ValueError."""
+    with warnings.catch_warnings():
+        # Pillow has a limit on pixels of its own, far above this one, and speaks of attacks.
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        try:
+            image = Image.open(io.BytesIO(contents), formats=_IMAGE_FORMATS)
+        except UnidentifiedImageError as error:
+            raise ValueError("it does not begin as any image does") from error
+        except Image.DecompressionBombError as error:
+            raise ValueError(f"it has more than the {MOST_PIXELS:,} pixels that are read at most") from error
+    width, height = image.size
+    if width * height > MOST_PIXELS:
+        raise ValueError(f"it has {width:,} x {height:,} pixels; at most {MOST_PIXELS:,} are read")
+    return image
+
+
+def require_mapping(path: Path | str, value: Any, error: type[PotlpError], what: str) -> dict[str, Any]:
+    """Check that the value of a file is entries by name, at every depth, as JSON could hold them.
+
+    Args:
+        path: the file, for the message.
+        value: what was read from it; no deeper than `DEEPEST` levels.
+        error: what is raised.
+        what: that the file should have been, with its article.
+
+    Returns:
+        The value.
+
+    Raises:
+        PotlpError: of the kind ``error``: it is something else, or holds names that are no texts (YAML reads ``on`` and
+            ``1`` as others), or whole numbers beyond 64 bits.
+    """
+    if not isinstance(value, dict):
+        raise error.of_file(path, f"is not {what}: give a mapping of names to values, found {short(value)}")
+    wrong = next(_not_json(value), None)
+    if wrong is not None:
+        raise error.of_file(path, f"is not {what}: {wrong}")
+    return value
+
+
+def _not_json(value: Any) -> Iterator[str]:
+    if isinstance(value, dict):
+        yield from (f"name {short(name)} is no text: put it in quotes" for name in value if not isinstance(name, str))
+        yield from (f"name {short(name)} is too long" for name in value if len(str(name)) > _LONGEST_NAME)
+        yield from (wrong for entry in value.values() for wrong in _not_json(entry))
+    elif isinstance(value, list):
+        yield from (wrong for entry in value for wrong in _not_json(entry))
+    # Beyond 64 bits no setting has a meaning, and beyond 4,300 digits Python itself refuses to write a number.
+    elif isinstance(value, int) and value.bit_length() > _LONGEST_INTEGER:
+        yield "a whole number is beyond 64 bits"

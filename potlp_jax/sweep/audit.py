@@ -1,0 +1,69 @@
+"""Check the rows of a sweep against worlds that are made anew, by rules that the planner does not share."""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import jax
+import numpy as np
+
+from potlp_jax.environments.base import Generator
+from potlp_jax.environments.registry import make
+from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.sweep.rows import read_path
+from potlp_jax.sweep.store import Row
+from potlp_jax.trials.rules import trial_key
+from potlp_jax.verify.audit import problems_of_path
+from potlp_jax.world.grid import World, world_digest
+
+
+def audit_rows(
+    rows: Sequence[Row], split: Split, seed: int = 0, generator_of: Callable[[str], Generator] = make
+) -> Iterator[tuple[Row, str]]:
+    """What is wrong with the trials of a sweep.
+
+    Args:
+        rows: of one sweep, in any order.
+        split: from which its worlds are.
+        seed: of its trials' keys.
+        generator_of: the family of worlds of an environment's name.
+
+    Returns:
+        Each row with one sentence for each of its problems, ordered by environment and world; rows without any are not
+        among them. A sentence about a violation of the task begins with ``violates``.
+    """
+    # Making a world takes longer than judging a trial in it: each is made once, for the trials of all policies.
+    made: tuple[str, int] | None = None
+    generator, world = None, None
+    for row in sorted(rows, key=lambda row: (row.item.environment, row.item.world)):
+        environment, number = row.item.environment, row.item.world
+        if generator is None or made is None or made[0] != environment:
+            generator = generator_of(environment)
+        if world is None or made != (environment, number):
+            world = generator.generate(world_key(split, number, generator.name))
+        made = (environment, number)
+        yield from ((row, problem) for problem in problems_of_row(row, world, seed))
+
+
+def problems_of_row(row: Row, world: World, seed: int = 0) -> list[str]:
+    """What is wrong with one trial; an empty list if nothing is.
+
+    Args:
+        row: of the store.
+        world: the one of the row's environment, split and number.
+        seed: of the sweep's keys.
+
+    Returns:
+        One sentence for each problem.
+    """
+    found = []
+    # A path may be legal in another world by chance. The digest tells what the row was made in.
+    if row.world_digest != world_digest(world):
+        found.append("was in another world: its digest is not that of the row's environment, split and number")
+    if row.key != tuple(np.asarray(jax.random.key_data(trial_key(row.item.world, seed))).tolist()):
+        found.append("was made with another key than that of its world and the sweep's seed")
+    try:
+        path = read_path(row.path)
+    except (ValueError, IndexError):
+        return [*found, f"its path cannot be read: {row.path[:40]!r}"]
+    if row.steps != len(path) - 1:
+        found.append(f"has {row.steps} steps, its path {len(path) - 1}")
+    return found + problems_of_path(world, path, row.cost, row.outcome, row.item.task)

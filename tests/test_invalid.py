@@ -1,0 +1,171 @@
+"""Inputs that the model does not allow: nothing is planned with them, and no other row of a batch is harmed."""
+
+import copy
+import dataclasses
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from potlp_jax.errors import ProblemError
+from potlp_jax.planning.problem import PlanningProblem, screen
+from potlp_jax.planning.search.api import plan_actions, search
+from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
+from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL, Status
+from tests.reference.problems import random_problem
+
+TASK = "F a & F b"
+SEARCHES = (BestFirstConfig(simulations=60), UctConfig(simulations=60))
+SUBGOALS = 3
+
+# An array, an index of a real entry, and a value that may not be there.
+WRONG = [
+    ("success_probability", (0, 0), 1.5),
+    ("success_probability", (1, 2), -0.1),
+    ("success_probability", (0, 1), np.nan),
+    ("success_cost", (0, 0), np.nan),
+    ("success_cost", (1, 1), np.inf),
+    ("success_cost", (1, 1), 3e38),
+    ("success_cost", (0, 3), 0.0),
+    ("success_cost", (0, 3), -2.0),
+    ("failure_cost", (1, 0), np.nan),
+    ("failure_cost", (0, 0), np.inf),
+    ("failure_cost", (0, 0), -1.0),
+    ("travel", (SUBGOALS, 0, 1, 0), np.nan),
+    ("travel", (0, 1, 1, 1), -3.0),
+    ("travel", (0, 1, 1, 1), -np.inf),
+    ("finish", (SUBGOALS, 0), np.nan),
+    ("finish", (1, 2), -0.5),
+    ("dead_end_cost", (), np.nan),
+    ("dead_end_cost", (), 0.0),
+    ("dead_end_cost", (), np.inf),
+    ("dfa_state", (), 99),
+    ("dfa_state", (), -1),
+]
+
+
+@cache
+def valid_problem() -> PlanningProblem:
+    """Two real subgoals of three."""
+    problem = random_problem(TASK, SUBGOALS, seed=0)
+    return dataclasses.replace(problem, subgoal_mask=jnp.array([True, True, False]))
+
+
+def of_shape(problem: PlanningProblem, name: str, shape: tuple[int, ...]) -> PlanningProblem:
+    """A problem with an array of another shape, past the checks of annotations that run in tests alone."""
+    wrong = copy.copy(problem)
+    object.__setattr__(wrong, name, jnp.ones(shape, getattr(problem, name).dtype))
+    return wrong
+
+
+def stack(problems: list[PlanningProblem]) -> PlanningProblem:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems)
+
+
+def with_value(problem: PlanningProblem, name: str, index: tuple[int, ...], value: float) -> PlanningProblem:
+    return dataclasses.replace(problem, **{name: getattr(problem, name).at[index].set(value)})
+
+
+@cache
+def searches_of_one():
+    return {config: jax.jit(plan_actions, static_argnames="config") for config in SEARCHES}
+
+
+def plan(problem: PlanningProblem, config: BestFirstConfig | UctConfig):
+    return searches_of_one()[config](problem, jax.random.key(0), config)
+
+
+@pytest.mark.parametrize("config", SEARCHES, ids=lambda config: config.kind)
+@pytest.mark.parametrize(("name", "index", "value"), WRONG)
+def test_an_invalid_problem_has_no_action_in_either_search(name, index, value, config):
+    found = plan(with_value(valid_problem(), name, index, value), config)
+    assert Status(int(found.status)) == Status.INVALID
+    assert (int(found.action), int(found.subgoal)) == (NO_ACTION, NO_SUBGOAL)
+    assert (int(found.from_state), int(found.to_state)) == (NO_STATE, NO_STATE)
+    assert float(found.value) == np.inf
+    assert bool(jnp.all(jnp.isinf(found.q_values)))
+    assert not np.any(found.visits)
+
+
+@pytest.mark.parametrize(("name", "index", "value"), WRONG)
+def test_the_host_names_the_value_that_the_search_refuses(name, index, value):
+    """One set of rules: what one of them lets pass, the other must not refuse."""
+    problem = with_value(valid_problem(), name, index, value)
+    assert bool(screen(problem)[1])
+    with pytest.raises(ProblemError, match=name):
+        problem.check()
+
+
+@pytest.mark.parametrize("config", SEARCHES, ids=lambda config: config.kind)
+def test_absent_entries_may_hold_anything(config):
+    """``subgoal_mask`` is False for the third subgoal: none of its rows and columns counts."""
+    problem = valid_problem()
+    absent = SUBGOALS - 1
+    filled = dataclasses.replace(
+        problem,
+        travel=problem.travel.at[absent].set(jnp.nan).at[:, :, absent].set(-1.0),
+        finish=problem.finish.at[absent].set(jnp.nan),
+        success_probability=problem.success_probability.at[absent].set(jnp.nan),
+        success_cost=problem.success_cost.at[absent].set(-jnp.inf),
+        failure_cost=problem.failure_cost.at[absent].set(jnp.nan),
+    )
+    filled.check()
+    wanted, found = plan(problem, config), plan(filled, config)
+    assert int(wanted.action) != NO_ACTION
+    for field in dataclasses.fields(wanted):
+        np.testing.assert_array_equal(getattr(found, field.name), getattr(wanted, field.name), field.name)
+
+
+@pytest.mark.parametrize("config", SEARCHES, ids=lambda config: config.kind)
+def test_invalid_rows_of_a_batch_leave_the_others_as_they_are(config):
+    good = [
+        dataclasses.replace(random_problem(TASK, SUBGOALS, seed), subgoal_mask=jnp.ones(3, bool)) for seed in range(3)
+    ]
+    bad = [with_value(good[0], name, index, value) for name, index, value in WRONG[:3]]
+    keys = jax.vmap(jax.random.key)(jnp.zeros(6, jnp.uint32))
+    # Good and bad in turn; and the same batch with good ones in place of the bad.
+    mixed = stack([problem for pair in zip(good, bad, strict=True) for problem in pair])
+    clean = stack([problem for each in good for problem in (each, each)])
+    for run in (
+        jax.jit(lambda problems: search(problems, keys, config)[0]),
+        jax.jit(jax.vmap(lambda problem: plan_actions(problem, keys[0], config))),
+    ):
+        found, wanted = run(mixed), run(clean)
+        assert [Status(int(status)) for status in found.status[1::2]] == [Status.INVALID] * 3
+        assert np.all(found.action[1::2] == NO_ACTION)
+        for field in dataclasses.fields(found):
+            rows = getattr(found, field.name)[::2], getattr(wanted, field.name)[::2]
+            np.testing.assert_array_equal(*rows, field.name)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "expected"),
+    [
+        ("success_probability", (3, 1), r"\(3, 5\)"),
+        ("success_cost", (1, 5), r"\(3, 5\)"),
+        ("failure_cost", (5,), r"\(3, 5\)"),
+        ("travel", (3, 4, 3, 4), r"\(4, 4, 3, 4\)"),
+        ("finish", (4, 1), r"\(4, 4\)"),
+        ("dfa_state", (1,), r"\(\)"),
+        ("dead_end_cost", (3,), r"\(\)"),
+        ("subgoal_mask", (), r"\('S',\)"),
+    ],
+)
+def test_shapes_are_checked_when_the_search_is_traced(name, shape, expected):
+    """[S, 1] would broadcast to the same answer for every class."""
+    wrong = of_shape(valid_problem(), name, shape)
+    message = rf"{name} has shape \({', '.join(map(str, shape))},?\), expected {expected}"
+    with pytest.raises(ProblemError, match=message):
+        jax.eval_shape(lambda key: plan_actions(wrong, key), jax.random.key(0))
+
+
+def test_shapes_of_a_batch_are_checked_with_its_axis():
+    problems = jax.tree.map(lambda leaf: leaf[None].repeat(2, axis=0), valid_problem())
+    wrong = of_shape(problems, "success_probability", (2, 3, 1))
+    keys = jax.vmap(jax.random.key)(jnp.arange(2))
+    with pytest.raises(ProblemError, match=r"success_probability has shape \(2, 3, 1\), expected \(2, 3, 5\)"):
+        jax.eval_shape(lambda keys: search(wrong, keys), keys)
+    with pytest.raises(ProblemError, match=r"subgoal_mask has shape \(2, 3\), expected \(3, 'S'\)"):
+        jax.eval_shape(lambda problems: search(problems, jax.vmap(jax.random.key)(jnp.arange(3))), problems)

@@ -1,0 +1,64 @@
+"""The mutation check: its mutants can be made, and its verdicts are right. ``python -m eval.mutants`` runs it."""
+
+import collections
+import dataclasses
+
+import pytest
+
+from eval.mutants.__main__ import judge, stale, table
+from eval.mutants.core import MUTANTS, Mutant
+
+# 1 + 1 made wrong; what is imported stands beside the test.
+SUM = Mutant("a part", "a sum is a difference", "sums.py", "a + b", "a - b", ("tests/test_sums.py",))
+
+
+@pytest.fixture
+def tree(tmp_path):
+    """A tree with one function and its tests."""
+    (tmp_path / "sums.py").write_text("def add(a, b):\n    return a + b  # a sum\n")
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests" / "test_sums.py").write_text(
+        "from sums import add\n\n\ndef test_sum():\n    assert add(1, 1) == 2\n\n\n"
+        "def test_nothing_much():\n    assert add(0, 0) == 0\n"
+    )
+    return tmp_path
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.says)
+def test_no_mutant_is_stale(mutant):
+    assert stale(mutant) is None
+    assert mutant.old != mutant.new
+
+
+def test_every_part_of_the_core_has_mutants():
+    assert len(MUTANTS) == len({(mutant.file, mutant.old, mutant.new) for mutant in MUTANTS}) >= 30
+    assert len({mutant.says for mutant in MUTANTS}) == len(MUTANTS)
+    assert min(collections.Counter(mutant.part for mutant in MUTANTS).values()) >= 5
+
+
+def test_a_mutant_whose_text_is_gone_or_occurs_twice_is_stale(tree):
+    assert stale(SUM, tree) is None
+    assert "occurs 0 times" in str(stale(dataclasses.replace(SUM, old="a * b"), tree))
+    assert "occurs 2 times" in str(stale(dataclasses.replace(SUM, old="b"), tree))
+    assert "there is no tests/test_none.py" in str(stale(dataclasses.replace(SUM, tests=("tests/test_none.py",)), tree))
+
+
+def test_verdicts(tree):
+    sound = (tree / "sums.py").read_text()
+    found = judge(SUM, tree)
+    assert (found["verdict"], found["by"]) == ("caught", "test_sums.py::test_sum")
+    assert judge(dataclasses.replace(SUM, only="nothing_much"), tree)["verdict"] == "survived"
+    assert judge(dataclasses.replace(SUM, only="no_such_test"), tree)["verdict"] == "not tested"
+    # The fault is taken back.
+    assert (tree / "sums.py").read_text() == sound
+
+
+def test_the_table_counts_what_is_caught():
+    rows = [
+        {"part": "a part", "fault": "one", "file": "potlp_jax/a.py", "verdict": "caught", "by": "test_a.py::test_b"},
+        {"part": "a part", "fault": "two", "file": "potlp_jax/a.py", "verdict": "survived", "by": ""},
+    ]
+    text = table(rows)
+    assert "1 of 2 mutants are caught." in text
+    assert "| one | `a.py` | `test_a.py::test_b` |" in text
+    assert "| two | `a.py` | **survived** |" in text
