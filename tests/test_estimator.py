@@ -16,11 +16,11 @@ from potlp_jax.learning.estimator import (
     SURE,
     estimator_for,
     exclusive_chances,
-    observe_panorama,
     read_estimator,
     shipped_estimator,
 )
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
+from potlp_jax.learning.observing import observe_panorama
 from potlp_jax.learning.serialization import save_estimator
 from potlp_jax.planning.decision import subgoals_at
 from potlp_jax.planning.policies import Policy

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +14,10 @@ from potlp_jax.codec import config_from_dict
 from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import PluginError, RecordError
-from potlp_jax.learning.estimator import TrainedEstimator, observe_panorama
+from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
+from potlp_jax.learning.observing import observe_panorama
 from potlp_jax.planning import policies
 from potlp_jax.planning.move import MoveKind
 from potlp_jax.planning.policies import Policy, decide
@@ -78,7 +80,14 @@ def test_trials_keep_their_promises(policy):
 def test_an_episode_compiles_nothing_new():
     """After one trial of each policy, another world and another task run with the programs that are there."""
     rules = (trial_module._first_tally, trial_module._arrive, trial_module._stop_of, trial_module._count_decision)
-    programs = (trial_module._decide, *rules, robot.follow, robot._observe, robot.photograph, observe_panorama)
+    programs: tuple[Any, ...] = (
+        trial_module._decide,
+        *rules,
+        robot.follow,
+        robot._observe,
+        robot.photograph,
+        observe_panorama,
+    )
 
     def run_all(number):
         for policy in Policy:

@@ -127,21 +127,15 @@ class NetworkEstimator:
         poses = self.memory.cells[slots_of_observations(self.memory, observation_of_subgoals(self.memory, subgoals))]
         return _distances(belief, poses, subgoals)
 
-    def observe(
-        self, panorama: UInt8[Array, "rows columns 3"], belief: BeliefMap, cell: Int32[Array, "2"]
+    def encode(self, panorama: UInt8[Array, "rows columns 3"]) -> Float32[Array, "feature_rows feature_columns F"]:
+        """The first stage's features of a panorama."""
+        return EstimatorNetwork(self.config).encode(self.params, panorama)
+
+    def remember(
+        self, seen: Float32[Array, "feature_rows feature_columns F"], belief: BeliefMap, cell: Int32[Array, "2"]
     ) -> "NetworkEstimator":
-        """The estimator after an observation.
-
-        Args:
-            panorama: what the camera saw, in the frame of the map.
-            belief: the map after the observation.
-            cell: where the panorama was taken.
-
-        Returns:
-            The same estimator with one panorama more in memory.
-        """
-        features = EstimatorNetwork(self.config).encode(self.params, panorama)
-        return dataclasses.replace(self, memory=remember(self.memory, features, belief, cell))
+        """The estimator with one panorama more in memory (``learning.memory.remember``)."""
+        return dataclasses.replace(self, memory=remember(self.memory, seen, belief, cell))
 
 
 def exclusive_chances(chances: Float32[Array, "S C"], subgoals: Subgoals, within: float) -> Float32[Array, "S C"]:
@@ -212,10 +206,6 @@ class TrainedEstimator:
         """
         empty = empty_memory(panoramas, self.config.feature_shape, height, width)
         return NetworkEstimator(params=self.params, memory=empty, config=self.config)
-
-
-observe_panorama = jax.jit(NetworkEstimator.observe)
-"""``NetworkEstimator.observe`` compiled: one compilation per network and size of the map."""
 
 
 @functools.lru_cache(maxsize=8)

@@ -150,7 +150,7 @@ class TaskEnv:
         # What the planner calls A - 1: all pairs of a subgoal and an edge come first.
         self._finish = self.config.decision.frontiers.max_subgoals * self._edges
         # No policy decides here; the setup only carries the rules of a leg.
-        self._setup = Setup(policy=Policy.BASELINE, config=self.config, network=None)
+        self._setup = Setup(policy=Policy.BASELINE, config=self.config)
 
     @classmethod
     def of_family(

@@ -11,6 +11,7 @@ import time
 from collections.abc import Hashable, Iterable, Iterator
 from functools import partial
 from itertools import chain
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from jaxtyping import Array, Bool, Int32, PRNGKeyArray
 
 from potlp_jax.errors import BatchError
 from potlp_jax.learning.estimator import TrainedEstimator
-from potlp_jax.learning.memory import PanoramaMemory
+from potlp_jax.learning.observing import ObservingEstimator
 from potlp_jax.learning.serialization import require_propositions
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy, PolicyFunction, named_policy
@@ -116,21 +117,19 @@ def run_batch(
     _check_start(first, first)
     config = rules.config_of(policy, config_in(first.world, config))
     asked = rules.asked_of(policy, estimator)
-    network = asked.config if isinstance(asked, TrainedEstimator) else None
     if isinstance(asked, TrainedEstimator):
         require_propositions(asked.config, first.arrays.propositions, f"estimator {asked.name}")
-    yield from _run(first, starts, Setup(policy=policy, config=config, network=network), slots, asked)
+    yield from _run(first, starts, Setup(policy=policy, config=config), slots, asked)
 
 
 def _run(
     first: Start, others: Iterator[Start], setup: Setup, count: int, asked: TrainedEstimator | Estimator | None
 ) -> Iterator[Finished]:
     starts = chain([first], others)
-    views, shared = None, asked
-    if isinstance(asked, TrainedEstimator):
-        # Parameters are the same in all slots; what a robot has seen is its own.
-        views, shared = asked.start(*first.world.shape, setup.config.panoramas).memory, asked.params
-    slots: tuple[Scene, Progress] = _empty_slots(first, views, setup, count)
+    shared = asked.start(*first.world.shape, setup.config.panoramas) if isinstance(asked, TrainedEstimator) else asked
+    # Parameters are the same in all slots; what a robot has seen is its own.
+    memory = shared.memory if isinstance(shared, ObservingEstimator) else None
+    slots: tuple[Scene, Progress] = _empty_slots(first, memory, setup, count)
     # Which trial is in which slot is the host's matter; the device knows slots alone.
     held: list[Start | None] = [None] * count
     seconds = np.zeros(count)
@@ -138,7 +137,7 @@ def _run(
         for slot in range(count):
             while held[slot] is None and (start := next(starts, None)) is not None:
                 _check_start(start, first)
-                slots = _fill(slots, jnp.int32(slot), start.world, start.arrays, start.key, views, setup=setup)
+                slots = _fill(slots, jnp.int32(slot), start.world, start.arrays, start.key, memory, setup=setup)
                 held[slot], seconds[slot] = start, 0.0
         occupied = [slot for slot, start in enumerate(held) if start is not None]
         if not occupied:
@@ -201,10 +200,10 @@ def _finished(start: Start, progress: Progress, slot: int, seconds: float) -> Fi
     )
 
 
-def _empty_slots(first: Start, views: PanoramaMemory | None, setup: Setup, count: int) -> tuple[Scene, Progress]:
+def _empty_slots(first: Start, memory: Any, setup: Setup, count: int) -> tuple[Scene, Progress]:
     """Slots without trials, of the shape of ``first``."""
     # Any trial gives the shapes; its values never run, for the slot is marked empty.
-    scene, progress = begin(first.world, first.arrays, first.key, views, setup=setup)
+    scene, progress = begin(first.world, first.arrays, first.key, memory, setup=setup)
     progress = dataclasses.replace(progress, tally=dataclasses.replace(progress.tally, outcome=jnp.int8(EMPTY)))
     return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], count, axis=0), (scene, progress))
 
@@ -216,12 +215,12 @@ def _fill(
     world: World,
     arrays: TaskArrays,
     key: PRNGKeyArray,
-    views: PanoramaMemory | None,
+    memory: Any,
     *,
     setup: Setup,
 ) -> tuple[Scene, Progress]:
     # Donated: the arrays of all slots are changed in place instead of copied for each new trial.
-    new = begin(world, arrays, key, views, setup=setup)
+    new = begin(world, arrays, key, memory, setup=setup)
     return jax.tree.map(lambda leaf, entry: leaf.at[slot].set(entry), slots, new)
 
 

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int32, PRNGKeyArray
 
-from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator, identity_of, observe_panorama
+from potlp_jax.learning.estimator import TrainedEstimator, identity_of
+from potlp_jax.learning.observing import ObservingEstimator, observe_panorama
 from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.move import Move, MoveKind
@@ -185,7 +186,7 @@ class _Loop:
         # By the number of the decision: the same whatever was drawn before it.
         at, key = jnp.asarray(cell, jnp.int32), rules.decision_key(self._key, index)
         # Before the decision, so that its estimates know what can be seen from here.
-        if isinstance(self._estimator, NetworkEstimator):
+        if isinstance(self._estimator, ObservingEstimator):
             self._estimator = observe_panorama(self._estimator, self._robot.panorama(), belief, at)
         move = _decide(
             belief,

@@ -9,8 +9,9 @@ from jaxtyping import Array, Int32, UInt8
 
 from potlp_jax.codec import config_from_dict
 from potlp_jax.errors import EstimatorError, RecordError
-from potlp_jax.learning.estimator import TrainedEstimator, identity_of, observe_panorama
+from potlp_jax.learning.estimator import TrainedEstimator, identity_of
 from potlp_jax.learning.labels import TrueMapEstimator
+from potlp_jax.learning.observing import observe_panorama
 from potlp_jax.planning.estimates import Estimator, ask
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.problem import PlanningProblem

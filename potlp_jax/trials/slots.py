@@ -17,10 +17,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Int16, Int32, Key, PRNGKeyArray
 
-from potlp_jax.learning.estimator import NetworkEstimator
 from potlp_jax.learning.labels import TrueMapEstimator
-from potlp_jax.learning.memory import PanoramaMemory, remember
-from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
+from potlp_jax.learning.observing import ObservingEstimator, with_memory
 from potlp_jax.planning.estimates import Estimates, Estimator, ask
 from potlp_jax.planning.move import Move, MoveKind
 from potlp_jax.planning.policies import Policy, PolicyFunction, planned_move, policy_function
@@ -48,8 +46,8 @@ from potlp_jax.world.sensing import observe
 EMPTY: int = -2
 """``Tally.outcome`` of a slot without a trial; neither running nor ended."""
 
-Asked = Params | Estimator | None
-"""What all slots share of what the policy asks: parameters of the network, a whole estimator, or nothing."""
+Asked = ObservingEstimator | Estimator | None
+"""What all slots share of what the policy asks: an estimator, whose memory is that of the beginning, or nothing."""
 
 
 @struct.dataclass(kw_only=True)
@@ -74,7 +72,7 @@ class Progress:
 
     Attributes:
         belief: what is known of the map.
-        views: panoramas seen so far; None for a policy that takes none.
+        memory: of the estimator; None where the policy asks none that remembers.
         first_seen: step at which each cell was first observed.
         cell: where the robot is.
         path: cells so far, ``tally.steps + 1`` of them; what stands behind them means nothing.
@@ -82,7 +80,7 @@ class Progress:
     """
 
     belief: BeliefMap
-    views: PanoramaMemory | None
+    memory: Any
     first_seen: Int32[Array, "*batch H W"]
     cell: Int32[Array, "*batch 2"]
     path: Int16[Array, "*batch L 2"]
@@ -91,11 +89,10 @@ class Progress:
 
 @dataclasses.dataclass(frozen=True)
 class Setup:
-    """What all trials of a batch share, static under jit; ``network`` is None for policies that take no panoramas."""
+    """What all trials of a batch share, static under jit."""
 
     policy: Policy | PolicyFunction
     config: TrialConfig
-    network: NetworkConfig | None
 
     @property
     def searches(self) -> bool:
@@ -104,16 +101,14 @@ class Setup:
 
 
 @partial(jax.jit, static_argnames="setup")
-def begin(
-    world: World, arrays: TaskArrays, key: PRNGKeyArray, views: PanoramaMemory | None, *, setup: Setup
-) -> tuple[Scene, Progress]:
+def begin(world: World, arrays: TaskArrays, key: PRNGKeyArray, memory: Any, *, setup: Setup) -> tuple[Scene, Progress]:
     """A trial before its first decision; what is visible from the start is known.
 
     Args:
         world: the true map, padded to the batch's shape.
         arrays: of the task, padded to the batch's sizes.
         key: of the trial.
-        views: an empty memory of panoramas, or None.
+        memory: of an estimator that has seen nothing yet, or None.
         setup: of the batch; static.
 
     Returns:
@@ -127,7 +122,7 @@ def begin(
     length = math.ceil(config.budget_factor * (height + width)) + 2 + config.decision.horizon(height, width)
     progress = Progress(
         belief=belief,
-        views=views,
+        memory=memory,
         first_seen=first_seen_at_start(belief),
         cell=world.start,
         path=jnp.zeros((length, 2), jnp.int16).at[0].set(world.start.astype(jnp.int16)),
@@ -165,12 +160,12 @@ def _search_together(scene: Scene, asked: Asked, setup: Setup, progress: Progres
     decision = setup.config.decision
 
     def prepare(progress: Progress, scene: Scene) -> tuple[Any, ...]:
-        views, situation, estimates, key = _consider(setup, asked, progress, scene)
+        memory, situation, estimates, key = _consider(setup, asked, progress, scene)
         running = progress.tally.running
         problem = _phase(running, partial(planning_problem, config=decision), situation, estimates)
-        return views, situation, problem, key
+        return memory, situation, problem, key
 
-    views, situation, problem, keys = _each(prepare, progress, scene)
+    memory, situation, problem, keys = _each(prepare, progress, scene)
     # ``plan_actions`` turns this vmap into one kernel with a batch axis: its loop ends when the last slot is done.
     plans = jax.vmap(lambda problem, key: plan_actions(problem, key, decision.search))(problem, keys)
 
@@ -180,19 +175,19 @@ def _search_together(scene: Scene, asked: Asked, setup: Setup, progress: Progres
         return advance(setup, progress, scene, move)
 
     # Intentions come from the progress, not from the search: commitment is applied when the plan is carried out.
-    return _each(act, dataclasses.replace(progress, views=views), scene, situation, problem, plans)
+    return _each(act, dataclasses.replace(progress, memory=memory), scene, situation, problem, plans)
 
 
 def _decide_alone(setup: Setup, asked: Asked, progress: Progress, scene: Scene) -> Progress:
     """Decide in one slot, with whatever function the policy is, and go."""
-    views, situation, estimates, key = _consider(setup, asked, progress, scene)
+    memory, situation, estimates, key = _consider(setup, asked, progress, scene)
     tally, config = progress.tally, setup.config.decision
 
     def decide(situation: Situation, estimates: Estimates | None, key: PRNGKeyArray, intention: Any) -> Move:
         return policy_function(setup.policy)(situation, estimates, key, config, intention)
 
     move = _phase(tally.running, decide, situation, estimates, key, tally.intention)
-    return advance(setup, dataclasses.replace(progress, views=views), scene, move)
+    return advance(setup, dataclasses.replace(progress, memory=memory), scene, move)
 
 
 def _each(function: Any, *batches: Any) -> Any:
@@ -232,11 +227,11 @@ def _zeros(leaf: Any) -> Array:
 
 def _consider(
     setup: Setup, asked: Asked, progress: Progress, scene: Scene
-) -> tuple[PanoramaMemory | None, Situation, Estimates | None, PRNGKeyArray]:
+) -> tuple[Any, Situation, Estimates | None, PRNGKeyArray]:
     """What every policy is given: the situation, and estimates where it asks for them."""
     # Panorama first: an estimator answers from what can be seen here too.
     running = progress.tally.running
-    views = None if setup.network is None else _take_panorama(setup, setup.network, asked, progress, scene)
+    memory = None if progress.memory is None else _memory_after_panorama(setup, asked, progress, scene)
     situation = _phase(
         running,
         partial(assess, config=setup.config.decision.frontiers),
@@ -247,43 +242,38 @@ def _consider(
     )
     # Known when tracing: a policy without an estimator has no such phase in its program.
     estimates = None
-    if _estimator(setup, asked, views, scene) is not None:
+    if _estimator(setup, asked, memory, scene) is not None:
 
         def estimate(progress: Progress, subgoals: Subgoals, scene: Scene) -> Estimates:
-            estimator = _estimator(setup, asked, progress.views, scene)
+            estimator = _estimator(setup, asked, progress.memory, scene)
             assert estimator is not None
             return ask(estimator, progress.belief, subgoals, scene.task, progress.tally.state)
 
-        estimates = _phase(running, estimate, dataclasses.replace(progress, views=views), situation.subgoals, scene)
+        estimates = _phase(running, estimate, dataclasses.replace(progress, memory=memory), situation.subgoals, scene)
         situation = situation.with_status_of(estimates)
     # As in the loop: by the number of the decision.
-    return views, situation, estimates, decision_key(scene.planning, progress.tally.decisions)
+    return memory, situation, estimates, decision_key(scene.planning, progress.tally.decisions)
 
 
-def _take_panorama(
-    setup: Setup, network: NetworkConfig, asked: Asked, progress: Progress, scene: Scene
-) -> PanoramaMemory:
-    """What is remembered after a panorama from here."""
+def _memory_after_panorama(setup: Setup, asked: Asked, progress: Progress, scene: Scene) -> Any:
+    """What the estimator remembers after a panorama from here."""
+    assert isinstance(asked, ObservingEstimator)
     config, running = setup.config, progress.tally.running
     # As ``SimulatedRobot.panorama``.
     key = jax.random.fold_in(scene.sensing, progress.tally.steps)
     camera = partial(photograph, camera=config.camera, disturbance=config.disturbance)
     panorama = _phase(running, camera, scene.world, progress.cell, key)
-    features = _phase(running, EstimatorNetwork(network).encode, asked, panorama)
-    views = progress.views
-    assert views is not None
+    seen = _phase(running, lambda asked, panorama: asked.encode(panorama), asked, panorama)
     # Not a phase of its own: a branch would copy the memory.
-    return remember(views, features, progress.belief, progress.cell)
+    return with_memory(asked, progress.memory).remember(seen, progress.belief, progress.cell).memory
 
 
-def _estimator(setup: Setup, asked: Asked, views: PanoramaMemory | None, scene: Scene) -> Estimator | None:
+def _estimator(setup: Setup, asked: Asked, memory: Any, scene: Scene) -> Estimator | None:
     """What the policy asks in one slot."""
-    # Decided when tracing: each slot has its own map, its own panoramas, or shares what it asks.
+    # Decided when tracing: each slot has its own map, its own memory, or shares what it asks.
     if setup.policy is Policy.ORACLE:
         return TrueMapEstimator(world=scene.world)
-    if setup.network is not None and views is not None:
-        return NetworkEstimator(params=asked, memory=views, config=setup.network)
-    return asked
+    return with_memory(asked, memory) if isinstance(asked, ObservingEstimator) else asked
 
 
 def advance(setup: Setup, progress: Progress, scene: Scene, move: Move) -> Progress:
@@ -308,10 +298,10 @@ def advance(setup: Setup, progress: Progress, scene: Scene, move: Move) -> Progr
         went = _went(progress, move, belief, first_seen, moved)
         return _arrive(scene, went, (move.kind == MoveKind.NONE) & (moved == 0), config)
 
-    # The views are not touched; in the branch they would be copied.
-    views, without = progress.views, dataclasses.replace(progress, views=None)
+    # The memory is not touched; in the branch it would be copied.
+    memory, without = progress.memory, dataclasses.replace(progress, memory=None)
     went = jax.lax.cond(progress.tally.running, go, lambda progress, *_: progress, without, scene, move, stop)
-    return dataclasses.replace(went, views=views)
+    return dataclasses.replace(went, memory=memory)
 
 
 def _went(

@@ -1,0 +1,70 @@
+"""The building network as an estimator: what it remembers in a trial, and what it answers in a decision."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float32, Int32, UInt8
+
+from potlp_jax.learning.building_network import BuildingConfig, BuildingNetwork, EncodedMap, Params, map_channels
+from potlp_jax.learning.estimator import exclusive_chances
+from potlp_jax.learning.painting import Painting, paint
+from potlp_jax.learning.serialization import require_propositions
+from potlp_jax.planning.estimates import Estimates
+from potlp_jax.task.task import TaskArrays
+from potlp_jax.world.frontiers import Subgoals
+from potlp_jax.world.grid import BeliefMap
+
+
+@struct.dataclass(kw_only=True)
+class BuildingEstimator:
+    """P_S, R_S and R_F from the belief and from what the panoramas seen so far painted on it. ``config`` is static."""
+
+    params: Params
+    memory: Painting
+    config: BuildingConfig = struct.field(pytree_node=False)
+
+    def encode(self, panorama: UInt8[Array, "rows columns 3"]) -> UInt8[Array, "rows columns 3"]:
+        """The panorama itself: what a pixel shows is known only with the belief."""
+        return panorama
+
+    def remember(
+        self, seen: UInt8[Array, "rows columns 3"], belief: BeliefMap, cell: Int32[Array, "2"]
+    ) -> "BuildingEstimator":
+        """The estimator with one panorama more painted on its map (``learning.painting.paint``)."""
+        return dataclasses.replace(self, memory=paint(self.memory, seen, belief, cell, self.config.camera))
+
+    def imagine(self, belief: BeliefMap) -> EncodedMap:
+        """The network's first stage: what it makes of the map, also of squares that were not observed."""
+        return BuildingNetwork(self.config).encode(self.params, map_channels(belief, self.memory))
+
+    def __call__(self, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays) -> Estimates:
+        """Estimates of every real (subgoal, class); padded pairs have P_S = 0.
+
+        Raises:
+            PropositionsError: the network was trained for other propositions than the task's.
+        """
+        require_propositions(self.config, task.propositions, "the estimator's network")
+        network = BuildingNetwork(self.config)
+        encoded = self.imagine(belief)
+        modulation = network.modulation(self.params, task.class_phi[:, 0], task.class_phi[:, 1])
+        places = network.places(self.params, encoded, subgoals.cells)
+
+        def ask(subgoal: Int32[Array, ""], found: Float32[Array, "3 S C"]) -> Float32[Array, "3 S C"]:
+            answers = network.answer(self.params, places[subgoal][None], modulation)
+            return found.at[:, subgoal].set(
+                jnp.stack([answers.success_probability, answers.success_cost, answers.failure_cost])
+            )
+
+        # Real subgoals come first, so the loop ends with the last of them: padding costs nothing.
+        real = jnp.sum(subgoals.mask, dtype=jnp.int32)
+        shape = (subgoals.mask.shape[0], task.class_mask.shape[0])
+        nothing = jnp.stack([jnp.zeros(shape), jnp.ones(shape), jnp.ones(shape)])
+        probability, success_cost, failure_cost = jax.lax.fori_loop(0, real, ask, nothing)
+        probability = jnp.where(task.class_mask[None, :], probability, 0.0)
+        return Estimates(
+            success_probability=exclusive_chances(probability, subgoals, self.config.exclusive_within),
+            success_cost=success_cost,
+            failure_cost=failure_cost,
+        )

@@ -1,0 +1,390 @@
+"""The building network: P_S, R_S and R_F from all that the robot has seen, the map and what is painted on it.
+
+The belief and the painting (``learning.painting``) are one picture of the building from above. A U-Net encodes it once
+a decision, for all frontiers and all classes (the first stage). What a subgoal is asked about is read off around its
+cell at every scale, together with one vector of the whole building; a small head per (subgoal, class) answers, its
+units scaled and shifted by phi (the second stage). Beside the answers the first stage says of every square of
+``SQUARE`` cells how much of it is free and which propositions lie in it, also where nothing was observed: training asks
+for it, because the simulator knows it everywhere, and people can look at it.
+
+No layer normalises over a batch, and the map is padded to whole squares on the right and below, so a map's answers
+never depend on what else is computed with it. Convolutions see where the edge of the array is, and the answers for a
+building may depend on where in the array it lies: worlds of a family are placed alike in training and in trials.
+
+References:
+    Ronneberger, Fischer and Brox, U-Net: convolutional networks for biomedical image segmentation, MICCAI 2015.
+    Perez et al., FiLM: visual reasoning with a general conditioning layer, AAAI 2018.
+"""
+
+import dataclasses
+import itertools
+import math
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float32, Int8, Int32, PRNGKeyArray
+
+from potlp_jax.errors import NetworkError
+from potlp_jax.learning.network import Answers
+from potlp_jax.learning.painting import Painting
+from potlp_jax.world.camera import CameraConfig
+from potlp_jax.world.frontiers import frontier_cells
+from potlp_jax.world.grid import BeliefMap
+
+Params = Any
+"""Parameters of the network: nested dictionaries of float32 arrays."""
+
+SQUARE: int = 4
+"""Side in cells of the squares about which the network says what lies in them."""
+
+# The logit of P_S, and R_S and R_F before they are made positive.
+_OUTPUTS = 3
+# Layers of the head that phi modulates.
+_MODULATED = 3
+# Of the leaky ReLU below 0, where a plain one would pass no gradient.
+_SLOPE = 0.1
+# Cells to each side of a subgoal, in features of the first scale and of the others, that its head reads.
+_CLOSE, _NEAR = 2, 1
+# Cells over which the weight of what was seen from afar falls by a factor of e; not tuned.
+_PAINT_REACH = 20.0
+# A coordinate of 100 cells enters the head as 1.
+_COORDINATE = 100.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BuildingConfig:
+    """Everything that, with the parameters, defines the answers; it is stored in every estimator's file.
+
+    Attributes:
+        propositions: Sigma: the meaning of the entries of both phi, in order.
+        image_shape: rows and columns of the panorama.
+        horizon, far, fold: of the camera (``CameraConfig``), for where on the map a pixel looks.
+        widths: channels of the encoder, one number a scale: squares of 2, 4, 8, ... cells.
+        blocks: residual blocks of each scale.
+        decoder: channels at least, on the way back to squares of ``SQUARE`` cells.
+        head: units of each layer of the head; condition: of the layer that reads phi.
+        success_cost_scale, failure_cost_scale: unit of the outputs R_S and R_F, and of their errors in the loss
+            (standard deviations over the training data).
+        step: the least R_S, one step of the grid, in the unit of cost.
+        exclusive_within: as in ``NetworkConfig``.
+    """
+
+    propositions: tuple[str, ...]
+    image_shape: tuple[int, int] = (CameraConfig.height, CameraConfig.width)
+    horizon: float = CameraConfig.horizon
+    far: float = CameraConfig.far
+    fold: float = CameraConfig.fold
+    widths: tuple[int, ...] = (32, 48, 64, 96, 128)
+    blocks: tuple[int, ...] = (0, 0, 1, 2, 3)
+    decoder: int = 48
+    head: int = 128
+    condition: int = 64
+    success_cost_scale: float = 30.0
+    failure_cost_scale: float = 30.0
+    step: float = 1.0
+    exclusive_within: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.propositions:
+            raise NetworkError("propositions is empty; name at least one")
+        # Squares of SQUARE cells are the second scale, and the decoder begins below them.
+        if len(self.widths) < 3 or min(self.widths) < 1:
+            raise NetworkError(f"widths is {self.widths}; give three positive numbers or more")
+        if len(self.blocks) != len(self.widths) or min(self.blocks) < 0:
+            raise NetworkError(f"blocks is {self.blocks}; give a number for each of the {len(self.widths)} widths")
+        for name in ("decoder", "head", "condition"):
+            if getattr(self, name) < 1:
+                raise NetworkError(f"{name} is {getattr(self, name)}; give a positive number")
+        for name in ("success_cost_scale", "failure_cost_scale", "step", "far", "fold"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise NetworkError(f"{name} is {getattr(self, name)}; give a positive number")
+        if not (math.isfinite(self.exclusive_within) and self.exclusive_within >= 0):
+            raise NetworkError(f"exclusive_within is {self.exclusive_within}; give a number of cells, 0 for none")
+
+    @property
+    def camera(self) -> CameraConfig:
+        """The geometry of the camera that the network was trained with."""
+        rows, columns = self.image_shape
+        return CameraConfig(height=rows, width=columns, horizon=self.horizon, far=self.far, fold=self.fold)
+
+    @property
+    def side(self) -> int:
+        """Cells of a square of the coarsest scale, to whose multiples maps are padded."""
+        return 2 ** len(self.widths)
+
+
+@struct.dataclass(kw_only=True)
+class EncodedMap:
+    """What the first stage makes of a map; any leading dimensions.
+
+    Attributes:
+        close: features of squares of 2 cells.
+        scales: features of squares of ``SQUARE`` cells, then of twice the side, and so on.
+        whole: of the building as a whole.
+        squares: logits, for each square of ``SQUARE`` cells: that it is free (on average over its cells), and that a
+            cell with each proposition lies in it.
+    """
+
+    close: Float32[Array, "*B h w F"]
+    scales: tuple[Array, ...]
+    whole: Float32[Array, "*B G"]
+    squares: Float32[Array, "*B rows columns P_plus_1"]
+
+
+def map_channels(belief: BeliefMap, painting: Painting) -> Float32[Array, "H W K"]:
+    """The picture of the building that the first stage reads; see the code for the order of its channels."""
+    bits = jnp.arange(len(belief.propositions), dtype=jnp.int32)
+    letters = (belief.letters[:, :, None] >> bits) & 1
+    painted = jnp.isfinite(painting.distance)
+    flags = (belief.free, belief.occupied, belief.unknown, frontier_cells(belief, belief.free), painted)
+    colours = jnp.concatenate([painting.floor, painting.beyond], axis=-1).astype(jnp.float32)
+    # Pixels in [0, 1] enter as (pixel - 0.5) / 0.25; where nothing was painted, 0.
+    colours = jnp.where(painted[:, :, None], (colours / 255 - 0.5) * 4, 0.0)
+    near = jnp.where(painted, jnp.exp(-painting.distance / _PAINT_REACH), 0.0)
+    parts = (jnp.stack(flags, axis=-1), letters, near[:, :, None], colours)
+    return jnp.concatenate([part.astype(jnp.float32) for part in parts], axis=-1)
+
+
+def channel_count(config: BuildingConfig) -> int:
+    """Channels of ``map_channels``: five flags, one for each proposition, the nearness and two colours."""
+    return 5 + len(config.propositions) + 1 + 6
+
+
+def _dense(width: int, gain: float) -> nn.Dense:
+    return nn.Dense(width, kernel_init=nn.initializers.variance_scaling(gain, "fan_in", "normal"))
+
+
+def _convolution(width: int, gain: float) -> nn.Conv:
+    return nn.Conv(width, (3, 3), kernel_init=nn.initializers.variance_scaling(gain, "fan_in", "normal"))
+
+
+def _activated(x: Array) -> Array:
+    return nn.leaky_relu(x, _SLOPE)
+
+
+def _halved(x: Array) -> Array:
+    """``[..., rows, columns, channels]`` to one vector for each square of two by two."""
+    *batch, rows, columns, channels = x.shape
+    x = x.reshape(*batch, rows // 2, 2, columns // 2, 2, channels)
+    return jnp.moveaxis(x, -4, -3).reshape(*batch, rows // 2, columns // 2, 4 * channels)
+
+
+def _doubled(x: Array) -> Array:
+    return jnp.repeat(jnp.repeat(x, 2, axis=-3), 2, axis=-2)
+
+
+class _Block(nn.Module):
+    """Two convolutions beside a residual connection; the second one's gain is small, so that many can be stacked."""
+
+    width: int
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        return x + _convolution(self.width, 0.2)(_activated(_convolution(self.width, 2.0)(x)))
+
+
+class _Encoder(nn.Module):
+    """The first stage, a U-Net whose way back ends at squares of ``SQUARE`` cells."""
+
+    config: BuildingConfig
+
+    @nn.compact
+    def __call__(self, channels: Array) -> EncodedMap:
+        config = self.config
+        scales = self._down(channels)
+        coarsest, width = scales[-1], config.widths[-1]
+        # What is known anywhere matters everywhere: that the only fire was found, how large the building is.
+        pooled = jnp.concatenate([jnp.mean(coarsest, axis=(-3, -2)), jnp.max(coarsest, axis=(-3, -2))], axis=-1)
+        whole = _activated(_dense(width, 2.0)(pooled))
+        x = coarsest + _dense(width, 1.0)(whole)[..., None, None, :]
+        decoded = []
+        for level in range(len(config.widths) - 2, 0, -1):
+            width = max(config.decoder, config.widths[level] * 3 // 4)
+            x = _activated(_doubled(_dense(width, 1.0)(x)) + _dense(width, 1.0)(scales[level]))
+            x = x + _activated(_convolution(width, 0.5)(x))
+            decoded.append(x)
+        # Small, so that training starts near even odds.
+        squares = _dense(1 + len(config.propositions), 0.01)(x)
+        return EncodedMap(close=scales[0], scales=tuple(reversed(decoded)), whole=whole, squares=squares)
+
+    def _down(self, x: Array) -> list[Array]:
+        scales = []
+        for level, (width, blocks) in enumerate(zip(self.config.widths, self.config.blocks, strict=True)):
+            x = _activated(_dense(width, 2.0)(_halved(x)))
+            # The first scale is the largest array; a convolution there would be most of the work.
+            if level > 0:
+                x = x + _activated(_convolution(width, 0.5)(x))
+            for _ in range(blocks):
+                x = _Block(width)(x)
+            scales.append(x)
+        return scales
+
+
+class _Place(nn.Module):
+    """What the head knows of a subgoal before it is asked anything."""
+
+    config: BuildingConfig
+
+    @nn.compact
+    def __call__(self, features: Array) -> Array:
+        for _ in range(2):
+            features = _activated(_dense(self.config.head, 2.0)(features))
+        return features
+
+
+class _Modulation(nn.Module):
+    """Scales and shifts of the head's units by phi, ``[..., layers, 2, units]``."""
+
+    config: BuildingConfig
+
+    @nn.compact
+    def __call__(self, phi: Array) -> Array:
+        condition = _activated(_dense(self.config.condition, 2.0)(phi))
+        # A small gain: at the start the condition changes little of what is seen.
+        modulation = _dense(_MODULATED * 2 * self.config.head, 0.3)(condition)
+        return modulation.reshape(*phi.shape[:-1], _MODULATED, 2, self.config.head)
+
+
+class _Head(nn.Module):
+    config: BuildingConfig
+
+    @nn.compact
+    def __call__(self, place: Array, modulation: Array) -> Array:
+        x = place
+        for layer in range(_MODULATED):
+            scale, shift = modulation[..., layer, 0, :], modulation[..., layer, 1, :]
+            x = _activated(_dense(self.config.head, 2.0)(x) * (1 + scale) + shift)
+        # Small, so that training starts near the constant prior.
+        return _dense(_OUTPUTS, 0.01)(x)
+
+
+class _Network(nn.Module):
+    config: BuildingConfig
+
+    def setup(self) -> None:
+        self.encoder = _Encoder(self.config)
+        self.place = _Place(self.config)
+        self.modulation = _Modulation(self.config)
+        self.head = _Head(self.config)
+
+    def __call__(self, channels: Array, cells: Array, phi: Array) -> tuple[Array, Array]:
+        encoded = self.encode(channels)
+        places = self.place_of(_read_at(encoded, cells))
+        return self.answer(places[..., :, None, :], self.modulate(phi)[..., None, :, :, :, :]), encoded.squares
+
+    def encode(self, channels: Array) -> EncodedMap:
+        rows, columns = channels.shape[-3:-1]
+        batch = ((0, 0),) * (channels.ndim - 3)
+        side = self.config.side
+        return self.encoder(jnp.pad(channels, (*batch, (0, -rows % side), (0, -columns % side), (0, 0))))
+
+    def place_of(self, features: Array) -> Array:
+        return self.place(features)
+
+    def modulate(self, phi: Array) -> Array:
+        return self.modulation(phi)
+
+    def answer(self, places: Array, modulation: Array) -> Array:
+        return self.head(places, modulation)
+
+
+def _read_at(encoded: EncodedMap, cells: Int32[Array, "*B S 2"]) -> Float32[Array, "*B S F"]:
+    """What the first stage says around cells, at every scale, and of the whole building."""
+    close = _around(encoded.close, cells // 2, _CLOSE)
+    near = [_around(scale, cells // (SQUARE * 2**level), _NEAR) for level, scale in enumerate(encoded.scales)]
+    whole = jnp.broadcast_to(encoded.whole[..., None, :], (*cells.shape[:-1], encoded.whole.shape[-1]))
+    return jnp.concatenate([close, *near, whole, cells.astype(jnp.float32) / _COORDINATE], axis=-1)
+
+
+def _around(features: Float32[Array, "*B h w F"], at: Int32[Array, "*B S 2"], reach: int) -> Float32[Array, "*B S N"]:
+    """The features of the ``2 * reach + 1`` squares a side around each place; 0 outside of the array."""
+    batch = ((0, 0),) * (features.ndim - 3)
+    padded = jnp.pad(features, (*batch, (reach, reach), (reach, reach), (0, 0)))
+    columns, steps = padded.shape[-2], np.arange(2 * reach + 1)
+    # Flat indices of a window, relative to its first square; of the padded array that is the place itself.
+    window = jnp.asarray((steps[:, None] * columns + steps[None, :]).reshape(-1), jnp.int32)
+    first = at[..., 0] * columns + at[..., 1]
+    index = first[..., None] + jnp.broadcast_to(window, (*first.shape, window.size))
+    index = index.reshape(*at.shape[:-2], -1)
+    flat = padded.reshape(*padded.shape[:-3], -1, padded.shape[-1])
+    found = jnp.take_along_axis(flat, index[..., None], axis=-2)
+    return found.reshape(*at.shape[:-1], -1)
+
+
+@dataclasses.dataclass(frozen=True)
+class BuildingNetwork:
+    """Pure functions of the parameters. ``*B`` are any leading dimensions, equal in all arguments of a call."""
+
+    config: BuildingConfig
+
+    def init(self, key: PRNGKeyArray) -> Params:
+        """New parameters; their shapes do not depend on the map's."""
+        side, propositions = self.config.side, len(self.config.propositions)
+        channels = jnp.zeros((side, side, channel_count(self.config)))
+        initial = jax.jit(_Network(self.config).init)
+        return initial(key, channels, jnp.zeros((1, 2), jnp.int32), jnp.zeros((1, 2 * propositions)))["params"]
+
+    def encode(self, params: Params, channels: Float32[Array, "*B H W K"]) -> EncodedMap:
+        """The first stage, of ``map_channels``."""
+        return self._apply(params, "encode", channels)
+
+    def places(self, params: Params, encoded: EncodedMap, cells: Int32[Array, "*B S 2"]) -> Float32[Array, "*B S U"]:
+        """What the network knows of subgoals, whatever is asked of them."""
+        return self._apply(params, "place_of", _read_at(encoded, cells))
+
+    def modulation(
+        self, params: Params, phi_stay: Int8[Array, "*B P"], phi_go: Int8[Array, "*B P"]
+    ) -> Float32[Array, "*B layers two U"]:
+        """What a class does to the head's units; the same for all subgoals.
+
+        Raises:
+            NetworkError: the vectors phi have another length than the network's propositions.
+        """
+        expected = len(self.config.propositions)
+        if phi_stay.shape[-1] != expected or phi_go.shape[-1] != expected:
+            raise NetworkError(
+                f"phi of lengths {phi_stay.shape[-1]} and {phi_go.shape[-1]}; this network knows {expected} "
+                f"propositions: {', '.join(self.config.propositions)}"
+            )
+        phi = jnp.concatenate([phi_stay, phi_go], axis=-1).astype(jnp.float32)
+        return self._apply(params, "modulate", phi)
+
+    def answer(
+        self, params: Params, places: Float32[Array, "*P U"], modulation: Float32[Array, "*M layers two U"]
+    ) -> Answers:
+        """The second stage; equally many leading dimensions, which are broadcast against each other."""
+        logit, success, failure = jnp.moveaxis(self._apply(params, "answer", places, modulation), -1, 0)
+        # Softplus keeps costs positive; a success costs at least one step of the grid.
+        return Answers(
+            success_logit=logit,
+            success_cost=jnp.float32(self.config.step)
+            + jnp.float32(self.config.success_cost_scale) * jax.nn.softplus(success),
+            failure_cost=jnp.float32(self.config.failure_cost_scale) * jax.nn.softplus(failure),
+        )
+
+    def _apply(self, params: Params, method: str, *arguments: Any) -> Any:
+        return _Network(self.config).apply({"params": params}, *arguments, method=method)
+
+
+def building_operations(config: BuildingConfig, height: int, width: int) -> tuple[int, int, int]:
+    """Floating-point operations forward: per map (first stage), per subgoal, and per (subgoal, class) pair.
+
+    Two per multiplication of a matrix product, as in ``network.operation_counts``.
+    """
+    rows, columns = (-(-size // config.side) * config.side for size in (height, width))
+    areas = [rows * columns // 4 ** (level + 1) for level in range(len(config.widths))]
+    inputs = [channel_count(config), *config.widths[:-1]]
+    first = sum(2 * area * 4 * i * o for area, i, o in zip(areas, inputs, config.widths, strict=True))
+    convolutions = [2 * blocks + (level > 0) for level, blocks in enumerate(config.blocks)]
+    first += sum(2 * area * 9 * o * o * n for area, o, n in zip(areas, config.widths, convolutions, strict=True))
+    decoded = [max(config.decoder, width * 3 // 4) for width in config.widths[1:-1]]
+    for level, (o, below) in enumerate(zip(decoded, [*decoded[1:], config.widths[-1]], strict=True), start=1):
+        first += 2 * areas[level] * (config.widths[level] * o + 9 * o * o) + 2 * areas[level + 1] * below * o
+    first += 2 * areas[1] * decoded[0] * (1 + len(config.propositions)) + 2 * 3 * config.widths[-1] ** 2
+    read = (2 * _CLOSE + 1) ** 2 * config.widths[0] + (2 * _NEAR + 1) ** 2 * sum(decoded) + config.widths[-1] + 2
+    place = sum(2 * i * o for i, o in itertools.pairwise((read, config.head, config.head)))
+    return first, place, 2 * (_MODULATED * config.head**2 + config.head * _OUTPUTS)

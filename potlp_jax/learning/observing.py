@@ -1,0 +1,64 @@
+"""What estimators that remember have in common: a trial shows them every panorama, a decision asks them what they know.
+
+The panorama network (``learning.estimator``) and the building network (``learning.building_estimator``) are two; one of
+your own is a pytree with the same fields and methods.
+"""
+
+import dataclasses
+from typing import Any, Protocol, TypeVar, cast, runtime_checkable
+
+import jax
+from jaxtyping import Array, Int32, UInt8
+
+from potlp_jax.planning.estimates import Estimates
+from potlp_jax.task.task import TaskArrays
+from potlp_jax.world.frontiers import Subgoals
+from potlp_jax.world.grid import BeliefMap
+
+
+@runtime_checkable
+class ObservingEstimator(Protocol):
+    """An ``Estimator`` that a trial shows what the camera sees: a dataclass that is a pytree.
+
+    Attributes:
+        memory: a pytree of arrays, all that changes when something is observed. In a batch of trials each slot has its
+            own, and the rest of the estimator is shared.
+    """
+
+    memory: Any
+
+    def encode(self, panorama: UInt8[Array, "rows columns 3"]) -> Any:
+        """What is to be remembered of a panorama; does not depend on the memory."""
+        ...
+
+    def remember(self, seen: Any, belief: BeliefMap, cell: Int32[Array, "2"]) -> "ObservingEstimator":
+        """The estimator after an observation.
+
+        Args:
+            seen: what ``encode`` made of the panorama.
+            belief: the map after the observation.
+            cell: where the panorama was taken.
+
+        Returns:
+            The same estimator with another memory.
+        """
+        ...
+
+    def __call__(self, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays) -> Estimates: ...
+
+
+_Observing = TypeVar("_Observing", bound=ObservingEstimator)
+
+
+@jax.jit
+def observe_panorama(
+    estimator: _Observing, panorama: UInt8[Array, "rows columns 3"], belief: BeliefMap, cell: Int32[Array, "2"]
+) -> _Observing:
+    """The estimator after a panorama from ``cell``; ``belief`` is the map after the observation."""
+    # A typing.Self would say that the class stays; checks at run time cannot read it in a protocol.
+    return cast(_Observing, estimator.remember(estimator.encode(panorama), belief, cell))
+
+
+def with_memory(estimator: _Observing, memory: Any) -> _Observing:
+    """The same estimator with another memory."""
+    return dataclasses.replace(cast(Any, estimator), memory=memory)

@@ -1,0 +1,224 @@
+"""The building network: what its answers depend on and what they do not, and its operations as XLA counts them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from potlp_jax.errors import NetworkError, PropositionsError
+from potlp_jax.learning.building_estimator import BuildingEstimator
+from potlp_jax.learning.building_network import (
+    SQUARE,
+    BuildingConfig,
+    BuildingNetwork,
+    building_operations,
+    channel_count,
+    map_channels,
+)
+from potlp_jax.learning.observing import ObservingEstimator, observe_panorama
+from potlp_jax.learning.painting import blank_painting
+from potlp_jax.planning.policies import Policy
+from potlp_jax.planning.search.config import BestFirstConfig
+from potlp_jax.planning.situation import DecisionConfig
+from potlp_jax.task.task import Task
+from potlp_jax.trials.batch import Start, run_batch
+from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.loop import run_trial
+from potlp_jax.world.camera import CameraConfig
+from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
+from potlp_jax.world.grid import BeliefMap, World, make_world
+from potlp_jax.world.renderer import render
+from potlp_jax.world.sensing import SensorConfig, observe
+
+NAMES = ("goal", "hazard")
+CAMERA = CameraConfig(height=64, width=128, horizon=24.0, fold=8.0)
+CONFIG = BuildingConfig(
+    propositions=NAMES,
+    image_shape=(64, 128),
+    horizon=24.0,
+    fold=8.0,
+    widths=(8, 8, 12),
+    blocks=(0, 1, 1),
+    decoder=8,
+    head=16,
+    condition=8,
+)
+NETWORK = BuildingNetwork(CONFIG)
+SENSOR = SensorConfig(range_cells=5.0)
+TRIAL = TrialConfig(
+    sensor=SENSOR,
+    camera=CAMERA,
+    decision=DecisionConfig(frontiers=FrontierConfig(max_subgoals=4), search=BestFirstConfig(simulations=50)),
+)
+
+
+@pytest.fixture(scope="module")
+def params():
+    """Parameters of which none is 0, so that everything that enters has an effect."""
+    initial = NETWORK.init(jax.random.key(0))
+    leaves, structure = jax.tree.flatten(initial)
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    moved = [leaf + 0.05 * jax.random.normal(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
+    return jax.tree.unflatten(structure, moved)
+
+
+def _world(far_letter: int = 1, far_wall: bool = False) -> World:
+    """Two rooms joined by a door; the goal is in the far one, out of the sensor's range and of the camera's sight."""
+    occupied = np.ones((12, 26), bool)
+    occupied[1:-1, 1:12] = occupied[1:-1, 13:-1] = False
+    occupied[2, 12] = False
+    letters = np.zeros(occupied.shape, np.int32)
+    letters[9, 22] = far_letter
+    if far_wall:
+        occupied[6:, 18] = True
+    return make_world(occupied, letters, (9, 3), propositions=NAMES)
+
+
+def _estimator(params, world: World) -> BuildingEstimator:
+    return BuildingEstimator(params=params, memory=blank_painting(*world.shape), config=CONFIG)
+
+
+def _asked(params, world: World):
+    task = Task.from_formula("!hazard U goal", propositions=NAMES)
+    belief = observe(BeliefMap.unobserved(world), world, world.start, SENSOR)
+    eyes = observe_panorama(_estimator(params, world), render(world, world.start, CAMERA), belief, world.start)
+    subgoals = find_subgoals(belief, belief.free, jnp.zeros(world.shape), FrontierConfig(max_subgoals=4))
+    return eyes, belief, subgoals, task
+
+
+def test_worlds_that_look_alike_so_far_get_equal_answers(params):
+    answers = []
+    for world in (_world(), _world(far_letter=2), _world(far_wall=True)):
+        eyes, belief, subgoals, task = _asked(params, world)
+        assert int(jnp.sum(subgoals.mask)) > 0
+        answers.append(jax.tree.leaves(jax.jit(eyes.__call__)(belief, subgoals, task.arrays)))
+    for other in answers[1:]:
+        for mine, its in zip(answers[0], other, strict=True):
+            np.testing.assert_array_equal(mine, its)
+
+
+def test_estimates_are_the_networks_answers_and_padding_cannot_succeed(params):
+    eyes, belief, subgoals, task = _asked(params, _world())
+    found = eyes(belief, subgoals, task.arrays)
+    encoded = NETWORK.encode(params, map_channels(belief, eyes.memory))
+    places = NETWORK.places(params, encoded, subgoals.cells)
+    phi = task.arrays.class_phi
+    answers = NETWORK.answer(params, places[:, None], NETWORK.modulation(params, phi[:, 0], phi[:, 1])[None])
+    real = np.asarray(subgoals.mask)[:, None] & np.asarray(task.arrays.class_mask)[None, :]
+    np.testing.assert_allclose(
+        np.asarray(found.success_probability)[real], np.asarray(answers.success_probability)[real], atol=1e-6
+    )
+    np.testing.assert_allclose(np.asarray(found.success_cost)[real], np.asarray(answers.success_cost)[real], rtol=1e-5)
+    np.testing.assert_allclose(np.asarray(found.failure_cost)[real], np.asarray(answers.failure_cost)[real], rtol=1e-5)
+    assert not np.asarray(found.success_probability)[~real].any()
+    assert np.all(np.asarray(found.success_cost) >= CONFIG.step)
+    assert np.all(np.asarray(found.failure_cost) >= 0)
+
+
+def test_answers_depend_on_map_paint_place_and_phi(params):
+    eyes, belief, subgoals, task = _asked(params, _world())
+
+    def answer(eyes=eyes, belief=belief, cells=subgoals.cells, phi=task.arrays.class_phi):
+        encoded = NETWORK.encode(params, map_channels(belief, eyes.memory))
+        places = NETWORK.places(params, encoded, cells)
+        modulation = NETWORK.modulation(params, phi[0, 0], phi[0, 1])
+        return float(NETWORK.answer(params, places[0], modulation).success_logit)
+
+    darker = dataclasses.replace(eyes.memory, floor=eyes.memory.floor // 2)
+    seen = dataclasses.replace(belief, letters=belief.letters.at[8, 4].set(2))
+    others = (
+        answer(eyes=dataclasses.replace(eyes, memory=darker)),
+        answer(belief=seen),
+        answer(cells=subgoals.cells + 2),
+        answer(phi=-task.arrays.class_phi),
+    )
+    assert len({answer(), *others}) == 5
+
+
+def test_a_maps_answers_do_not_depend_on_the_others_in_the_batch(params):
+    random = np.random.default_rng(0)
+    maps = jnp.asarray(random.normal(size=(3, 12, 26, channel_count(CONFIG))), jnp.float32)
+    cells = jnp.asarray(random.integers(0, 12, (3, 4, 2)), jnp.int32)
+    together = NETWORK.encode(params, maps)
+    # 26 columns are padded to 32, and 12 rows to 16.
+    assert together.squares.shape == (3, 16 // SQUARE, 32 // SQUARE, 3)
+    places = NETWORK.places(params, together, cells)
+    for index in range(3):
+        alone = NETWORK.places(params, NETWORK.encode(params, maps[index]), cells[index])
+        np.testing.assert_allclose(places[index], alone, rtol=1e-4, atol=1e-5)
+
+
+def test_a_place_reads_the_squares_around_its_cell(params):
+    """A change far from a cell and from its squares, of the first scale's features, changes nothing at this scale."""
+    maps = jnp.zeros((32, 32, channel_count(CONFIG)))
+    encoded = NETWORK.encode(params, maps)
+    cells = jnp.array([[9, 13]])
+    before = NETWORK.places(params, encoded, cells)
+
+    def after(row: int, column: int):
+        close = encoded.close.at[row, column].add(1.0)
+        return NETWORK.places(params, dataclasses.replace(encoded, close=close), cells)
+
+    # Squares of two cells: that of the cell is (4, 6), and two on each side of it are read.
+    assert not np.array_equal(before, after(6, 8))
+    assert not np.array_equal(before, after(2, 4))
+    assert np.array_equal(before, after(7, 6))
+    assert np.array_equal(before, after(4, 9))
+
+
+def test_trials_with_the_network_are_the_same_alone_and_in_a_batch(params):
+    world = _world()
+    assert isinstance(_estimator(params, world), ObservingEstimator)
+    task = Task.from_formula("!hazard U goal", propositions=NAMES)
+    estimator = _estimator(params, world)
+    trials = list(
+        run_batch(
+            [Start(world, task.arrays, jax.random.key(n), name=n) for n in range(3)],
+            Policy.POTLP,
+            TRIAL,
+            slots=2,
+            estimator=estimator,
+        )
+    )
+    alone = run_trial(world, task, Policy.POTLP, TRIAL, estimator=estimator, key=jax.random.key(0))
+    assert [trial.outcome for trial in trials] == [alone.outcome] * 3
+    for trial in trials:
+        np.testing.assert_array_equal(trial.path, np.asarray(alone.path))
+
+
+def test_operations_are_about_those_that_xla_counts(params):
+    maps = jnp.zeros((62, 182, channel_count(CONFIG)))
+    analysis = jax.jit(NETWORK.encode).lower(params, maps).compile().cost_analysis()
+    first, place, pair = building_operations(CONFIG, 62, 182)
+    # XLA counts activations too, and leaves out what convolutions would do on their padding.
+    assert first == pytest.approx(analysis["flops"], rel=0.2)
+    assert pair == 2 * (3 * 16 * 16 + 16 * 3)
+    # 25 squares of 8 features, 9 of 8 of the one scale of the decoder, 12 of the whole, 2 coordinates.
+    assert place == 2 * ((25 * 8 + 9 * 8 + 12 + 2) * 16 + 16 * 16)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "named"),
+    [
+        ("propositions", (), "propositions"),
+        ("widths", (8, 8), "widths"),
+        ("blocks", (1,), "blocks"),
+        ("head", 0, "head"),
+        ("far", float("nan"), "far"),
+        ("exclusive_within", -1.0, "exclusive_within"),
+    ],
+)
+def test_what_is_no_network_is_named(field, value, named):
+    with pytest.raises(NetworkError, match=named):
+        dataclasses.replace(CONFIG, **{field: value})
+
+
+def test_other_propositions_are_refused(params):
+    eyes, belief, subgoals, _ = _asked(params, _world())
+    other = Task.from_formula("F hazard", propositions=("hazard", "goal"))
+    with pytest.raises(PropositionsError, match="goal"):
+        eyes(belief, subgoals, other.arrays)
+    with pytest.raises(NetworkError, match="lengths 3 and 3"):
+        NETWORK.modulation(params, jnp.zeros((1, 3), jnp.int8), jnp.zeros((1, 3), jnp.int8))

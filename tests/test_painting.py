@@ -1,0 +1,117 @@
+"""What is painted on the map, against a loop over cells, and against a rendered room whose colours are known."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from potlp_jax.learning.painting import Painting, blank_painting, column_of, paint
+from potlp_jax.world.camera import CameraConfig, column_bearings, floor_rows
+from potlp_jax.world.grid import Appearance, BeliefMap, belief_from_numpy, make_world
+from potlp_jax.world.renderer import render
+from potlp_jax.world.sensing import SensorConfig, observe, visible
+
+CAMERA = CameraConfig(height=64, width=128, horizon=24.0, fold=8.0, texture=0.0)
+paint_jit = jax.jit(paint, static_argnames="camera")
+
+
+def _room(rows: int = 14, columns: int = 20) -> np.ndarray:
+    occupied = np.ones((rows, columns), bool)
+    occupied[1:-1, 1:-1] = False
+    occupied[4:9, 8] = True
+    return occupied
+
+
+def _belief(occupied: np.ndarray, unknown_from: int) -> BeliefMap:
+    cells = np.where(occupied, BeliefMap.OCCUPIED, BeliefMap.FREE).astype(np.int8)
+    cells[:, unknown_from:] = BeliefMap.UNKNOWN
+    return belief_from_numpy(cells, np.zeros(cells.shape, np.int32))
+
+
+def _slow_paint(painting: Painting, panorama: np.ndarray, belief: BeliefMap, cell: tuple[int, int]) -> Painting:
+    """Cell by cell: the column whose bearing is nearest, the row of the floor at the cell's distance."""
+    floor, beyond = np.array(painting.floor), np.array(painting.beyond)
+    distance = np.array(painting.distance)
+    everywhere = SensorConfig(range_cells=float(sum(distance.shape)))
+    sight = np.asarray(visible(belief.occupied, jnp.asarray(cell), everywhere))
+    bearings = column_bearings(CAMERA)
+    for row, column in np.argwhere(sight):
+        away = math.hypot(row - cell[0], column - cell[1])
+        if away >= distance[row, column]:
+            continue
+        angle = math.atan2(row - cell[0], column - cell[1])
+        apart = np.abs((bearings - angle + math.pi) % (2 * math.pi) - math.pi)
+        # On the border of two columns both are as near: the one that begins there.
+        nearest = np.flatnonzero(apart <= apart.min() + 1e-6)
+        chosen = nearest[-1] if nearest[0] != 0 or len(nearest) == 1 else nearest[0]
+        line = round(float(floor_rows(CAMERA, jnp.float32(away))))
+        floor[row, column] = panorama[min(line, CAMERA.height - 1), chosen]
+        beyond[row, column] = panorama[24, chosen]
+        distance[row, column] = away
+    return Painting(floor=jnp.asarray(floor), beyond=jnp.asarray(beyond), distance=jnp.asarray(distance))
+
+
+@pytest.mark.parametrize("unknown_from", [20, 12])
+def test_painting_is_what_a_loop_over_cells_paints(unknown_from):
+    random = np.random.default_rng(0)
+    belief = _belief(_room(), unknown_from)
+    fast, slow = blank_painting(14, 20), blank_painting(14, 20)
+    for cell in ((3, 3), (10, 5), (2, 7)):
+        panorama = random.integers(0, 256, (64, 128, 3)).astype(np.uint8)
+        fast = paint_jit(fast, jnp.asarray(panorama), belief, jnp.asarray(cell), CAMERA)
+        slow = _slow_paint(slow, panorama, belief, cell)
+        np.testing.assert_allclose(fast.distance, slow.distance, rtol=1e-6)
+        np.testing.assert_array_equal(fast.beyond, slow.beyond)
+        np.testing.assert_array_equal(fast.floor, slow.floor)
+
+
+def test_columns_are_those_that_look_along_the_bearing():
+    bearings = column_bearings(CameraConfig())
+    np.testing.assert_array_equal(column_of(jnp.asarray(bearings, jnp.float32), 512), np.arange(512))
+    assert int(column_of(jnp.float32(math.pi), 512)) == int(column_of(jnp.float32(-math.pi), 512)) == 0
+
+
+def _coloured_world():
+    """A room with a green floor on the right, red on the left, and blue walls."""
+    occupied = _room()
+    floor = np.zeros((14, 20, 3), np.uint8)
+    floor[:, :10], floor[:, 10:] = (200, 30, 30), (30, 200, 30)
+    look = Appearance(
+        floor_colour=jnp.asarray(floor),
+        wall_colour=jnp.asarray(np.full((14, 20, 3), (30, 30, 200), np.uint8)),
+        smoke=jnp.zeros((14, 20)),
+        light=jnp.ones((14, 20)),
+    )
+    return make_world(occupied, np.zeros(occupied.shape, np.int32), (2, 2), appearance=look)
+
+
+def test_floors_and_walls_have_their_colours():
+    """Beyond the sensor's range too, as far as nothing known stands in between."""
+    world = _coloured_world()
+    cell = jnp.array([2, 4])
+    belief = observe(BeliefMap.unobserved(world), world, cell, SensorConfig(range_cells=6.0))
+    assert bool(belief.unknown[2, 15])
+    painting = paint_jit(blank_painting(14, 20), render(world, cell, CAMERA), belief, cell, CAMERA)
+    floor, beyond = np.asarray(painting.floor).argmax(axis=2), np.asarray(painting.beyond).argmax(axis=2)
+    assert floor[2, 6] == floor[1, 8] == 0
+    assert floor[2, 13] == floor[2, 15] == 1
+    # At eye height there is a wall in every direction.
+    assert set(beyond[np.isfinite(painting.distance)].tolist()) == {2}
+    # The wall in the middle of the room is known by now, and what it hides stays blank.
+    blank = ~np.isfinite(np.asarray(painting.distance))
+    assert bool(belief.occupied[5, 8])
+    assert blank[7, 12]
+    assert not np.asarray(painting.floor)[7, 12].any()
+
+
+def test_a_nearer_look_replaces_one_from_afar_and_a_farther_one_does_not():
+    belief = _belief(_room(), 20)
+    far, near = (np.full((64, 128, 3), value, np.uint8) for value in (10, 90))
+    first = paint_jit(blank_painting(14, 20), jnp.asarray(far), belief, jnp.array([2, 2]), CAMERA)
+    both = paint_jit(first, jnp.asarray(near), belief, jnp.array([2, 15]), CAMERA)
+    assert np.asarray(both.floor)[2, 14, 0] == 90
+    assert np.asarray(both.floor)[2, 3, 0] == 10
+    again = paint_jit(both, jnp.asarray(far), belief, jnp.array([2, 2]), CAMERA)
+    np.testing.assert_array_equal(again.floor, both.floor)
