@@ -23,7 +23,7 @@ from eval.faults.tally import Tally, open_tally, table
 from eval.faults.worker import Worker, all_kinds
 from potlp_jax.errors import PotlpError
 
-MODULES = ("eval.faults.files", "eval.faults.texts", "eval.faults.commands")
+MODULES = ("eval.faults.files", "eval.faults.texts", "eval.faults.commands", "eval.faults.formulas")
 """The modules that have kinds of cases. To add one, write it and a line here."""
 
 _TURN = 60.0
