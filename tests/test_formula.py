@@ -1,6 +1,5 @@
 """Formulas: syntax, propositions, co-safety, and errors that say where and what to do."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -243,14 +242,18 @@ def test_messages_show_what_is_around_the_place_and_nothing_that_a_terminal_obey
 
 
 def test_spot_in_a_process_that_was_forked_is_its_own():
-    Task.from_formula("F a")
-    parent = spot_process._running
-    child = os.fork()
-    if child == 0:
-        Task.from_formula("F b")
-        os._exit(0 if spot_process._running is not parent else 1)
-    assert os.waitpid(child, 0)[1] == 0
-    assert Task.from_formula("F c").propositions == ("c",)
+    code = (
+        "import os\n"
+        "from potlp_jax.task import formula, spot_process\n"
+        "formula.parse_formula('F a')\n"
+        "before = spot_process._running\n"
+        "if os.fork() == 0:\n"
+        "    formula.parse_formula('F b')\n"
+        "    os._exit(int(spot_process._running is before))\n"
+        "assert os.wait()[1] == 0\n"
+        "assert formula.parse_formula('F c').propositions == ('c',)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_the_process_of_spot_ends_with_the_one_that_asked():

@@ -116,14 +116,14 @@ def _serve(connection: Connection, modules: tuple[str, ...], name: str, seed: in
     # Some cases that nobody counts, so that imports and compilation are not measured, and the threads of jax have got
     # their memory before it is limited.
     jax.random.key(0).block_until_ready()
+    # Libraries in C write remarks about damaged input to the error stream; the table has no place for them.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     for number in range(_WARM_UP):
         _empty(folder)
         judged(kind, seed, number, folder)
     if kind.memory is not None:
         size = _address_space() + kind.memory
         resource.setrlimit(resource.RLIMIT_AS, (size, size))
-    # Libraries in C write remarks about damaged input to the error stream; the table has no place for them.
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     connection.send("ready")
     while True:
         try:
