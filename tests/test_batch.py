@@ -24,8 +24,6 @@ from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import pad_world
 from potlp_jax.world.sensing import SensorConfig
 
-pytestmark = pytest.mark.optimised
-
 TOY = make("toy")
 TASKS = [Task.from_formula(text, propositions=TOY.propositions) for text in TOY.tasks.values()]
 SIZES = TASKS[0].sizes.union(TASKS[-1].sizes)

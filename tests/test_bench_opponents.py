@@ -15,8 +15,6 @@ from potlp_jax.planning.history import action_terms, initial_history, step, unpa
 from potlp_jax.types import NO_ACTION
 from tests.reference.problems import FORMULAS, SIZES, padded_problem, random_fields, random_problem, task_of
 
-pytestmark = pytest.mark.optimised
-
 MISSING = "the optional extra 'bench' is not installed (pip install -e '.[bench]')"
 pytest.importorskip("numba", reason=MISSING)
 numba_search = pytest.importorskip("eval.bench.opponents.pouct_numba")

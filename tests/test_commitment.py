@@ -12,8 +12,6 @@ from potlp_jax.task.task import Task
 from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL
 from potlp_jax.world.frontiers import Subgoals
 
-pytestmark = pytest.mark.optimised
-
 TASK = Task.from_formula("F a & F b").arrays
 EDGES = TASK.edge_mask.shape[0]
 CELLS = ((10, 10), (10, 40), (10, 16))

@@ -16,8 +16,6 @@ import potlp_jax
 from potlp_jax.environments.families import FAMILIES
 from potlp_jax.environments.registry import make
 
-pytestmark = pytest.mark.optimised
-
 
 def _parameters(function):
     return list(inspect.signature(function).parameters)

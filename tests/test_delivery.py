@@ -29,8 +29,6 @@ from potlp_jax.task.task import Task
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import Outcome
 
-pytestmark = pytest.mark.optimised
-
 GENERATOR = Delivery()
 FLOORS = 80
 WORLDS = 25

@@ -13,8 +13,6 @@ from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
 from potlp_jax.world.grid import BeliefMap, make_world
 from tests.reference.problems import FORMULAS, SIZES, random_fields, task_of
 
-pytestmark = pytest.mark.optimised
-
 
 def states_after(task, state):
     """States that some word leads to without a trap, found word by word."""

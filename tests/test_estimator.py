@@ -37,8 +37,6 @@ from potlp_jax.world.renderer import render
 from potlp_jax.world.sensing import SensorConfig, observe
 from tests.reference.dijkstra import product_distances
 
-pytestmark = pytest.mark.optimised
-
 TINY = {"first_widths": (4, 4, 4, 4), "second_widths": (4,) * 8, "dense_widths": (8, 8, 8, 8)}
 WITHIN = 16.0
 """Cells within which subgoals exclude each other."""

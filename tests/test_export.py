@@ -29,8 +29,6 @@ from potlp_jax.world.grid import BeliefMap
 from potlp_jax.world.sensing import SensorConfig, observe
 from tests.reference.problems import random_fields
 
-pytestmark = pytest.mark.optimised
-
 pytest.importorskip("flatbuffers", reason="jax writes exported programs with flatbuffers")
 
 SUBGOALS = 2

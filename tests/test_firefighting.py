@@ -23,8 +23,6 @@ from potlp_jax.errors import WorldError
 from potlp_jax.world.grid import World
 from potlp_jax.world.sensing import SensorConfig
 
-pytestmark = pytest.mark.optimised
-
 BITS = {name: 1 << index for index, name in enumerate(Firefighting.propositions)}
 TOY = Firefighting.toy()
 FULL = Firefighting()

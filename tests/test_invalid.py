@@ -16,8 +16,6 @@ from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
 from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL, Status
 from tests.reference.problems import random_problem
 
-pytestmark = pytest.mark.optimised
-
 TASK = "F a & F b"
 SEARCHES = (BestFirstConfig(simulations=60), UctConfig(simulations=60))
 SUBGOALS = 3

@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from potlp_jax.learning.memory import (
     NO_OBSERVATION,
@@ -17,8 +16,6 @@ from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy
 from potlp_jax.world.sensing import SensorConfig, visible
 from tests.reference.sensing import visible as reference_visible
-
-pytestmark = pytest.mark.optimised
 
 FEATURES = (1, 2, 3)
 remember_jit = jax.jit(remember)

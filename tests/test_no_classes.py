@@ -26,8 +26,6 @@ from potlp_jax.view.replay_page import replay_page
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.sensing import SensorConfig
 
-pytestmark = pytest.mark.optimised
-
 TOY = Toy(ToyConfig(door_row=4, start=(4, 2), goal=(2, 12), hazard=(6, 9)))
 GOAL = 1 << TOY.propositions.index("goal")
 

@@ -17,8 +17,6 @@ from potlp_jax.task.task import Task
 from tests.reference import covers
 from tests.reference.make_golden_covers import GOLDEN_COVERS
 
-pytestmark = pytest.mark.optimised
-
 
 def guard_of(letters, n: int) -> np.ndarray:
     guard = np.zeros(2**n, dtype=bool)

@@ -24,8 +24,6 @@ from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 from tests.reference.map_files import drawn, p5, write_map
 
-pytestmark = pytest.mark.optimised
-
 # Three rooms above a hallway; a sign is half a metre.
 BUILDING = drawn(
     "#####################",

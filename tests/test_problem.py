@@ -12,8 +12,6 @@ from potlp_jax.planning.history import action_terms, initial_history
 from potlp_jax.planning.problem import PlanningProblem, enumerate_actions
 from tests.reference.problems import FORMULAS, SIZES, padded_problem, problem_of, random_fields, random_problem, task_of
 
-pytestmark = pytest.mark.optimised
-
 TASK = "F a & F b"
 
 

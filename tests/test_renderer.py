@@ -18,8 +18,6 @@ from potlp_jax.world.grid import Appearance, World, make_world, pad_world
 from potlp_jax.world.renderer import render
 from tests.reference import renderer as reference
 
-pytestmark = pytest.mark.optimised
-
 SMALL = CameraConfig(height=36, width=64, horizon=13.0, fold=4.5)
 PLAIN = dataclasses.replace(SMALL, texture=0.0)
 

@@ -12,8 +12,6 @@ from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.rules import trial_key
 
-pytestmark = pytest.mark.optimised
-
 STEPS = 12
 
 

@@ -9,8 +9,6 @@ from hypothesis import strategies as st
 from potlp_jax.learning.sample_weights import WeightBounds, loss_weights
 from potlp_jax.planning.estimates import Estimates
 
-pytestmark = pytest.mark.optimised
-
 BOUNDS = WeightBounds(low=2.0, high=50.0)
 
 

@@ -27,8 +27,6 @@ from potlp_jax.world.grid import BeliefMap
 from potlp_jax.world.sensing import SensorConfig, observe
 from tests.reference.labels import true_label
 
-pytestmark = pytest.mark.optimised
-
 SIGMA = Firefighting.propositions
 
 

@@ -32,8 +32,6 @@ from potlp_jax.learning.training import (
     train,
 )
 
-pytestmark = pytest.mark.optimised
-
 SHAPE = (64, 128)
 ROOT = Path(__file__).parents[1]
 WIDTHS = {

@@ -35,8 +35,6 @@ from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy, make_world, pad_world
 from potlp_jax.world.sensing import SensorConfig
 
-pytestmark = pytest.mark.optimised
-
 SIZES = TaskSizes(states=6, propositions=3, edges=9, classes=9, compound=3, cubes=3)
 CONFIG = TrialConfig(
     sensor=SensorConfig(range_cells=6.0),
