@@ -23,6 +23,7 @@ from potlp_jax.trials.record import Outcome
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import pad_world
 from potlp_jax.world.sensing import SensorConfig
+from tests.reference.domains import domain_of
 
 TOY = make("toy")
 TASKS = [Task.from_formula(text, propositions=TOY.propositions) for text in TOY.tasks.values()]
@@ -38,7 +39,9 @@ def _untrained():
         propositions=TOY.propositions, first_widths=(4,) * 4, second_widths=(4,) * 8, dense_widths=(8,) * 4, fovea=3
     )
     params = EstimatorNetwork(config).init(jax.random.key(0))
-    return TrainedEstimator(params=params, config=config, metadata={}, name="untrained", digest="")
+    return TrainedEstimator(
+        params=params, config=config, domain=domain_of("toy"), metadata={}, name="untrained", digest=""
+    )
 
 
 UNTRAINED = _untrained()

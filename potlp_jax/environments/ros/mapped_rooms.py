@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from potlp_jax.environments.base import Generator
-from potlp_jax.environments.campus.delivery import DeliveryConfig
+from potlp_jax.environments.campus.delivery import PARCELS_FAMILY, scaled_to
 from potlp_jax.environments.campus.furnishing import NO_ROOM, PARCELS, Floor, FurnishConfig, Kind, Placement, furnish
 from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.ros.cleaning import CleanMap, clean_map
@@ -32,7 +32,6 @@ from potlp_jax.environments.ros.places import Region, load_regions
 from potlp_jax.environments.ros.ros_map import NARROW_DOORS
 from potlp_jax.environments.splits import PARCELS_PREFIX
 from potlp_jax.errors import MapError, MapWarning
-from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.grid import World
 from potlp_jax.world.settings import Settings
 
@@ -41,12 +40,6 @@ PERSON_RADIUS = 0.5
 
 LEAST_ROOM = 2.0
 """Square metres that the robot must be able to reach of a room."""
-
-LEARNED_RESOLUTION = DeliveryConfig().resolution
-"""Metres a cell in the worlds of ``parcels``, whose camera this one equals."""
-
-REPLAN_DISTANCE = 2.0
-"""Metres between decisions, as there."""
 
 MANY_SLIVERS = 64
 """Subgoals that there is room for: where doors may be as narrow as a cell, slivers between clutter are frontiers too,
@@ -85,6 +78,8 @@ class MappedRooms(Generator):
 
     propositions = PARCELS.propositions
     tasks = PARCELS.tasks
+    # They look like the generator's, and the camera shows the same metres.
+    family = PARCELS_FAMILY
 
     def __init__(self, config: MappedRoomsConfig) -> None:
         """Reads the map and its rooms.
@@ -145,14 +140,8 @@ class MappedRooms(Generator):
 
 def _settings(resolution: float) -> Settings:
     """Camera and replanning as in ``parcels``, in metres, space for all frontiers, and none too narrow."""
-    # The camera counts in cells. On other cells its lengths are scaled, so that the picture shows the same metres.
-    scale, camera = LEARNED_RESOLUTION / resolution, CameraConfig()
-    lengths = {name: getattr(camera, name) * scale for name in ("far", "eye_height", "wall_height", "texture_reach")}
     frontiers = {"max_subgoals": MANY_SLIVERS, **NARROW_DOORS["decision"]["frontiers"]}
-    replan_distance = REPLAN_DISTANCE / resolution
-    return Settings(
-        {**NARROW_DOORS, "decision": {"frontiers": frontiers}, "camera": lengths, "replan_distance": replan_distance}
-    )
+    return Settings({**NARROW_DOORS, "decision": {"frontiers": frontiers}, **scaled_to(resolution)})
 
 
 def _floor(
