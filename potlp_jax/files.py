@@ -206,7 +206,35 @@ def read_yaml(path: Path | str, error: type[PotlpError], loader: type[Any] | Non
 def parse_yaml(text: str, loader: type[Any] | None = None) -> Any:
     """The value of a YAML text. Raises YAMLError, or whatever a value that is out of range makes its type raise."""
     _check_events(text)
-    return yaml.load(text, Loader=loader or (yaml.CSafeLoader if _LIBYAML else yaml.SafeLoader))
+    reader = (loader or (yaml.CSafeLoader if _LIBYAML else yaml.SafeLoader))(text)
+    try:
+        node = reader.get_single_node()
+        _check_keys(node)
+        return None if node is None else reader.construct_document(node)
+    finally:
+        reader.dispose()
+
+
+def _check_keys(root: yaml.Node | None) -> None:
+    """Refuse a key that is given twice: PyYAML keeps the last of them, and says nothing."""
+    waiting, seen = [root], set()
+    while waiting:
+        node = waiting.pop()
+        # An alias is the node itself, once more.
+        if not isinstance(node, yaml.CollectionNode) or id(node) in seen:
+            continue
+        seen.add(id(node))
+        if isinstance(node, yaml.MappingNode):
+            keys: set[tuple[str, str]] = set()
+            for key, value in node.value:
+                if isinstance(key, yaml.ScalarNode):
+                    if (key.tag, key.value) in keys:
+                        line = key.start_mark.line + 1
+                        raise yaml.YAMLError(f"key {short(key.value)} is given twice, line {line}")
+                    keys.add((key.tag, key.value))
+                waiting += [key, value]
+        else:
+            waiting += node.value
 
 
 def _check_events(text: str) -> None:

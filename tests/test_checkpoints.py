@@ -161,7 +161,7 @@ def test_parameters_that_are_no_numbers_are_refused_by_name(tmp_path, params, va
     broken = jax.tree.unflatten(structure, [leaves[0].at[0].set(value), *leaves[1:]])
     save_estimator(tmp_path / "e.npz", broken, CONFIG, DOMAIN, {})
     name = next(iter(estimator_files.named_leaves(broken)))
-    with pytest.raises(CheckpointError, match=rf"e\.npz: the parameter {name} holds .* NaN or infinite"):
+    with pytest.raises(EstimatorError, match=rf"e\.npz: the parameter {name} holds .* NaN or infinite"):
         load_estimator(tmp_path / "e.npz")
 
 

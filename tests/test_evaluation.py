@@ -485,7 +485,7 @@ def test_bad_input_is_one_clear_message(estimator, dataset, tmp_path, monkeypatc
         (("info", broken), "damaged"),
         (("evaluate", broken, folder), "damaged"),
         (("evaluate", estimator, tmp_path), "there is no dataset"),
-        (("evaluate", other, folder), "knows the propositions goal"),
+        (("evaluate", other, folder), "has the propositions (fire, alarm, exit)"),
         (("evaluate", estimator, folder, "--ablate", "sound"), "unknown ablation 'sound'"),
     ):
         result = _potlp(*arguments)

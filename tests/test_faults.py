@@ -131,6 +131,13 @@ def test_yaml_values_that_no_type_takes_are_refused(text, tmp_path):
         read_yaml(tmp_path / "x.yaml", ConfigurationError)
 
 
+@pytest.mark.parametrize("text", ["a: 1\na: 2", "b: [{a: 1, c: 2, a: 3}]", "? a\n: &x {a: 1}\n? a\n: *x"])
+def test_a_key_that_is_given_twice_is_refused_in_every_file(text, tmp_path):
+    (tmp_path / "x.yaml").write_text(text)
+    with pytest.raises(ConfigurationError, match=r"x\.yaml: is not valid YAML: key 'a' is given twice, line \d"):
+        read_yaml(tmp_path / "x.yaml", ConfigurationError)
+
+
 @pytest.mark.parametrize("text", ["1: a", "a: {2001-01-01: b}", "on: a", f"a: [0x{'f' * 5000}]", "[a]", "a"])
 def test_settings_hold_names_and_numbers_that_json_knows(text, tmp_path):
     (tmp_path / "x.yaml").write_text(text)

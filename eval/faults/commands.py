@@ -12,7 +12,7 @@ import numpy as np
 import typer
 
 from eval.faults import Kind, seeds
-from eval.faults.mutations import damaged
+from eval.faults.mutations import damaged, pick
 from eval.faults.seeds import Tree, kept, write_tree
 from potlp_jax.cli import app
 from potlp_jax.errors import PotlpError
@@ -62,9 +62,9 @@ _COMMANDS: tuple[tuple[Callable[[Path], Tree], tuple[str, ...]], ...] = (
 
 def _command(random: np.random.Generator, folder: Path) -> None:
     """One command with one damaged file, in this process, as the script would run it."""
-    make, words = _COMMANDS[random.integers(len(_COMMANDS))]
+    make, words = pick(random, _COMMANDS)
     tree = make(folder)
-    name = sorted(tree)[random.integers(len(tree))]
+    name = pick(random, sorted(tree))
     write_tree({**tree, name: damaged(random, tree[name], list(tree.values()))}, folder)
     out, errors = io.StringIO(), io.StringIO()
     try:

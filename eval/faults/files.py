@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from eval.faults import Kind, WrongAnswerError, seeds
-from eval.faults.mutations import damaged
+from eval.faults.mutations import damaged, pick
 from eval.faults.seeds import Tree, kept, write_tree
 from potlp_jax.environments.campus.floor_plan_xml import read_plan
 from potlp_jax.environments.ros.map_files import load_map, load_settings
@@ -50,9 +50,9 @@ def _case(
         folder: for the files.
     """
     found = trees(folder)
-    tree = found[random.integers(len(found))]
+    tree = pick(random, found)
     names = sorted(tree)
-    name = names[random.integers(len(names))]
+    name = pick(random, names)
     others = [contents for other in found for contents in other.values()]
     write_tree({**tree, name: damaged(random, tree[name], others)}, folder)
     with warnings.catch_warnings():
@@ -254,7 +254,7 @@ _READERS: dict[str, tuple[str, Read]] = {
 
 def _not_a_file(random: np.random.Generator, folder: Path) -> None:
     """A folder, a pipe, a device, a link to itself, nothing, or an endless file in the place of a file."""
-    name, read = _READERS[sorted(_READERS)[random.integers(len(_READERS))]]
+    name, read = _READERS[pick(random, sorted(_READERS))]
     # Where several files are read, the others are whole.
     for tree in (_dataset_trees(folder), _export_trees(folder)):
         if name in tree[0]:
@@ -283,7 +283,7 @@ def _not_a_file(random: np.random.Generator, folder: Path) -> None:
 
 def _bomb(random: np.random.Generator, folder: Path) -> None:
     """Small files that stand for gigabytes, and files whose headers promise them."""
-    kind = sorted(_BOMBS)[random.integers(len(_BOMBS))]
+    kind = pick(random, sorted(_BOMBS))
     try:
         _BOMBS[kind](random, folder)
     except PotlpError:
@@ -295,8 +295,8 @@ def _image_bomb(random: np.random.Generator, folder: Path) -> None:
     import cv2
 
     # 30,000 squared, of which the file has the header and nothing else that is true.
-    size = int(random.choice([8_000, 30_000, 65_535]))
-    kind = str(random.choice(["pgm", "ascii", "png", "bmp"]))
+    size = pick(random, (8_000, 30_000, 65_535))
+    kind = pick(random, ("pgm", "ascii", "png", "bmp"))
     contents = bytearray(seeds.encoded(kind))
     if kind in ("pgm", "ascii"):
         contents = bytearray(contents.replace(b"60 40", f"{size} {size}".encode()))
@@ -360,9 +360,7 @@ def _entity_bomb(random: np.random.Generator, folder: Path) -> None:
 
 def _large_file(random: np.random.Generator, folder: Path) -> None:
     # Sparse: it takes no space on the disk.
-    name, read = _READERS[
-        str(random.choice(["map", "image", "places", "plan", "task", "record", "sweep", "estimator"]))
-    ]
+    name, read = _READERS[pick(random, ("map", "image", "places", "plan", "task", "record", "sweep", "estimator"))]
     with (folder / name).open("wb") as stream:
         stream.truncate(int(random.integers(2 << 30, 1 << 40)))
     read(folder)

@@ -2,8 +2,11 @@
 
 import re
 from collections.abc import Callable, Sequence
+from typing import Literal, TypeVar
 
 import numpy as np
+
+T = TypeVar("T")
 
 EXTREMES: tuple[str, ...] = (
     "0",
@@ -40,6 +43,7 @@ EXTREMES: tuple[str, ...] = (
 )
 """What may stand where a number is expected: the ends of the types, and what YAML or Python read as something else."""
 
+_BYTE_ORDERS: tuple[Literal["little"], Literal["big"]] = ("little", "big")
 _NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 _WORD = re.compile(r"[A-Za-z_]\w*")
 _BRACKETS = (("[", "]"), ("{", "}"), ("(", ")"), ("{a: ", "}"), ("<a>", "</a>"), ("- ", ""), ("!", ""), ("X ", ""))
@@ -66,6 +70,11 @@ _ODD = (
 )
 
 
+def pick(random: np.random.Generator, choices: Sequence[T]) -> T:
+    """One of some values, as it is; ``Generator.choice`` would make numpy's types of them, and floats of 64 bits."""
+    return choices[int(random.integers(len(choices)))]
+
+
 def damaged(random: np.random.Generator, data: bytes, others: Sequence[bytes] = ()) -> bytes:
     """The bytes of a file with one to five kinds of damage, one after another.
 
@@ -78,7 +87,7 @@ def damaged(random: np.random.Generator, data: bytes, others: Sequence[bytes] = 
         Other bytes, at most a few times as many.
     """
     for _ in range(_few(random)):
-        data = _BYTES[random.integers(len(_BYTES))](random, data, [*others, data])
+        data = pick(random, _BYTES)(random, data, [*others, data])
     return data
 
 
@@ -94,7 +103,7 @@ def damaged_text(random: np.random.Generator, text: str, others: Sequence[str] =
         Another text.
     """
     for _ in range(_few(random)):
-        text = _TEXTS[random.integers(len(_TEXTS))](random, text, [*others, text])
+        text = pick(random, _TEXTS)(random, text, [*others, text])
     return text
 
 
@@ -113,7 +122,7 @@ def _span(random: np.random.Generator, length: int, longest: int | None = None) 
 def _flip_bits(random: np.random.Generator, data: bytes, others: Sequence[bytes]) -> bytes:
     changed = bytearray(data)
     for place in random.integers(len(data), size=int(2 ** random.uniform(0, 6))) if data else ():
-        changed[place] ^= 1 << random.integers(8)
+        changed[int(place)] ^= 1 << int(random.integers(8))
     return bytes(changed)
 
 
@@ -134,7 +143,7 @@ def _overwrite(random: np.random.Generator, data: bytes, others: Sequence[bytes]
 
 
 def _splice(random: np.random.Generator, data: bytes, others: Sequence[bytes]) -> bytes:
-    other = others[random.integers(len(others))]
+    other = pick(random, others)
     (begin, end), (first, last) = _span(random, len(data)), _span(random, len(other))
     return data[:begin] + other[first:last] + data[end:]
 
@@ -152,35 +161,34 @@ def _repeat(random: np.random.Generator, data: bytes, others: Sequence[bytes]) -
 def _extreme_integer(random: np.random.Generator, data: bytes, others: Sequence[bytes]) -> bytes:
     """Sizes and counts in binary formats: the ends of their types, and values just beside."""
     size = int(random.choice([1, 2, 4, 8]))
-    # Picked by index: numpy would make floats of integers beyond 63 bits.
-    value = (0, 1, (1 << (8 * size - 1)) - 1, 1 << (8 * size - 1), (1 << 8 * size) - 1)[random.integers(5)]
+    value = pick(random, (0, 1, (1 << (8 * size - 1)) - 1, 1 << (8 * size - 1), (1 << 8 * size) - 1))
     place = int(random.integers(max(1, len(data) - size)))
-    return data[:place] + value.to_bytes(size, str(random.choice(["little", "big"]))) + data[place + size :]
+    return data[:place] + value.to_bytes(size, pick(random, _BYTE_ORDERS)) + data[place + size :]
 
 
 def _as_text(random: np.random.Generator, data: bytes, others: Sequence[bytes]) -> bytes:
-    return _TEXTS[random.integers(len(_TEXTS))](random, data.decode("latin-1"), [""]).encode("latin-1", "replace")
+    return pick(random, _TEXTS)(random, data.decode("latin-1"), [""]).encode("latin-1", "replace")
 
 
 def _replace_match(pattern: re.Pattern[str], random: np.random.Generator, text: str, new: str) -> str:
     matches = list(pattern.finditer(text))
     if not matches:
         return text
-    match = matches[random.integers(len(matches))]
+    match = pick(random, matches)
     return text[: match.start()] + new + text[match.end() :]
 
 
 def _extreme_number(random: np.random.Generator, text: str, others: Sequence[str]) -> str:
-    return _replace_match(_NUMBER, random, text, EXTREMES[random.integers(len(EXTREMES))])
+    return _replace_match(_NUMBER, random, text, pick(random, EXTREMES))
 
 
 def _other_word(random: np.random.Generator, text: str, others: Sequence[str]) -> str:
-    words = _WORD.findall(others[random.integers(len(others))]) or ["a"]
-    return _replace_match(_WORD, random, text, words[random.integers(len(words))])
+    words = _WORD.findall(pick(random, others)) or ["a"]
+    return _replace_match(_WORD, random, text, pick(random, words))
 
 
 def _nest(random: np.random.Generator, text: str, others: Sequence[str]) -> str:
-    before, after = _BRACKETS[random.integers(len(_BRACKETS))]
+    before, after = pick(random, _BRACKETS)
     # 400 levels go beyond the stack of many a parser, 20,000 beyond that of any that calls itself.
     depth = int(random.choice([3, 40, 400, 2_000, 20_000]))
     begin, end = _span(random, len(text), 40)
@@ -189,14 +197,14 @@ def _nest(random: np.random.Generator, text: str, others: Sequence[str]) -> str:
 
 def _repeat_line(random: np.random.Generator, text: str, others: Sequence[str]) -> str:
     lines = text.splitlines(keepends=True) or [""]
-    chosen = lines[random.integers(len(lines))]
+    chosen = pick(random, lines)
     lines.insert(int(random.integers(len(lines) + 1)), chosen * int(random.choice([1, 2, 100])))
     return "".join(lines)
 
 
 def _drop_line(random: np.random.Generator, text: str, others: Sequence[str]) -> str:
     lines = text.splitlines(keepends=True) or [""]
-    del lines[random.integers(len(lines))]
+    del lines[int(random.integers(len(lines)))]
     return "".join(lines)
 
 
@@ -216,11 +224,11 @@ def _indent_line(random: np.random.Generator, text: str, others: Sequence[str]) 
 
 def _odd_character(random: np.random.Generator, text: str, others: Sequence[str]) -> str:
     begin, end = _span(random, len(text), 4)
-    return text[:begin] + _ODD[random.integers(len(_ODD))] * int(random.integers(1, 4)) + text[end:]
+    return text[:begin] + pick(random, _ODD) * int(random.integers(1, 4)) + text[end:]
 
 
 def _splice_text(random: np.random.Generator, text: str, others: Sequence[str]) -> str:
-    other = others[random.integers(len(others))]
+    other = pick(random, others)
     (begin, end), (first, last) = _span(random, len(text)), _span(random, len(other))
     return text[:begin] + other[first:last] + text[end:]
 

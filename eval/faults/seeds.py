@@ -69,6 +69,12 @@ def picture() -> np.ndarray:
     return pixels
 
 
+def frame() -> GridFrame:
+    """Where that map lies."""
+    height, width = picture().shape
+    return GridFrame(height, width, RESOLUTION, -1.0, -2.0)
+
+
 def map_yaml(image: str) -> str:
     """The settings of that map."""
     return (
@@ -152,7 +158,6 @@ def make_bag(folder: Path, name: str) -> None:
     still = quaternion_of(0.0)
     image = np.random.default_rng(0).integers(0, 255, (8, 16, 3)).astype(np.uint8)
     cells = np.where(picture() == 205, -1, np.where(picture() == 0, 1, 0))
-    frame = GridFrame(*cells.shape, RESOLUTION, -1.0, -2.0)
     with Recorder(folder / ("drive.bag" if name == "ros1" else "drive"), BagFormat(name)) as recorder:
         recorder.transforms("/tf_static", _SECOND, [("base_link", "panorama", (0.0, 0.0, 1.0), still)])
         for step in range(12):
@@ -160,7 +165,7 @@ def make_bag(folder: Path, name: str) -> None:
             seen = np.where(np.arange(cells.shape[1]) < 10 + 5 * step, cells, -1)
             if step % 4 == 0 or step == 11:
                 belief = belief_from_numpy(_belief_codes(seen), np.zeros(cells.shape, np.int32), RESOLUTION)
-                recorder.map(time, frame, belief)
+                recorder.map(time, frame(), belief)
             recorder.transforms("/tf", time, [("map", "odom", (0.0, 0.0, 0.0), still)])
             recorder.transforms("/tf", time + 1, [("odom", "base_link", (x, 0.0, 0.0), still)])
             recorder.odometry(time, (x, 0.0, 0.0), still)

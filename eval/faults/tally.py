@@ -95,7 +95,7 @@ def table(tally: Tally) -> str:
     lines += [_line(name, row) for name, row in sorted(tally.rows.items(), key=lambda item: (item[1].unit, item[0]))]
     for unit in sorted({row.unit for row in tally.rows.values()}):
         rows = [row for row in tally.rows.values() if row.unit == unit]
-        counts = {verdict: sum(row.counts[verdict] for row in rows) for verdict in Verdict}
+        counts: dict[str, int] = {verdict: sum(row.counts[verdict] for row in rows) for verdict in Verdict}
         total = Row(unit, sum(row.cases for row in rows), counts, max(row.slowest for row in rows))
         lines.append(_line("**all**", total))
     made = ", ".join(f"{name} {version}" for name, version in tally.versions.items())

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from eval.faults import Kind, seeds
-from eval.faults.mutations import EXTREMES, damaged_text
+from eval.faults.mutations import EXTREMES, damaged_text, pick
 from eval.faults.seeds import kept, write_tree
 from potlp_jax.codec import settings_from_words, with_settings
 from potlp_jax.environments.campus.floor_plan_xml import read_kinds, read_plan
@@ -34,7 +34,7 @@ Read = Callable[[str, Path], object]
 def _text_case(texts: Callable[[Path], Sequence[str]], read: Read, random: np.random.Generator, folder: Path) -> None:
     """Damage one of some texts, and read it; what was read is kept in the folder."""
     found = texts(folder)
-    text = damaged_text(random, found[random.integers(len(found))], found)
+    text = damaged_text(random, pick(random, found), found)
     (folder / "text").write_bytes(text.encode("utf-8", "surrogatepass"))
     read(text, folder)
 
@@ -61,7 +61,7 @@ def _places_text(folder: Path) -> str:
 
 def _read_places(file: Path) -> None:
     free = seeds.picture() == 254
-    place_letters(load_places(file), free, seeds.GridFrame(*free.shape, seeds.RESOLUTION, -1.0, -2.0))
+    place_letters(load_places(file), free, seeds.frame())
 
 
 def _read_map(file: Path) -> None:
@@ -102,7 +102,7 @@ def changed(random: np.random.Generator, value: Any) -> Any:
     """
     # Down to a random depth, so that values near the top change as often as the many at the bottom.
     if isinstance(value, dict) and value and random.random() < 0.85:
-        name = sorted(value)[random.integers(len(value))]
+        name = pick(random, sorted(value))
         return {**value, name: changed(random, value[name])}
     if isinstance(value, list) and value and random.random() < 0.85:
         place = int(random.integers(len(value)))
@@ -112,9 +112,9 @@ def changed(random: np.random.Generator, value: Any) -> Any:
 
 def _another(random: np.random.Generator, value: Any) -> Any:
     odd: list[Any] = [None, True, 0, -1, 1 << 40, 1 << 70, 1e308, "inf", "nan", "", "\ud800", [], {}, [[]], {"": 0}]
-    odd += [EXTREMES[random.integers(len(EXTREMES))], "x" * 10_000]
+    odd += [pick(random, EXTREMES), "x" * 10_000]
     if isinstance(value, dict) and value and random.random() < 0.5:
-        name = sorted(value)[random.integers(len(value))]
+        name = pick(random, sorted(value))
         return {other: entry for other, entry in value.items() if other != name}
     if isinstance(value, list) and value and random.random() < 0.5:
         return value[: random.integers(len(value))] if random.random() < 0.5 else value * 2
@@ -122,7 +122,7 @@ def _another(random: np.random.Generator, value: Any) -> Any:
         return value + (1 if random.random() < 0.5 else -1)
     if isinstance(value, str) and random.random() < 0.5:
         return damaged_text(random, value)
-    return odd[random.integers(len(odd))]
+    return pick(random, odd)
 
 
 def _json_case(

@@ -12,6 +12,7 @@ import traceback
 import zlib
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import jax
@@ -50,7 +51,7 @@ class Worker:
 
     def __init__(self, modules: tuple[str, ...], kind: Kind, seed: int, folder: Path) -> None:
         self._modules, self._kind, self._seed, self._folder = modules, kind, seed, folder
-        self._process: multiprocessing.process.BaseProcess | None = None
+        self._process: BaseProcess | None = None
         self._connection: Connection | None = None
 
     def run(self, number: int) -> Ending:
@@ -91,8 +92,9 @@ class Worker:
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
         arguments = (theirs, self._modules, self._kind.name, self._seed, self._folder)
-        self._process = context.Process(target=_serve, args=arguments)
-        self._process.start()
+        process = context.Process(target=_serve, args=arguments)
+        process.start()
+        self._process = process
         theirs.close()
         if not ours.poll(_START):
             self.close()

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from potlp_jax.codec import config_from_dict, differences
-from potlp_jax.errors import ConfigurationError, EstimatorError, NetworkError
+from potlp_jax.errors import ConfigurationError, EstimatorError, NetworkError, PotlpError
 from potlp_jax.files import read_npz, reading, require_mapping, short
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
@@ -87,27 +87,28 @@ def load_estimator(path: Path | str) -> tuple[Params, NetworkConfig, Domain, dic
     found = differences(array_shapes(arrays), array_shapes(wanted), "array")
     if found:
         raise EstimatorError(f"{path}: the parameters do not fit the network. {'; '.join(found)}")
-    require_finite(arrays, str(path))
+    require_finite(arrays, str(path), EstimatorError)
     leaves = [jnp.asarray(arrays[name]) for name in wanted]
     return jax.tree.unflatten(jax.tree.structure(like), leaves), config, domain, metadata
 
 
-def require_finite(arrays: Mapping[str, np.ndarray], where: str) -> None:
+def require_finite(arrays: Mapping[str, np.ndarray], where: str, kind: type[PotlpError]) -> None:
     """Check that all parameters are numbers.
 
     Args:
         arrays: by name.
         where: names the file in the message.
+        kind: of error for such a file.
 
     Raises:
-        EstimatorError: an array holds NaN or an infinity; the first one is named.
+        PotlpError: of this kind; an array holds NaN or an infinity; the first one is named.
     """
     # One such parameter reaches most estimates, and every decision would be flagged as invalid.
     for name, array in arrays.items():
         # Keys and counters are integers, which are always finite.
         if np.issubdtype(array.dtype, np.floating) and not np.all(np.isfinite(array)):
             count = int(np.sum(~np.isfinite(array)))
-            raise EstimatorError(
+            raise kind(
                 f"{where}: the parameter {name} holds {count} values that are NaN or infinite, of {array.size}: get it "
                 "again, or train it again"
             )

@@ -26,7 +26,7 @@ References:
 import math
 import re
 import warnings
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -228,18 +228,8 @@ def load_settings(file: Path | str) -> MapSettings:
     return settings
 
 
-class _TextLoader(yaml.CBaseLoader if yaml.__with_libyaml__ else yaml.BaseLoader):
-    """Leaves every scalar as its text, so that numbers stay exact, and refuses a key that is given twice."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        # YAML libraries keep the last of two equal keys, and say nothing.
-        seen = set()
-        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
-            if key.value in seen:
-                problem = f"key {key.value!r} is given twice"
-                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
-            seen.add(key.value)
-        return super().construct_mapping(node, deep=deep)
+_LOADER = yaml.CBaseLoader if yaml.__with_libyaml__ else yaml.BaseLoader
+"""Leaves every scalar as its text, so that numbers stay exact."""
 
 
 def read_yaml(file: Path) -> dict[str, Any]:
@@ -248,7 +238,7 @@ def read_yaml(file: Path) -> dict[str, Any]:
     Raises:
         MapError: the file is missing, is no YAML, or holds something else than a mapping of names.
     """
-    fields = files.read_yaml(file, MapError, _TextLoader)
+    fields = files.read_yaml(file, MapError, _LOADER)
     if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
         raise MapError(file, "", "must hold lines of the form 'key: value'")
     return fields
