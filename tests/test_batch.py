@@ -8,7 +8,7 @@ import pytest
 
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
-from potlp_jax.errors import BatchError
+from potlp_jax.errors import BatchError, EstimatorError
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.policies import Policy
@@ -134,5 +134,5 @@ def test_what_does_not_fit_is_named():
         list(run_batch([first, large], Policy.BASELINE, CONFIG, slots=3))
     with pytest.raises(BatchError, match="slots is 0"):
         list(run_batch([first], Policy.BASELINE, CONFIG, slots=0))
-    with pytest.raises(BatchError, match="needs an estimator"):
+    with pytest.raises(EstimatorError, match="no estimator is shipped for the propositions goal"):
         list(run_batch([first], Policy.POTLP, CONFIG))

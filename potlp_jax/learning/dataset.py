@@ -140,8 +140,7 @@ class DatasetMetadata:
             camera = config_from_dict(CameraConfig, self.camera, "camera")
         except ConfigurationError as error:
             raise DatasetError(f"not the metadata of a dataset: {error}") from error
-        # The unit by its name: cells of one metre are no unit of their own.
-        return dataclasses.replace(Domain.of_cells(self.family, camera, self.resolution), unit=self.unit)
+        return Domain.of_cells(self.family, camera, self.resolution)
 
     def differences(self, other: "DatasetMetadata") -> list[str]:
         """What differs, with both values: of this dataset, and of the other."""

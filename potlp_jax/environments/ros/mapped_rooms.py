@@ -26,7 +26,7 @@ from potlp_jax.environments.base import Generator
 from potlp_jax.environments.campus.delivery import PARCELS_FAMILY, scaled_to
 from potlp_jax.environments.campus.furnishing import NO_ROOM, PARCELS, Floor, FurnishConfig, Kind, Placement, furnish
 from potlp_jax.environments.options import parse_options
-from potlp_jax.environments.ros.cleaning import CleanMap, clean_map
+from potlp_jax.environments.ros.cleaning import CleanMap, clean_map, warn_of_cut_off
 from potlp_jax.environments.ros.map_files import load_map
 from potlp_jax.environments.ros.places import Region, load_regions
 from potlp_jax.environments.ros.ros_map import NARROW_DOORS
@@ -88,13 +88,15 @@ class MappedRooms(Generator):
             MapError: one of them cannot be used, or fewer than two rooms can be reached.
 
         Warns:
-            MapWarning: rooms are left out, because the robot can reach less than ``LEAST_ROOM`` of them.
+            MapWarning: a part of the building cannot be reached, or rooms are left out, because the robot can reach
+                less than ``LEAST_ROOM`` of them.
         """
         self.config = config
         file = Path(config.rooms) if config.rooms is not None else Path(config.file).with_suffix(".rooms.yaml")
         regions = load_regions(file, ("rooms",))["rooms"]
         self.clean: CleanMap = clean_map(load_map(config.file), config.resolution, config.radius)
         self.name = f"{PARCELS_PREFIX}{Path(config.file).stem}"
+        warn_of_cut_off(config.file, self.clean, config.resolution, config.radius)
         self.rooms, self.left_out, self.floor = _floor(regions, self.clean)
         # The hallway counts as the first; two people need two rooms.
         if len(self.rooms) < 3 or not np.any(self.floor.rooms == _HALLWAY):
