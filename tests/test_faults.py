@@ -28,7 +28,7 @@ from eval.faults import (
 from eval.faults.mutations import damaged, damaged_text
 from eval.faults.page import page, write_page
 from eval.faults.tally import TALLY, Row, Tally, open_tally, table
-from eval.faults.worker import Ending, judged
+from eval.faults.worker import Ending, _Clock, judged
 from potlp_jax.codec import read_settings, settings_from_words
 from potlp_jax.environments.campus.floor_plan_xml import read_plan
 from potlp_jax.environments.ros.map_files import load_map, load_settings, parse_number
@@ -542,3 +542,16 @@ def test_words_of_the_command_line_end_well(tmp_path):
         folder.mkdir()
         verdict, text = judged(kind, 3, number, folder)
         assert Verdict(verdict) in GOOD, text
+
+
+def test_waiting_for_a_core_is_no_time_of_a_case(monkeypatch, tmp_path):
+    (tmp_path / "7").mkdir()
+    (tmp_path / "7" / "schedstat").write_text("1 2000000000 3")
+    clock = _Clock(None)
+    clock._tasks = tmp_path
+    clock._began, clock._waited = 100.0, clock._waits()
+    monkeypatch.setattr("eval.faults.worker.time.monotonic", lambda: 110.0)
+    (tmp_path / "7" / "schedstat").write_text("1 8000000000 3")
+    assert clock.seconds() == pytest.approx(4.0)
+    clock._tasks = tmp_path / "gone"
+    assert clock.seconds() == pytest.approx(10.0)

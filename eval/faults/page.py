@@ -114,7 +114,7 @@ def _head(tallies: Mapping[str, Tally]) -> Iterator[str]:
         f"A *clear error* is a `PotlpError` of at most {LONGEST_MESSAGE:,} characters, which the command line shows as "
         "one line. Any other exception, a message that cannot be shown, and a process that dies count as a "
         f"*traceback*. A *hang* takes longer than {LIMIT:g} s, or the limit of its kind, twice. Each case may add "
-        f"{MEMORY // MIB:,} MiB to the memory of its process. Times are of a machine that did other work, too."
+        f"{MEMORY // MIB:,} MiB to the memory of its process. Seconds in which a case waited for a core do not count."
     )
     yield ""
 
