@@ -32,6 +32,8 @@ def made_line(made_by: Mapping[str, Any]) -> str:
     Returns:
         A sentence in Markdown.
     """
+    if not any(made_by.values()):
+        return "*Made before results kept their command, commit and versions.*"
     commits = made_by.get("commits") or [commit for commit in [made_by.get("commit")] if commit]
     # With ``+`` the package had changes that no commit holds.
     named = ", ".join(

@@ -224,4 +224,5 @@ def test_the_dead_end_part_is_the_slope_in_the_dead_end_cost(formula):
 def test_no_conditions():
     """A task without any edge to attempt: only finish is left."""
     exact = assert_equals_recursion(random_problem("X a", 2, 0, finish_chance=1.0))
-    assert exact.action == 0
+    assert np.isinf(exact.q_values[:-1]).all()
+    assert exact.action == len(exact.q_values) - 1

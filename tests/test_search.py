@@ -325,11 +325,13 @@ def test_no_subgoals_or_no_edges(formula, subgoals, finish):
     fields = random_fields(task, subgoals, 0)
     fields["finish"] = np.full_like(fields["finish"], finish)
     plan = plan_actions(problem_of(task, fields), jax.random.key(0), BestFirstConfig(simulations=4))
-    assert plan.q_values.shape == (1,)
+    *attempts, last = np.asarray(plan.q_values)
+    assert np.isinf(attempts).all()
+    assert last == finish
     if np.isinf(finish):
         assert (int(plan.action), float(plan.value), int(plan.status)) == (NO_ACTION, 300.0, Status.DEAD_END)
     else:
-        assert (int(plan.action), float(plan.value), int(plan.status)) == (0, 25.0, Status.OK)
+        assert (int(plan.action), float(plan.value), int(plan.status)) == (len(attempts), 25.0, Status.OK)
         assert (int(plan.subgoal), int(plan.from_state), int(plan.to_state)) == (NO_SUBGOAL, NO_STATE, NO_STATE)
 
 

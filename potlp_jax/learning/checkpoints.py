@@ -110,7 +110,8 @@ def load_checkpoint(
     if _checksum(arrays, description) != description["checksum"]:
         raise _damaged_checkpoint(path, "its checksum differs")
     # Scalars are left out: the best loss of a training that has not been evaluated yet is inf.
-    require_finite({name: array for name, array in arrays.items() if np.ndim(array) > 0}, str(path))
+    parameters = {name: array for name, array in arrays.items() if np.ndim(array) > 0}
+    require_finite(parameters, str(path), CheckpointError)
     leaves = [jnp.asarray(arrays[name]) for name in wanted]
     return jax.tree.unflatten(jax.tree.structure(like), leaves), dict(description["progress"])
 

@@ -17,8 +17,8 @@ MAX_PROPOSITIONS: int = 16
 LONGEST_NAME: int = 50
 """Characters of a name: sixteen fit into a message."""
 
-MAKE_THE_TASK = (
-    "make the task from the world, world.task(formula), or with its names, Task.from_formula(formula, names)"
+TAKE_ITS_NAMES = (
+    "take the task from the world, world.task(formula), or give its names, Task.from_formula(formula, names)"
 )
 """What to do where a task meets a world or a belief of other propositions."""
 
@@ -52,7 +52,7 @@ def require_same_propositions(
     *,
     asker: str = "the task",
     knower: str = "the world",
-    remedy: str = MAKE_THE_TASK,
+    remedy: str = TAKE_ITS_NAMES,
 ) -> None:
     """Refuse to join two things whose propositions differ in names or in order.
 

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Int8, Int32
 
 from potlp_jax.errors import SpotMissingError, TaskError, TaskWarning, UnsatisfiableError
-from potlp_jax.task.automaton import Dfa, canonical_dfa, translate
+from potlp_jax.precision import in_32_bits
+from potlp_jax.task.automaton import Dfa, canonical_dfa, check_size, translate
 from potlp_jax.task.formula import parse_formula, unknown_proposition
 from potlp_jax.task.guards import Phi, minimal_cover
 from potlp_jax.task.hoa import HoaAutomaton, read_hoa, write_hoa
@@ -196,6 +197,7 @@ class Task:
         cls, text: str, propositions: tuple[str, ...], automaton: HoaAutomaton, max_positive_literals: int | None
     ) -> "Task":
         """The task of a parsed automaton, over Sigma."""
+        check_size(len(automaton.accepting), len(propositions))
         unknown = [name for name in automaton.propositions if name not in propositions]
         if unknown:
             raise TaskError(f"unknown proposition '{unknown[0]}'; known: {', '.join(propositions) or 'none'}")
@@ -249,6 +251,7 @@ class Task:
         """The device form, without more padding than ``sizes`` has."""
         return self.padded(self.sizes)
 
+    @in_32_bits
     def padded(self, sizes: TaskSizes) -> TaskArrays:
         """The device form in larger arrays. Padding changes no result.
 
@@ -316,6 +319,7 @@ def _check_that_it_asks_for_something(text: str, dfa: Dfa) -> None:
         warnings.warn(f"'{text}' is satisfied by every word: there is nothing to do", TaskWarning, stacklevel=4)
 
 
+@in_32_bits
 def stack_tasks(tasks: Sequence[Task], sizes: TaskSizes | None = None) -> TaskArrays:
     """Several tasks over the same propositions, padded and stacked along a new leading axis.
 

@@ -169,9 +169,9 @@ def _places(task: Task, edges: list[Edge]) -> dict[int, np.ndarray]:
         for rank, state in enumerate(states)
     }
     # Traps stand below all other states and outside the layers, for progress never goes through one.
-    lowest = min((place[1] for place in places.values()), default=0.0)
+    lowest = min(place[1] for place in places.values())
     for rank, state in enumerate(np.flatnonzero(task.dfa.trap).tolist()):
-        places[state] = np.array([(rank + 0.5) * ACROSS if places else 0.0, lowest - DOWN - 0.35])
+        places[state] = np.array([(rank + 0.5) * ACROSS, lowest - DOWN - 0.35])
     return places
 
 

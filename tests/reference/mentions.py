@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
 
+import typer.completion
 import typer.core
 from typer.testing import CliRunner
 
@@ -103,7 +104,9 @@ def words_of(line: str) -> list[str]:
 
 def parse_potlp(words: list[str]) -> str | None:
     """What is wrong with the words after ``potlp``, as the real parser says; None where nothing is. Runs nothing."""
-    with mock.patch.object(typer.core.TyperCommand, "invoke", return_value=None):
+    # Options that install completion do it while they are read, in the shell and the home folder of whoever tests.
+    installed = mock.patch.object(typer.completion, "install", return_value=("a shell", Path("a file")))
+    with mock.patch.object(typer.core.TyperCommand, "invoke", return_value=None), installed:
         result = CliRunner().invoke(app, words)
     return None if result.exit_code == 0 else f"exit code {result.exit_code}: {result.output}"
 
