@@ -13,12 +13,11 @@ from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.errors import EstimatorError, PropositionsError
 from potlp_jax.learning.estimator import (
-    SURE,
     estimator_for,
-    exclusive_chances,
     read_estimator,
     shipped_estimator,
 )
+from potlp_jax.learning.exclusion import SURE, exclusive_chances
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.learning.observing import observe_panorama
 from potlp_jax.learning.serialization import save_estimator

@@ -5,9 +5,10 @@ import dataclasses
 import jax
 
 from potlp_jax.bench.planner import PhaseRow, Phases, Scene, measure_decision, world_of
-from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator
+from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.memory import remember
 from potlp_jax.learning.network import EstimatorNetwork
+from potlp_jax.learning.panorama_estimator import NetworkEstimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.situation import DecisionConfig, assess
 from potlp_jax.trials.config import TrialConfig

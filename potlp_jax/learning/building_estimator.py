@@ -8,7 +8,7 @@ from flax import struct
 from jaxtyping import Array, Float32, Int32, UInt8
 
 from potlp_jax.learning.building_network import BuildingConfig, BuildingNetwork, EncodedMap, Params, map_channels
-from potlp_jax.learning.estimator import exclusive_chances
+from potlp_jax.learning.exclusion import exclusive_chances
 from potlp_jax.learning.painting import Painting, paint
 from potlp_jax.learning.serialization import require_propositions
 from potlp_jax.planning.estimates import Estimates

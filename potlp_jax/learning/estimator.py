@@ -1,185 +1,27 @@
-"""The trained network as an estimator: what it is asked in a decision, and which one belongs to which worlds.
+"""A trained estimator as it is read from a file, and which one belongs to which worlds.
 
-``TrainedEstimator`` is what is read from a file, on the host; ``NetworkEstimator`` is the pytree that a decision calls
-inside jit, with the panoramas seen so far. Which propositions an estimator knows, and which worlds it serves, its file
-says.
+``TrainedEstimator`` lives on the host; ``start`` gives the pytree that a decision calls inside jit, with the panoramas
+seen so far (``learning.panorama_estimator``). Which propositions an estimator knows, and which worlds it serves, its
+file says.
 """
 
 import dataclasses
 import functools
 import hashlib
-import math
 import warnings
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, cast
 
-import jax
-import jax.numpy as jnp
-from flax import struct
-from jaxtyping import Array, Float32, Int32, UInt8
-
 from potlp_jax import plugins
 from potlp_jax.errors import EstimatorError, PluginError, PotlpWarning
 from potlp_jax.learning.domain import Domain
-from potlp_jax.learning.memory import (
-    PanoramaMemory,
-    empty_memory,
-    observation_of_subgoals,
-    remember,
-    slots_of_observations,
-)
-from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
+from potlp_jax.learning.memory import empty_memory
+from potlp_jax.learning.network import NetworkConfig, Params
+from potlp_jax.learning.panorama_estimator import NetworkEstimator
 from potlp_jax.learning.serialization import load_estimator, require_propositions
-from potlp_jax.planning.distances.product import product_distances
-from potlp_jax.planning.estimates import Estimates, Estimator
-from potlp_jax.task.task import TaskArrays
-from potlp_jax.types import NO_STATE
-from potlp_jax.world.camera import bearing
-from potlp_jax.world.frontiers import Subgoals
-from potlp_jax.world.grid import BeliefMap
-
-QUESTIONS: int = 3
-"""Classes that are asked of a subgoal at a time."""
-
-SURE: float = 0.97
-"""The most that the chances of subgoals side by side come to together."""
-
-
-@struct.dataclass(kw_only=True)
-class NetworkEstimator:
-    """P_S, R_S and R_F from the panoramas seen so far (Bradley et al. 2021, section IV). ``config`` is static."""
-
-    params: Params
-    memory: PanoramaMemory
-    config: NetworkConfig = struct.field(pytree_node=False)
-
-    def __call__(self, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays) -> Estimates:
-        """Estimates of every real (subgoal, class); padded pairs have P_S = 0.
-
-        At least one observation must be remembered.
-
-        The network counts in the unit of the worlds that it learned from, which is the belief's: cells or metres.
-        Subgoals are asked one after the other, of each so many classes at a time, so that padding costs little.
-
-        Raises:
-            PropositionsError: the network was trained for other propositions than the task's.
-        """
-        require_propositions(self.config, task.propositions, "the estimator's network")
-        # Each subgoal is judged from the panorama in which it was last in sight, taken from where the robot then stood.
-        places = slots_of_observations(self.memory, observation_of_subgoals(self.memory, subgoals))
-        distance = self.distances(belief, subgoals)
-        angle = jax.vmap(bearing)(self.memory.cells[places], subgoals.cells)
-        classes = task.class_mask.shape[0]
-
-        def ask(subgoal: Int32[Array, ""], answers: Float32[Array, "3 S C"]) -> Float32[Array, "3 S C"]:
-            features = self.memory.features[places[subgoal]]
-            found = self._ask_of_subgoal(features, angle[subgoal], distance[subgoal], task, answers[:, subgoal])
-            return answers.at[:, subgoal].set(found)
-
-        # Real subgoals come first, so the loop ends with the last of them: what padding would cost is the second stage
-        # of the network, which is most of the work.
-        real = jnp.sum(subgoals.mask, dtype=jnp.int32)
-        nothing = jnp.stack(
-            [jnp.zeros((subgoals.mask.shape[0], classes)), *[jnp.ones((subgoals.mask.shape[0], classes))] * 2]
-        )
-        probability, success_cost, failure_cost = jax.lax.fori_loop(0, real, ask, nothing)
-        # Rows of masked subgoals keep P_S = 0 from the start; columns of masked classes may hold anything.
-        probability = jnp.where(task.class_mask[None, :], probability, 0.0)
-        return Estimates(
-            success_probability=exclusive_chances(probability, subgoals, self.config.exclusive_within),
-            success_cost=success_cost,
-            failure_cost=failure_cost,
-            # Sticky: once a panorama was dropped that showed a frontier, later estimates may be worse for it.
-            status=self.memory.status,
-        )
-
-    def _ask_of_subgoal(
-        self,
-        features: Float32[Array, "rows columns F"],
-        angle: Float32[Array, ""],
-        distance: Float32[Array, ""],
-        task: TaskArrays,
-        answers: Float32[Array, "3 C"],
-    ) -> Float32[Array, "3 C"]:
-        """P_S, R_S and R_F of the real classes beyond one subgoal; ``answers`` keeps what it has of the others."""
-        network, classes = EstimatorNetwork(self.config), task.class_mask.shape[0]
-        centred = network.centre(features, angle, distance)
-        repeated = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (QUESTIONS, *leaf.shape)), centred)
-        # The features of a subgoal are the same for all of its classes, so they are broadcast once.
-        # Real classes first; those that fill up the last portion are dropped where they are written.
-        order = jnp.argsort(~task.class_mask, stable=True).astype(jnp.int32)
-        # An index of ``classes`` is out of bounds, and mode="drop" ignores it.
-        order = jnp.pad(order, (0, -classes % QUESTIONS), constant_values=classes)
-        portions = -(-jnp.sum(task.class_mask, dtype=jnp.int32) // QUESTIONS)
-
-        def ask(portion: Int32[Array, ""], answers: Float32[Array, "3 C"]) -> Float32[Array, "3 C"]:
-            chosen = jax.lax.dynamic_slice_in_dim(order, portion * QUESTIONS, QUESTIONS)
-            answer = network.answer(self.params, repeated, task.class_phi[chosen, 0], task.class_phi[chosen, 1])
-            found = jnp.stack([answer.success_probability, answer.success_cost, answer.failure_cost])
-            return answers.at[:, chosen].set(found, mode="drop")
-
-        return jax.lax.fori_loop(0, portions, ask, answers)
-
-    def distances(self, belief: BeliefMap, subgoals: Subgoals) -> Float32[Array, " S"]:
-        """From where each subgoal was seen to the subgoal through known space, letters ignored, in the belief's unit.
-
-        0 where masked, or where known space does not lead there.
-        """
-        poses = self.memory.cells[slots_of_observations(self.memory, observation_of_subgoals(self.memory, subgoals))]
-        return _distances(belief, poses, subgoals)
-
-    def encode(self, panorama: UInt8[Array, "rows columns 3"]) -> Float32[Array, "feature_rows feature_columns F"]:
-        """The first stage's features of a panorama."""
-        return EstimatorNetwork(self.config).encode(self.params, panorama)
-
-    def remember(
-        self, seen: Float32[Array, "feature_rows feature_columns F"], belief: BeliefMap, cell: Int32[Array, "2"]
-    ) -> "NetworkEstimator":
-        """The estimator with one panorama more in memory (``learning.memory.remember``)."""
-        return dataclasses.replace(self, memory=remember(self.memory, seen, belief, cell))
-
-
-def exclusive_chances(chances: Float32[Array, "S C"], subgoals: Subgoals, within: float) -> Float32[Array, "S C"]:
-    """P_S of subgoals side by side, raised so that, taken as independent, they fail together as rarely as they do.
-
-    In fire-fighting buildings two frontiers within 16 cells of each other border the same place, and what is asked for
-    is in one of its parts: both succeed in less than 1 % of the cases, and one of them does with about the sum of their
-    chances (``eval.exclusion``). Eq. 3 takes attempts as independent. The logarithms of the chances to fail are scaled
-    by a common factor, so that all subgoals ``within`` so many cells of one fail together with ``1 - sum``, at least
-    ``1 - SURE``. With ``within`` 0 nothing is raised.
-
-    Args:
-        chances: P_S as the network answers it, in [0, 1].
-        subgoals: where they are; masked ones neither raise others nor are raised.
-        within: distance in cells between subgoals that exclude each other; static.
-
-    Returns:
-        P_S of the same shape, nowhere lower than ``chances``.
-    """
-    apart = subgoals.cells[:, None] - subgoals.cells[None, :]
-    near = jnp.sum(apart**2, axis=2) <= math.floor(within**2)
-    near = jnp.where(near & subgoals.mask[:, None] & subgoals.mask[None, :], 1.0, 0.0)
-    # Logarithms of the chance to fail: a product over neighbours becomes a matrix product.
-    # Kept off 1, where the logarithm is infinite.
-    fails = jnp.log1p(-jnp.minimum(chances, jnp.float32(1.0 - 1e-6)))
-    independent, together = near @ fails, jnp.log1p(-jnp.minimum(near @ chances, SURE))
-    # Where no neighbour can succeed both logarithms are 0, and there is nothing to scale.
-    factor = jnp.where(independent < 0.0, together / jnp.minimum(independent, -1e-12), 1.0)
-    # Never below 1: subgoals that exclude each other do not make each other less likely.
-    return -jnp.expm1(fails * jnp.maximum(factor, 1.0))
-
-
-def _distances(belief: BeliefMap, poses: Int32[Array, "S 2"], subgoals: Subgoals) -> Float32[Array, " S"]:
-    """From each pose to its subgoal through known space, letters ignored; 0 where masked."""
-    # One automaton state for all free cells: letters do not matter for how far away something was seen.
-    open_cells = jnp.where(belief.free, 0, NO_STATE).astype(jnp.int32)[:, :, None]
-    states = jnp.where(subgoals.mask, 0, NO_STATE).astype(jnp.int32)
-    fields = product_distances(open_cells, belief.free, poses, states, belief.resolution)
-    count = jnp.arange(poses.shape[0], dtype=jnp.int32)
-    distance = fields[count, subgoals.cells[:, 0], subgoals.cells[:, 1], 0]
-    return jnp.where(jnp.isfinite(distance), distance, 0.0)
+from potlp_jax.planning.estimates import Estimator
 
 
 @dataclasses.dataclass(frozen=True)

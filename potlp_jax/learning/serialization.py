@@ -20,6 +20,7 @@ import numpy as np
 from potlp_jax.codec import config_from_dict, differences
 from potlp_jax.errors import ConfigurationError, EstimatorError, NetworkError, PotlpError
 from potlp_jax.files import read_npz, reading, require_mapping, short
+from potlp_jax.learning.building_network import BuildingConfig
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
 from potlp_jax.task.propositions import require_same_propositions
@@ -124,7 +125,7 @@ def _configuration(path: Path | str, header: Mapping[str, Any]) -> tuple[Network
 
 
 def require_propositions(
-    config: NetworkConfig, propositions: tuple[str, ...], where: str, asker: str = "the task"
+    config: NetworkConfig | BuildingConfig, propositions: tuple[str, ...], where: str, asker: str = "the task"
 ) -> None:
     """Check that an estimator was trained with these propositions, in this order.
 

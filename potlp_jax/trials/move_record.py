@@ -8,8 +8,8 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from potlp_jax.learning.estimator import NetworkEstimator
 from potlp_jax.learning.memory import observation_of_subgoals
+from potlp_jax.learning.panorama_estimator import NetworkEstimator
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.history import ActionTerms
 from potlp_jax.planning.move import Move, MoveKind
