@@ -5,9 +5,18 @@ A message names what is wrong, where, and what to do. Anything that is not a ``P
 
 from pathlib import Path
 
+_BEGINNING, _END = 600, 300
+"""Characters of a message that are kept at either end: the file and the field stand first, what to do stands last."""
+
 
 class PotlpError(ValueError):
     """Base of all errors about what was given: a task, a map, a file, a setting."""
+
+    def __init__(self, message: str) -> None:
+        # Messages quote what was given, and what was given may be a name of 20,000 characters.
+        if len(message) > _BEGINNING + _END:
+            message = f"{message[:_BEGINNING]} [...] {message[-_END:]}"
+        super().__init__(message)
 
     @classmethod
     def of_file(cls, file: Path | str, message: str) -> "PotlpError":

@@ -1,13 +1,17 @@
 """Formulas: syntax, propositions, co-safety, and errors that say where and what to do."""
 
-import importlib
+import signal
+import subprocess
 import sys
-import types
+import time
 
 import pytest
 
 from potlp_jax.errors import TaskError
+from potlp_jax.sweep.store import process_start
+from potlp_jax.task import spot_process
 from potlp_jax.task.formula import parse_formula
+from potlp_jax.task.task import Task
 
 
 def error_of(text, propositions=None) -> str:
@@ -155,16 +159,114 @@ def test_spot_missing(monkeypatch):
     assert "conda install -c conda-forge spot" in message
 
 
-def test_another_package_called_spot(monkeypatch):
-    monkeypatch.setitem(sys.modules, "spot", types.ModuleType("spot"))
+@pytest.mark.parametrize(
+    "module", ["", "raise SyntaxError('print is a statement')", "print('hello')"], ids=["empty", "fails", "talks"]
+)
+def test_another_package_called_spot(module, monkeypatch, tmp_path):
+    (tmp_path / "spot.py").write_text(module)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(spot_process, "_running", None)
     message = error_of("F a")
     assert "not the Spot library" in message
     assert "pip install spottl" in message
 
 
-def test_another_package_called_spot_that_cannot_be_imported(monkeypatch):
-    def fail(name):
-        raise SyntaxError("Missing parentheses in call to 'print'")
+# Formulas that blow up.
 
-    monkeypatch.setattr(importlib, "import_module", fail)
-    assert "not the Spot library" in error_of("F a")
+
+def conjoined(parts):
+    return " & ".join(f"F p{i}" for i in range(parts))
+
+
+def error_of_task(text, **options) -> str:
+    with pytest.raises(TaskError) as caught:
+        Task.from_formula(text, **options)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (conjoined(9), "19,683 transitions"),
+        (conjoined(14), "takes Spot more than 2 s of computing"),
+        ("F[0:200](a & F[0:200] b)", "takes Spot more than 2 s of computing"),
+        ("F(" + " xor ".join(f"p{i}" for i in range(16)) + ")", "more than 250,000 characters to write down"),
+        ("X" * 1500 + "a", "1,503 states"),
+    ],
+)
+def test_formulas_whose_automata_blow_up_are_refused_with_what_to_change(text, why):
+    message = error_of_task(text)
+    assert "too large" in message
+    assert why in message
+    assert "give them an order, as F(a & F b) does" in message
+    # The process that gave up has been followed by another one.
+    assert Task.from_formula("F a & F b").dfa.num_states == 4
+
+
+def test_automata_whose_tables_blow_up_are_refused():
+    names = [f"p{i}" for i in range(15)]
+    assert "65,798,144 entries for each state and letter" in error_of_task("X" * 1001 + "a", propositions=[*names, "a"])
+
+
+def test_where_fewer_propositions_at_one_cell_help_the_message_says_so(monkeypatch):
+    # Of the 3^5 - 2^5 pairs of a set of parts and a smaller one, those that differ by one part remain: 5 * 2^4.
+    monkeypatch.setattr("potlp_jax.task.outcomes.MAX_CLASSES", 100)
+    message = error_of_task(conjoined(5))
+    assert "more than 100 outcome classes" in message
+    assert "max_positive_literals=1, which leaves 80 of them" in message
+    assert len(Task.from_formula(conjoined(5), max_positive_literals=1).classes) == 80
+    both = conjoined(6).replace("F p0 & F p1", "F(p0 & p1)")
+    assert "max_positive_literals" not in error_of_task(both), "where it would make the task impossible"
+
+
+def test_a_formula_on_which_spot_crashes_ends_in_one_line(monkeypatch):
+    # Longer than formulas may be, so that the limit of their length does not hide the crash.
+    monkeypatch.setattr("potlp_jax.task.formula.MAX_LENGTH", 1_000_000)
+    assert "a deeper stack than Spot has" in error_of_task("X" * 500_000 + "a")
+    assert Task.from_formula("F a").dfa.num_states == 2
+
+
+@pytest.mark.parametrize("text", ["X" * 100_000 + "a", "(" * 50_000 + "a" + ")" * 50_000])
+def test_long_texts_are_not_read(text):
+    assert "characters, more than 4,000" in error_of(text)
+
+
+def test_messages_show_what_is_around_the_place_and_nothing_that_a_terminal_obeys():
+    message = error_of("F a & " * 500 + "\x1b[2J F b")
+    assert len(message) < 500
+    assert "\x1b" not in message
+    caret = message.splitlines()[-1].index("^")
+    assert message.splitlines()[-2][caret] == "\N{REPLACEMENT CHARACTER}"
+    assert len(error_of("F " + "a" * 3900, ("b",))) < 500
+    assert "surrogates" in error_of("F \ud800")
+
+
+def test_spot_in_a_process_that_was_forked_is_its_own():
+    code = (
+        "import os\n"
+        "from potlp_jax.task import formula, spot_process\n"
+        "formula.parse_formula('F a')\n"
+        "before = spot_process._running\n"
+        "if os.fork() == 0:\n"
+        "    formula.parse_formula('F b')\n"
+        "    os._exit(int(spot_process._running is before))\n"
+        "assert os.wait()[1] == 0\n"
+        "assert formula.parse_formula('F c').propositions == ('c',)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_process_of_spot_ends_with_the_one_that_asked():
+    code = (
+        "import os, signal\n"
+        "from potlp_jax.task import formula, spot_process\n"
+        "formula.parse_formula('F a')\n"
+        "print(spot_process._running._process.pid, flush=True)\n"
+        "os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == -signal.SIGKILL
+    until = time.monotonic() + 20
+    while process_start(int(done.stdout)) is not None:
+        assert time.monotonic() < until
+        time.sleep(0.05)

@@ -66,6 +66,7 @@ class Kind:
         unit: what a case is, in the plural.
         limit: seconds that a case may take.
         memory: bytes that a case may add to the address space of its process; None: as many as there are.
+        weight: cases of this kind for one of another kind of its part; less than 1 for slow ones.
     """
 
     name: str
@@ -73,3 +74,4 @@ class Kind:
     unit: str = "files"
     limit: float = LIMIT
     memory: int | None = MEMORY
+    weight: float = 1.0

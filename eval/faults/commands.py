@@ -5,11 +5,10 @@ Only commands that read first and compute little: what they read with is attacke
 
 import contextlib
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-import typer
 
 from eval.faults import Kind, seeds
 from eval.faults.mutations import damaged, pick
@@ -60,31 +59,45 @@ _COMMANDS: tuple[tuple[Callable[[Path], Tree], tuple[str, ...]], ...] = (
 )
 
 
-def _command(random: np.random.Generator, folder: Path) -> None:
-    """One command with one damaged file, in this process, as the script would run it."""
-    make, words = pick(random, _COMMANDS)
-    tree = make(folder)
-    name = pick(random, sorted(tree))
-    write_tree({**tree, name: damaged(random, tree[name], list(tree.values()))}, folder)
+def run_command(words: Sequence[str]) -> None:
+    """One command in this process, as the script would run it.
+
+    Args:
+        words: after ``potlp``.
+
+    Raises:
+        PotlpError: it ended with a clear error, whose line is the message.
+        AssertionError: it ended with a code and no word, or with more lines than anybody reads.
+    """
     out, errors = io.StringIO(), io.StringIO()
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(errors):
-            app([word.format(folder) for word in words], standalone_mode=False)
-    except typer.Exit as ending:
-        code = ending.exit_code
+            app(words)
+    # The command line always ends with a code.
+    except SystemExit as ending:
+        code = ending.code
     else:
-        code = 0
+        raise AssertionError("no exit code")
     lines = errors.getvalue().splitlines()
     # What nobody can send to a terminal fails here, as it would there.
     (out.getvalue() + errors.getvalue()).encode()
-    said = [line for line in lines if line.startswith("potlp: ")]
+    said = [line for line in lines if line.startswith("potlp: ") or "Error" in line]
     if code and not said and not out.getvalue():
         raise AssertionError(f"code {code} without a word")
     if len(lines) > _MOST_LINES or "Traceback" in errors.getvalue():
         raise AssertionError(errors.getvalue())
-    if said:
+    if code and lines:
         # Counted as the clear error that it is.
-        raise PotlpError(said[0])
+        raise PotlpError(lines[-1])
 
 
-KINDS = (Kind("command line", _command, "commands", limit=10.0),)
+def _command(random: np.random.Generator, folder: Path) -> None:
+    """One command with one damaged file."""
+    make, words = pick(random, _COMMANDS)
+    tree = make(folder)
+    name = pick(random, sorted(tree))
+    write_tree({**tree, name: damaged(random, tree[name], list(tree.values()))}, folder)
+    run_command([word.format(folder) for word in words])
+
+
+KINDS = (Kind("command line", _command),)

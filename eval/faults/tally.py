@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-import platform
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,8 +10,7 @@ from typing import Any
 from eval.faults import GOOD, Kind, Verdict
 from eval.faults.worker import Ending
 from potlp_jax.errors import ConfigurationError
-from potlp_jax.sweep.rows import source_commit
-from potlp_jax.trials.loop import versions
+from potlp_jax.sweep.rows import provenance
 
 TALLY: str = "faults.json"
 """Name of the file of counts in the folder of a run."""
@@ -54,22 +53,40 @@ class Row:
 
 @dataclass
 class Tally:
-    """The counts of all kinds, and by which code they were made."""
+    """The counts of all kinds of a part, and by which command, code and versions they were made."""
 
     seed: int
-    commit: str
-    versions: dict[str, str]
+    provenance: dict[str, Any]
     rows: dict[str, Row] = field(default_factory=dict)
 
     def row(self, kind: Kind) -> Row:
         """The row of a kind, begun if there is none."""
         return self.rows.setdefault(kind.name, Row(kind.unit))
 
-    def write(self, folder: Path) -> None:
-        """Replace the file in the folder."""
-        temporary = folder / f"{TALLY}.part"
+    def sums(self) -> dict[str, Row]:
+        """All rows of equal units as one, by unit."""
+        return {
+            unit: summed([row for row in self.rows.values() if row.unit == unit], unit)
+            for unit in sorted({row.unit for row in self.rows.values()})
+        }
+
+    def write(self, file: Path) -> None:
+        """Replace the file."""
+        temporary = file.with_name(f"{file.name}.part")
         temporary.write_text(json.dumps(dataclasses.asdict(self), indent=1) + "\n", "utf-8")
-        temporary.replace(folder / TALLY)
+        temporary.replace(file)
+
+
+def summed(rows: Sequence[Row], unit: str) -> Row:
+    """The counts of some rows together."""
+    counts: dict[str, int] = {verdict: sum(row.counts[verdict] for row in rows) for verdict in Verdict}
+    return Row(unit, sum(row.cases for row in rows), counts, max(row.slowest for row in rows))
+
+
+def read_tally(file: Path) -> Tally:
+    """The counts that a file holds."""
+    data: dict[str, Any] = json.loads(file.read_text("utf-8"))
+    return Tally(data["seed"], data["provenance"], {name: Row(**row) for name, row in data["rows"].items()})
 
 
 def open_tally(folder: Path, seed: int) -> Tally:
@@ -78,14 +95,15 @@ def open_tally(folder: Path, seed: int) -> Tally:
     Raises:
         ConfigurationError: those in the folder are of another seed or commit: a table would mix the two.
     """
-    now = Tally(seed, source_commit(), {"python": platform.python_version(), **versions()})
+    now = Tally(seed, provenance())
     if not (folder / TALLY).exists():
         return now
-    data: dict[str, Any] = json.loads((folder / TALLY).read_text("utf-8"))
-    for name, value in (("seed", seed), ("commit", now.commit)):
-        if data[name] != value:
-            raise ConfigurationError(f"{folder}: was made with {name} {data[name]}, not {value}: give another --out")
-    return dataclasses.replace(now, rows={name: Row(**row) for name, row in data["rows"].items()})
+    found = read_tally(folder / TALLY)
+    pairs = (("seed", found.seed, seed), ("commit", found.provenance["commit"], now.provenance["commit"]))
+    for name, before, given in pairs:
+        if before != given:
+            raise ConfigurationError(f"{folder}: was made with {name} {before}, not {given}: give another --out")
+    return found
 
 
 def table(tally: Tally) -> str:
@@ -93,13 +111,8 @@ def table(tally: Tally) -> str:
     titles = ["kind", "unit", "cases", *Verdict, "slowest"]
     lines = [" | ".join(["", *titles, ""]).strip(), "|---|---|" + "---:|" * (len(titles) - 2)]
     lines += [_line(name, row) for name, row in sorted(tally.rows.items(), key=lambda item: (item[1].unit, item[0]))]
-    for unit in sorted({row.unit for row in tally.rows.values()}):
-        rows = [row for row in tally.rows.values() if row.unit == unit]
-        counts: dict[str, int] = {verdict: sum(row.counts[verdict] for row in rows) for verdict in Verdict}
-        total = Row(unit, sum(row.cases for row in rows), counts, max(row.slowest for row in rows))
-        lines.append(_line("**all**", total))
-    made = ", ".join(f"{name} {version}" for name, version in tally.versions.items())
-    return "\n".join([*lines, "", f"Seed {tally.seed}, commit {tally.commit}; {made}.", ""])
+    lines += [_line("**all**", row) for row in tally.sums().values()]
+    return "\n".join([*lines, ""])
 
 
 def _line(name: str, row: Row) -> str:

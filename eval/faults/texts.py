@@ -223,11 +223,12 @@ KINDS = (
         "values of a trial record",
         _json_case("record", seeds.make_record, "trial.json", _use_record, _seal_record),
         "texts",
+        weight=0.2,
     ),
     Kind(
         "values of a manifest",
         _json_case("export", seeds.make_export, "manifest.json", _read_manifest, lambda value: value),
         "texts",
     ),
-    Kind("values of an estimator's header", _header_case, "texts"),
+    Kind("values of an estimator's header", _header_case, "texts", weight=0.2),
 )

@@ -46,6 +46,26 @@ def all_kinds(modules: tuple[str, ...]) -> dict[str, Kind]:
     return {kind.name: kind for kind in kinds}
 
 
+class _Clock:
+    """Seconds of a process without those in which it waited for a core, while the machine did something else."""
+
+    def __init__(self, process: BaseProcess | None) -> None:
+        self._tasks = Path(f"/proc/{process.pid}/task" if process is not None else "/proc/self/task")
+        self._began, self._waited = time.monotonic(), self._waits()
+
+    def seconds(self) -> float:
+        """Since this was made. Of several threads, the one counts that waited longest."""
+        waits = [wait - self._waited.get(thread, 0.0) for thread, wait in self._waits().items()]
+        return time.monotonic() - self._began - max(waits, default=0.0)
+
+    def _waits(self) -> dict[str, float]:
+        """Seconds of waiting by thread; none where the system does not tell, or the process is gone."""
+        try:
+            return {task.name: int((task / "schedstat").read_text().split()[1]) / 1e9 for task in self._tasks.iterdir()}
+        except (OSError, IndexError):
+            return {}
+
+
 class Worker:
     """One process that runs cases of one kind in a folder, begun again when a case has killed it."""
 
@@ -74,17 +94,19 @@ class Worker:
     def _attempt(self, number: int) -> Ending:
         connection = self._connection or self.start()
         _empty(self._folder)
-        began = time.monotonic()
+        clock = _Clock(self._process)
         connection.send(number)
         try:
-            if connection.poll(self._kind.limit):
-                verdict, text = connection.recv()
-                return Ending(Verdict(verdict), text, time.monotonic() - began)
+            while (left := self._kind.limit - clock.seconds()) > 0:
+                if connection.poll(left):
+                    verdict, text = connection.recv()
+                    return Ending(Verdict(verdict), text, clock.seconds())
         except EOFError:
+            seconds = clock.seconds()
             self.close()
-            return Ending(Verdict.TRACEBACK, "the process died", time.monotonic() - began)
+            return Ending(Verdict.TRACEBACK, "the process died", seconds)
         self.close()
-        return Ending(Verdict.HANG, f"no end after {self._kind.limit:g} s", time.monotonic() - began)
+        return Ending(Verdict.HANG, f"no end after {self._kind.limit:g} s", self._kind.limit)
 
     def start(self) -> Connection:
         """Begin the process, and wait until it can run cases. Raises TimeoutError."""
@@ -116,14 +138,14 @@ def _serve(connection: Connection, modules: tuple[str, ...], name: str, seed: in
     # Some cases that nobody counts, so that imports and compilation are not measured, and the threads of jax have got
     # their memory before it is limited.
     jax.random.key(0).block_until_ready()
+    # Libraries in C write remarks about damaged input to the error stream; the table has no place for them.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     for number in range(_WARM_UP):
         _empty(folder)
         judged(kind, seed, number, folder)
     if kind.memory is not None:
         size = _address_space() + kind.memory
         resource.setrlimit(resource.RLIMIT_AS, (size, size))
-    # Libraries in C write remarks about damaged input to the error stream; the table has no place for them.
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     connection.send("ready")
     while True:
         try:

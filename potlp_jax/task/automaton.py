@@ -14,7 +14,15 @@ import numpy as np
 from jaxtyping import Bool, Int, Int32
 
 from potlp_jax.errors import TaskError
-from potlp_jax.task.formula import Formula, load_spot
+from potlp_jax.task.formula import Formula
+from potlp_jax.task.spot_child import LONGEST_HOA
+from potlp_jax.task.spot_process import SIMPLER, ask_spot
+
+MAX_STATES: int = 1024
+"""States of a task's automaton, at most. Tasks that ship have 8 at most."""
+
+MOST_ENTRIES: int = 1 << 22
+"""Entries of the table of successors, states times letters: 64 states over 16 propositions, 1,024 over 12."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,11 +53,34 @@ def translate(formula: Formula) -> str:
     """Spot's deterministic complete Büchi automaton of the formula, in HOA format.
 
     Raises:
-        TaskError: Spot is missing.
+        TaskError: Spot is missing, or the automaton is too large.
     """
-    # "BA" puts acceptance on states. "deterministic" is a preference to Spot; for co-safe formulas it is always met.
-    automaton = load_spot().translate(formula.parsed, "BA", "deterministic", "complete")
-    return automaton.to_str("hoa")
+    answer = ask_spot("translate", formula.parsed)
+    check_size(answer["states"], answer["propositions"])
+    if answer["hoa"] is None:
+        raise TaskError(
+            f"the formula is too large: its automaton has {answer['states']:,} states and {answer['transitions']:,} "
+            f"transitions, and takes more than {LONGEST_HOA:,} characters to write down; {SIMPLER}"
+        )
+    return answer["hoa"]
+
+
+def check_size(states: int, propositions: int) -> None:
+    """Refuse an automaton that takes too long to work with, or whose tables would be too large.
+
+    Args:
+        states: of the automaton.
+        propositions: over which it is to be written down.
+
+    Raises:
+        TaskError: it is too large; says how large and what to do.
+    """
+    entries = states << propositions
+    if states > MAX_STATES or entries > MOST_ENTRIES:
+        raise TaskError(
+            f"the task is too large: its automaton has {states:,} states (at most {MAX_STATES:,}), and {entries:,} "
+            f"entries for each state and letter of Sigma (at most {MOST_ENTRIES:,}); {SIMPLER}"
+        )
 
 
 def canonical_dfa(transitions: Int[np.ndarray, "Z L"], accepting: Bool[np.ndarray, " Z"], initial: int) -> Dfa:
@@ -115,6 +146,17 @@ def _reaches(adjacency: np.ndarray, target: np.ndarray) -> np.ndarray:
         reached = grown
 
 
+def _distance(adjacency: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Steps to the next state of ``target`` from each state; -1 where none can be reached."""
+    distance = np.where(target, 0, -1)
+    ring, steps = target, 0
+    while ring.any():
+        steps += 1
+        ring = adjacency[:, ring].any(axis=1) & (distance < 0)
+        distance[ring] = steps
+    return distance
+
+
 def _satisfied_states(transitions: np.ndarray, accepting: np.ndarray) -> np.ndarray:
     """States from which every infinite word is accepted: no run ends up avoiding ``accepting`` for ever."""
     adjacency = _adjacency(transitions)
@@ -144,7 +186,9 @@ def _check_co_safe(transitions: np.ndarray, accepting: np.ndarray, satisfied: np
 
 def _refine(transitions: np.ndarray, satisfied: np.ndarray) -> np.ndarray:
     """Coarsest partition whose blocks agree on ``satisfied`` and move to equal blocks (Moore's algorithm)."""
-    block = satisfied.astype(np.int64)
+    # Equivalent states are equally far from satisfaction. Beginning with that, a chain of a thousand states takes one
+    # round instead of a thousand.
+    block = _distance(_adjacency(transitions), satisfied)
     count = 0
     while True:
         # States stay together if they were together and all their successors are. Including the own block means that

@@ -1,23 +1,25 @@
 """Text becomes a checked co-safe formula: propositions, syntax, co-safety, errors with a caret.
 
-Formulas are in Spot's syntax. Spot is imported only when a formula is parsed, so that everything else in this package
-works without it.
+Formulas are in Spot's syntax. Spot is asked only when a formula is parsed (``task.spot_process``), so that everything
+else in this package works without it.
 """
 
-import importlib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from potlp_jax.errors import SpotMissingError, TaskError
-from potlp_jax.task.propositions import check_propositions
+from potlp_jax.errors import TaskError
+from potlp_jax.files import one_line
+from potlp_jax.task.propositions import LONGEST_NAME, check_propositions
+from potlp_jax.task.spot_process import ask_spot
 
-_INSTALL_SPOT = (
-    "install it with 'pip install spottl' (Linux x86_64; the PyPI package called 'spot' is something else) or, on "
-    "other platforms, 'conda install -c conda-forge spot'; formulas of shipped tasks, however they are written, and "
-    "HOA files need no Spot"
-)
+MAX_LENGTH: int = 4000
+"""Characters of a formula, at most; the longest task that ships has 55."""
+
+LONGEST_EXCERPT: int = 160
+"""Characters of a formula that a message shows, around what is wrong."""
+
 _WORD_OR_STRING = re.compile(r'"(?:[^"\\]|\\.)*"|[A-Za-z_][A-Za-z0-9_.]*|.')
 _OPERATOR_PREFIX = re.compile(r"^[FGX]+")
 _CARET_INDENT = 4
@@ -30,12 +32,18 @@ def error_at(message: str, text: str, column: int) -> TaskError:
     Args:
         message: what is wrong.
         text: one line.
-        column: where, counted from 1; the caret stands under it.
+        column: where, counted from 1; the caret stands under it. Of a long text only what is around it is shown.
 
     Returns:
         The error, to be raised.
     """
-    return TaskError(f"{message} (column {column})\n  {text}\n  {' ' * (column - 1)}^")
+    # One sign for one, so that the caret stays below its place.
+    shown = "".join(char if char.isprintable() else "\N{REPLACEMENT CHARACTER}" for char in text)
+    start = max(0, min(column - LONGEST_EXCERPT // 2, len(shown) - LONGEST_EXCERPT))
+    before, after = "..." if start else "", "..." if start + LONGEST_EXCERPT < len(shown) else ""
+    excerpt = f"{before}{shown[start : start + LONGEST_EXCERPT]}{after}"
+    caret = " " * (len(before) + column - 1 - start) + "^"
+    return TaskError(f"{message} (column {column})\n  {excerpt}\n  {caret}")
 
 
 @dataclass(frozen=True)
@@ -45,30 +53,12 @@ class Formula:
     Attributes:
         text: what the user wrote.
         propositions: Sigma; bit ``i`` of a letter is ``propositions[i]``.
-        parsed: Spot's formula.
+        parsed: the formula as Spot writes it.
     """
 
     text: str
     propositions: tuple[str, ...]
-    parsed: Any
-
-
-def load_spot() -> Any:
-    """The module ``spot``.
-
-    Raises:
-        SpotMissingError: Spot is missing, or another package of that name is installed.
-    """
-    # Imported by name: neither the type checker nor the tests of layers need Spot to be there.
-    try:
-        spot = importlib.import_module("spot")
-    except ImportError as error:
-        raise SpotMissingError(f"this formula needs Spot, which is not installed: {_INSTALL_SPOT}") from error
-    except Exception as error:  # the namesake on PyPI is Python 2 code and fails in its own ways
-        raise SpotMissingError(f"the installed module 'spot' is not the Spot library: {_INSTALL_SPOT}") from error
-    if not (hasattr(spot, "translate") and hasattr(spot, "formula")):
-        raise SpotMissingError(f"the installed module 'spot' is not the Spot library: {_INSTALL_SPOT}")
-    return spot
+    parsed: str
 
 
 def parse_formula(text: str, propositions: Sequence[str] | None = None) -> Formula:
@@ -79,41 +69,49 @@ def parse_formula(text: str, propositions: Sequence[str] | None = None) -> Formu
         propositions: Sigma, a superset of the formula's names; default: these names, sorted.
 
     Raises:
-        TaskError: empty text, syntax, unknown proposition, too many propositions (all with column and caret where
-            they have one), a formula that is not syntactically co-safe, or Spot missing.
+        TaskError: text that is empty or too long, syntax, unknown proposition, too many propositions (all with column
+            and caret where they have one), a formula that is not syntactically co-safe, or Spot missing.
     """
     # One line, of unchanged length: columns of errors refer to the text as it was given, and the caret is printed
     # below.
     line = re.sub(r"\s", " ", text)
     if not line.strip():
         raise error_at("the formula is empty", line, 1)
+    # A file of another encoding may hold halves of characters, which no other program reads.
+    if any("\ud800" <= char <= "\udfff" for char in line):
+        raise TaskError("the formula is no valid text: it holds surrogates, halves of characters")
+    if len(line) > MAX_LENGTH:
+        raise TaskError(f"the formula has {len(line):,} characters, more than {MAX_LENGTH:,}: use a shorter one")
     # Wrong propositions are reported before Spot is asked for.
     known = None if propositions is None else check_propositions(propositions)
-    spot = load_spot()
-    parsed = _parse(spot, line, known or ())
-    names = sorted(proposition.ap_name() for proposition in spot.atomic_prop_collect(parsed) or ())
-    sigma = check_propositions(names if known is None else known)
-    for name in names:
+    answer = _parse(line, known or ())
+    sigma = check_propositions(answer["names"] if known is None else known)
+    for name in answer["names"]:
         if name not in sigma:
             raise unknown_proposition(name, sigma, line)
-    _check_co_safe(spot, parsed, line)
-    return Formula(text=text, propositions=sigma, parsed=parsed)
+    # The check is of syntax: a formula that is co-safe for subtler reasons is refused, which is why the message says
+    # what may be used.
+    if answer["offender"] is not None:
+        raise TaskError(
+            f"the formula is not co-safe: its negation normal form holds '{one_line(answer['offender'])}', which no "
+            "finite word can make true; use X, F, U, M, &, | and negated propositions only"
+            f"{_operator_hint(line)}\n  {one_line(line)}"
+        )
+    return Formula(text=text, propositions=sigma, parsed=answer["formula"])
 
 
-def _parse(spot: Any, line: str, known: tuple[str, ...]) -> Any:
-    """Spot's formula, or the first of Spot's complaints."""
+def _parse(line: str, known: tuple[str, ...]) -> dict[str, Any]:
+    """What Spot has read, or the first of its complaints."""
     quoted, added = _quote_known_names(line, known)
-    result = spot.parse_infix_psl(quoted)
-    if not result.errors:
-        return result.f
+    answer = ask_spot("parse", quoted)
+    if "errors" not in answer:
+        return answer
     # Spot reports an error in three lines: the formula, carets below it, the message.
-    stream = spot.ostringstream()
-    result.format_errors(stream)
-    _, carets, message = stream.str().splitlines()[:3]
+    _, carets, message = answer["errors"].splitlines()[:3]
     column = carets.index("^") - _CARET_INDENT
     # Quotes that were added before the column have moved it to the right.
     column = min(column - sum(quote < column for quote in added), len(line)) + 1
-    raise error_at(f"syntax error in the formula: {message.removeprefix('syntax error, ')}", line, column)
+    raise error_at(f"syntax error in the formula: {one_line(message.removeprefix('syntax error, '))}", line, column)
 
 
 def _quote_known_names(line: str, known: tuple[str, ...]) -> tuple[str, list[int]]:
@@ -139,7 +137,8 @@ def _quote_known_names(line: str, known: tuple[str, ...]) -> tuple[str, list[int
 
 def unknown_proposition(name: str, known: tuple[str, ...], line: str) -> TaskError:
     """Points at the name and lists the known propositions."""
-    message = f"unknown proposition '{name}'; known: {', '.join(known) or 'none'}{_operator_hint(line)}"
+    shown = one_line(name, LONGEST_NAME)
+    message = f"unknown proposition '{shown}'; known: {', '.join(known) or 'none'}{_operator_hint(line)}"
     # The name as a whole word, perhaps in quotes, perhaps with operators written in front of it.
     pattern = rf'(?<![A-Za-z0-9_.])[FGX]*("?)(?P<name>{re.escape(name)})\1(?![A-Za-z0-9_.])'
     match = re.search(pattern, line)
@@ -151,26 +150,3 @@ def _operator_hint(line: str) -> str:
     # A word in capitals that begins with F, G or X and has a letter that is none of them, such as FIRE.
     match = re.search(r'(?<![\w".])[FGX][A-Z_]*[A-EH-WY-Z][A-Z0-9_]+(?![\w"])', line)
     return "" if match is None else f'; F, G and X at the start of a name are operators: quote it, "{match.group()}"'
-
-
-def _check_co_safe(spot: Any, parsed: Any, line: str) -> None:
-    """Raises unless the negation normal form is syntactically co-safe (a 'guarantee', in Spot's words)."""
-    # "Guarantee" is Manna and Pnueli's class that the field calls co-safe. The check is of syntax: a formula that is
-    # co-safe for subtler reasons is refused, which is why the message says what may be used.
-    normal_form = spot.negative_normal_form(parsed)
-    if normal_form.is_syntactic_guarantee():
-        return
-    offender = _offending_part(normal_form)
-    raise TaskError(
-        f"the formula is not co-safe: its negation normal form holds '{offender}', which no finite word can "
-        f"make true; use X, F, U, M, &, | and negated propositions only"
-        f"{_operator_hint(line)}\n  {line}"
-    )
-
-
-def _offending_part(formula: Any) -> Any:
-    """The innermost sub-formula that breaks co-safety while its own parts do not."""
-    for part in formula:
-        if part.is_psl_formula() and not part.is_syntactic_guarantee():
-            return _offending_part(part)
-    return formula

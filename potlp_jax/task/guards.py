@@ -61,7 +61,7 @@ def prime_implicants(guard: Bool[np.ndarray, " L"]) -> list[Phi]:
         key = part.tobytes()
         if key not in solved:
             # Letters are in increasing order, so the halves are those without and with the highest proposition.
-            low, high = np.split(part, 2)
+            low, high = part[: part.size // 2], part[part.size // 2 :]
             both = primes(low & high)
             cubes = {(*cube, 0) for cube in both}
             cubes |= {(*cube, -1) for cube in primes(low) - both}
@@ -115,6 +115,9 @@ def _smallest_hitting_set(sets: list[int], size: int) -> list[int]:
     """Lexicographically first among the smallest index sets that meet every one of ``sets``."""
     # First how many are needed, from the lower bound up; then each index in order is taken wherever the rest can still
     # be done with one fewer. That is the lexicographically first of the smallest sets.
+    # A prime that is the only one of some letter is in every cover; where all are, nothing has to be searched for.
+    forced = {bits.bit_length() - 1 for bits in sets if bits.bit_count() == 1}
+    sets = [bits for bits in sets if not any(bits >> i & 1 for i in forced)]
     budget = _disjoint_sets(sets)
     while not _can_hit(sets, budget):
         budget += 1
@@ -130,7 +133,7 @@ def _smallest_hitting_set(sets: list[int], size: int) -> list[int]:
             sets, budget = without, budget - 1
         else:
             sets = [bits & ~(1 << i) for bits in sets]
-    return chosen
+    return sorted(forced.union(chosen))
 
 
 def _disjoint_sets(sets: list[int]) -> int:

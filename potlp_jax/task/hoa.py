@@ -16,7 +16,7 @@ from jaxtyping import Bool, Int
 
 from potlp_jax.errors import TaskError
 from potlp_jax.files import one_line, short
-from potlp_jax.task.automaton import Dfa
+from potlp_jax.task.automaton import MOST_ENTRIES, Dfa
 from potlp_jax.task.guards import Phi, minimal_cover
 from potlp_jax.task.propositions import check_propositions
 
@@ -31,9 +31,6 @@ _TOKEN = re.compile(
       | (?P<symbol>[\[\](){}!&|])""",
     re.VERBOSE | re.DOTALL,
 )
-MOST_ENTRIES: int = 1 << 22
-"""Entries of the table of successors, states times letters: 64 states over 16 propositions, 4,096 over 10."""
-
 DEEPEST: int = 30
 """Parentheses within each other in a label; Spot writes none. More would exhaust the stack of a recursive descent."""
 

@@ -9,6 +9,7 @@ Definitions (docs/model.md sections 3 and 4; Bradley et al. 2021, sections III-B
 * Condition a **implies** condition b if whatever makes a hold beyond a subgoal makes b hold there as well.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -19,11 +20,15 @@ from jaxtyping import Bool, Int32
 from potlp_jax.errors import TaskError
 from potlp_jax.task.automaton import Dfa
 from potlp_jax.task.guards import Phi, cube_letters, hull, minimal_cover
+from potlp_jax.task.spot_process import SIMPLER
 
 MAX_CLASSES: int = 4096
-"""Outcome classes of a task, at most: each is asked of an estimator, and stored with its letters.
+"""Outcome classes of a task, at most: each is asked of an estimator, and stored with its letters."""
 
-The relation ``implies`` is square in them; a task of this size is a mistake in the formula."""
+MAX_COMPARISONS: int = 1 << 33
+"""Letters that the relation ``implies`` compares, at most: the square of the classes times the letters.
+
+``MAX_CLASSES`` over 9 propositions, 362 over 16; it is computed in a second or two."""
 
 
 class OutcomeClass(NamedTuple):
@@ -125,12 +130,15 @@ def find_outcomes(dfa: Dfa, max_positive_literals: int | None = None) -> Outcome
     # Before cubes are dropped: afterwards a state without edges may as well be one that no letter keeps.
     if max_positive_literals is not None:
         _check_reachable(dfa, max_positive_literals)
-    edges = _find_edges(dfa, max_positive_literals)
+    try:
+        edges = _find_edges(dfa, max_positive_literals)
+    except _TooManyClassesError as error:
+        raise TaskError(
+            f"the task has more than {error.most:,} outcome classes: {_remedy(dfa, max_positive_literals)}"
+        ) from None
     # Two edges share a class if their cubes and the letters that stay agree; phi_stay alone may be coarser than these.
     stays = {key: edge.stay for edge in edges for key in edge.class_keys}
     keys = sorted(stays)
-    if len(keys) > MAX_CLASSES:
-        raise TaskError(f"the task has {len(keys)} outcome classes, more than {MAX_CLASSES}: use a simpler formula")
     # One condition per class, with the class's own index: what is learnt of a cube is kept under that index.
     conditions = [Condition(stays[key], cube_letters(key[1]), (c,)) for c, key in enumerate(keys)]
     number = {key: c for c, key in enumerate(keys)}
@@ -156,7 +164,8 @@ def _find_edges(dfa: Dfa, max_positive_literals: int | None) -> list[_Edge]:
     """Edges in lexicographic order, with the cubes that are kept."""
     # Many edges of an automaton have the same guard, and covers are the expensive part.
     covers: dict[bytes, tuple[Phi, ...]] = {}
-    edges = []
+    edges, classes, most = [], set(), _most_classes(dfa)
+    allowed = _allowed_letters(dfa, max_positive_literals)
     for source, row in enumerate(dfa.transitions):
         stay = row == source
         # A state that no letter keeps is left with the next cell, whatever that is: nothing can be explored in it.
@@ -166,12 +175,50 @@ def _find_edges(dfa: Dfa, max_positive_literals: int | None) -> list[_Edge]:
             if target == source or dfa.trap[target]:
                 continue
             go = row == target
+            # A cube is kept exactly if it holds an allowed letter: where there is none, the cover is not needed.
+            if not go[allowed].any():
+                continue
             if go.tobytes() not in covers:
                 covers[go.tobytes()] = minimal_cover(go)
-            cubes = tuple(cube for cube in covers[go.tobytes()] if _allowed(cube, max_positive_literals))
-            if cubes:
-                edges.append(_Edge(source, int(target), stay, hull(stay), cubes))
+            cubes = tuple(cube for cube in covers[go.tobytes()] if _allowed(cube.count(1), max_positive_literals))
+            edges.append(_Edge(source, int(target), stay, hull(stay), cubes))
+            # Counted as they are found: all classes of a formula that blows up are found in minutes or days.
+            classes.update(edges[-1].class_keys)
+            if len(classes) > most:
+                raise _TooManyClassesError(most)
     return edges
+
+
+class _TooManyClassesError(Exception):
+    """There are more than ``most``."""
+
+    def __init__(self, most: int) -> None:
+        super().__init__(most)
+        self.most = most
+
+
+def _most_classes(dfa: Dfa) -> int:
+    return min(MAX_CLASSES, math.isqrt(MAX_COMPARISONS // dfa.transitions.shape[1]))
+
+
+def _allowed_letters(dfa: Dfa, max_positive_literals: int | None) -> list[int]:
+    """Letters of at most so many propositions."""
+    return [letter for letter in range(dfa.transitions.shape[1]) if _allowed(letter.bit_count(), max_positive_literals)]
+
+
+def _remedy(dfa: Dfa, max_positive_literals: int | None) -> str:
+    """What to do about too many classes: a limit of positive literals where that helps."""
+    limit = 1 if max_positive_literals is None else max_positive_literals - 1
+    try:
+        _check_reachable(dfa, limit)
+        edges = _find_edges(dfa, limit)
+    except (TaskError, _TooManyClassesError):
+        return SIMPLER
+    count = len({key for edge in edges for key in edge.class_keys})
+    return (
+        f"{SIMPLER}; or, if no cell has more than {limit} of the propositions, give max_positive_literals={limit}, "
+        f"which leaves {count:,} of them"
+    )
 
 
 def _packed(guards: list[np.ndarray]) -> np.ndarray:
@@ -185,8 +232,8 @@ def _letter_sets(condition: Condition) -> tuple[bytes, bytes]:
     return condition.stay.tobytes(), condition.go.tobytes()
 
 
-def _allowed(cube: Phi, max_positive_literals: int | None) -> bool:
-    return max_positive_literals is None or cube.count(1) <= max_positive_literals
+def _allowed(positive: int, max_positive_literals: int | None) -> bool:
+    return max_positive_literals is None or positive <= max_positive_literals
 
 
 def _check_reachable(dfa: Dfa, max_positive_literals: int) -> None:
@@ -197,7 +244,7 @@ def _check_reachable(dfa: Dfa, max_positive_literals: int) -> None:
     """
     if max_positive_literals < 0:
         raise TaskError(f"max_positive_literals is {max_positive_literals}: it must be None or at least 0")
-    letters = [letter for letter in range(dfa.transitions.shape[1]) if letter.bit_count() <= max_positive_literals]
+    letters = _allowed_letters(dfa, max_positive_literals)
     reached, queue = {dfa.initial}, [dfa.initial]
     for state in queue:
         successors = {int(target) for target in dfa.transitions[state, letters]} - reached

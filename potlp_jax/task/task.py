@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int8, Int32
 
 from potlp_jax.errors import SpotMissingError, TaskError, TaskWarning, UnsatisfiableError
-from potlp_jax.task.automaton import Dfa, canonical_dfa, translate
+from potlp_jax.task.automaton import Dfa, canonical_dfa, check_size, translate
 from potlp_jax.task.formula import parse_formula, unknown_proposition
 from potlp_jax.task.guards import Phi, minimal_cover
 from potlp_jax.task.hoa import HoaAutomaton, read_hoa, write_hoa
@@ -196,6 +196,7 @@ class Task:
         cls, text: str, propositions: tuple[str, ...], automaton: HoaAutomaton, max_positive_literals: int | None
     ) -> "Task":
         """The task of a parsed automaton, over Sigma."""
+        check_size(len(automaton.accepting), len(propositions))
         unknown = [name for name in automaton.propositions if name not in propositions]
         if unknown:
             raise TaskError(f"unknown proposition '{unknown[0]}'; known: {', '.join(propositions) or 'none'}")
