@@ -1,4 +1,7 @@
-"""Strict modes for every test: no silent rank promotion, no silent dtype promotion."""
+"""Strict modes for every test, and how each module's programs are compiled.
+
+No silent rank promotion, no silent dtype promotion. Modules marked ``optimised`` are compiled as users' programs are.
+"""
 
 import atexit
 import importlib.metadata
@@ -8,20 +11,10 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-# Nearly all of the suite's time is compilation. XLA's optimiser takes half of it, and the newer emitters of fused loops
-# a third of what is left. XLA refuses to start with a flag that it does not know, so the second is for the pinned
-# version alone. Before jax is imported; the processes that tests start inherit both. XLA_FLAGS="" in the environment
-# runs the suite with the optimiser.
-os.environ.setdefault(
-    "XLA_FLAGS",
-    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-    if importlib.metadata.version("jaxlib").startswith("0.10.")
-    else "--xla_backend_optimization_level=0",
-)
-
 import jax
 import pytest
 from hypothesis import Phase, settings
+from jax._src import compiler
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -51,8 +44,49 @@ def external_data() -> Path:
     return Path(folder)
 
 
+# Nearly all of the suite's time is compilation. XLA's optimiser takes most of it, and the newer emitters of fused loops
+# half of what is left. XLA refuses a flag that it does not know, so the second is for the pinned version alone.
+_UNOPTIMISED: dict[str, int | bool] = {"xla_backend_optimization_level": 0}
+if importlib.metadata.version("jaxlib").startswith("0.10."):
+    _UNOPTIMISED["xla_cpu_use_fusion_emitters"] = False
+
+# XLA reads its flags once in a process. It does so here, because `compiled_as_marked` sets flags for the processes that
+# tests start, which are not for this one.
+_XLA_FLAGS = os.environ.get("XLA_FLAGS", "")
+jax.devices()
+
+# No public setting does this for all programs of a process and can be changed: `jax_disable_most_optimizations` leaves
+# the emitters on, `compiler_options` belongs to one `jax.jit`. `test_optimiser.py` and `test_unoptimised.py` notice a
+# version of jax in which this does nothing.
+_compile_options = compiler.get_compile_options
+
+
+def _unoptimised_options(*arguments, env_options_overrides=None, **options):
+    overrides = {**_UNOPTIMISED, **(env_options_overrides or {})}
+    return _compile_options(*arguments, env_options_overrides=overrides, **options)
+
+
+compiler.get_compile_options = _unoptimised_options
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line(
+        "markers", "optimised: the module compares numbers, so it and the processes it starts run with XLA's optimiser"
+    )
+
+
 @pytest.fixture(scope="module", autouse=True)
-def forget_programs() -> Iterator[None]:
-    """Compiled programs go when their module is done: a worker's memory would grow to several gigabytes."""
-    yield
+def compiled_as_marked(request: pytest.FixtureRequest) -> Iterator[None]:
+    """XLA's optimiser is on in modules marked ``optimised``, and off in others and in what collecting them compiles.
+
+    Each module begins without compiled programs: some are of the other kind, and a worker's memory would grow to
+    several gigabytes.
+    """
     jax.clear_caches()
+    with pytest.MonkeyPatch.context() as patch:
+        if request.node.get_closest_marker("optimised"):
+            patch.setattr(compiler, "get_compile_options", _compile_options)
+        else:
+            flags = " ".join(f"--{name}={str(value).lower()}" for name, value in _UNOPTIMISED.items())
+            patch.setenv("XLA_FLAGS", f"{flags} {_XLA_FLAGS}".strip())
+        yield

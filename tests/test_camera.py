@@ -9,6 +9,8 @@ import pytest
 
 from potlp_jax.world.camera import CameraConfig, Disturbance, bearing, disturb
 
+pytestmark = pytest.mark.optimised
+
 
 def test_bearings_of_several_targets():
     targets = jnp.asarray(np.array([[4, 9], [9, 4], [4, 0], [0, 4], [4, 4]], np.int32))

@@ -12,6 +12,8 @@ from potlp_jax.world.camera import CameraConfig, bearing, floor_rows, rows_at_sl
 from potlp_jax.world.grid import make_world
 from potlp_jax.world.renderer import render
 
+pytestmark = pytest.mark.optimised
+
 SHAPE = (64, 128)
 
 

@@ -10,6 +10,7 @@ import potlp_jax
 ORDER = (
     "types",
     "errors",
+    "precision",
     "files",
     "plugins",
     "codec",

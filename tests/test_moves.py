@@ -7,6 +7,8 @@ import pytest
 from potlp_jax.world import moves
 from tests.reference.dijkstra import grid_moves
 
+pytestmark = pytest.mark.optimised
+
 
 @pytest.fixture(scope="module")
 def free():

@@ -11,6 +11,8 @@ from potlp_jax.codec import config_from_dict, json_copy
 from potlp_jax.errors import ConfigurationError, NetworkError
 from potlp_jax.learning.network import STRIDE, EstimatorNetwork, NetworkConfig, operation_counts, parameter_count
 
+pytestmark = pytest.mark.optimised
+
 CONFIG = NetworkConfig(
     propositions=("fire", "alarm", "exit"),
     image_shape=(64, 128),

@@ -3,8 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from potlp_jax.planning.rounding import rounded_product
+
+pytestmark = pytest.mark.optimised
 
 
 def test_a_sum_of_products_rounds_every_step():

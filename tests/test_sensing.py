@@ -14,6 +14,8 @@ from potlp_jax.world.grid import BeliefMap, make_world, pad_world
 from potlp_jax.world.sensing import SensorConfig, observe, visible
 from tests.reference import sensing as reference
 
+pytestmark = pytest.mark.optimised
+
 see = jax.jit(visible, static_argnums=2)
 look = jax.jit(observe, static_argnums=3)
 

@@ -33,6 +33,8 @@ from potlp_jax.planning.distances.product import product_distances, product_tran
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.world.grid import World
 
+pytestmark = pytest.mark.optimised
+
 BY_HAND = ToyConfig(door_row=4, start=(4, 2), goal=(4, 12), hazard=(4, 10))
 GOAL, HAZARD = 1, 2
 STRAIGHT = 10.0

@@ -159,7 +159,7 @@ def _draw(specification: "Specification", results: "Results", folder: Path, worl
     if world not in numbers:
         fail(f"--picture {world}: the worlds compared are {', '.join(map(str, numbers))}")
     # Rows keep no maps. The trials are made again from world and key, and are the same (tests/test_sweep.py).
-    sweep, pair = Sweep(specification, folder), cell.pairs[numbers.index(world)]
+    sweep, pair = Sweep(specification, folder, read_only=True), cell.pairs[numbers.index(world)]
     # The known map's path shows no exploration, which is what the picture is to compare.
     trials = [sweep.trial(row.item) for policy, row in pair.items() if policy != Policy.KNOWN_MAP]
     sweep.store.close()

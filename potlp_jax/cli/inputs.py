@@ -126,7 +126,7 @@ def open_store(folder: Path) -> Iterator[Store]:
         fail(
             f"{folder}: there is no sweep in here (no {RESULTS}); begin one with `potlp sweep FILE.yaml --out {folder}`"
         )
-    store = Store(folder / RESULTS)
+    store = Store(folder / RESULTS, read_only=True)
     try:
         yield store
     finally:

@@ -12,6 +12,7 @@ from jaxtyping import PRNGKeyArray
 
 from potlp_jax.environments.splits import Split, default_split, world_key
 from potlp_jax.errors import TaskError
+from potlp_jax.precision import in_32_bits
 from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.reading import read_task
 from potlp_jax.task.task import Task
@@ -50,6 +51,7 @@ class Generator(abc.ABC):
             WorldError: no world can be made.
         """
 
+    @in_32_bits
     def generate(self, key: PRNGKeyArray) -> World:
         """The world of this key, with the settings of its family. Raises WorldError as ``draw``."""
         return self.signed(self.draw(key))

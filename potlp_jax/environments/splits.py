@@ -22,6 +22,7 @@ import jax
 from jaxtyping import PRNGKeyArray
 
 from potlp_jax.errors import WorldError
+from potlp_jax.precision import in_32_bits
 
 # The four highest bits number the split, which leaves space for sixteen.
 _INDEX_BITS = 28
@@ -68,6 +69,7 @@ def check_split(split: Split, family: str) -> None:
         )
 
 
+@in_32_bits
 def world_key(split: Split | str, index: int, family: str) -> PRNGKeyArray:
     """The key of a world.
 

@@ -21,12 +21,14 @@ from potlp_jax.planning.estimates import Estimates, check_shapes
 from potlp_jax.planning.move import Move
 from potlp_jax.planning.policies import search_move
 from potlp_jax.planning.situation import DecisionConfig, assess, is_in_map
+from potlp_jax.precision import in_32_bits
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_SUBGOAL, UNREACHABLE, Status, status_array, status_if
 from potlp_jax.world.frontiers import Subgoals
 from potlp_jax.world.grid import BeliefMap
 
 
+@in_32_bits
 def frontier_subgoals(
     belief: BeliefMap,
     cell: Int32[Array, "2"],
@@ -78,6 +80,7 @@ def subgoals_at(cells: Int32[Array, "S 2"], mask: Bool[Array, " S"], height: int
     )
 
 
+@in_32_bits
 def decide_from_estimates(
     belief: BeliefMap,
     subgoals: Subgoals,

@@ -26,6 +26,7 @@ from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
 from potlp_jax.planning.problem import PlanningProblem, take_rows
 from potlp_jax.planning.rounding import rounded_product
+from potlp_jax.planning.sharding import vary_alike
 from potlp_jax.types import NO_CLASS, NO_STATE
 
 WORD_BITS: int = 32
@@ -380,7 +381,7 @@ def _propagate_failures(tables: ActionTables, fails: UInt32[Array, "*N W"]) -> U
             fails = fails | jnp.where(failed, implying, jnp.uint32(0))
         return fails
 
-    return jax.lax.fori_loop(0, count, close_once, fails)
+    return jax.lax.fori_loop(0, count, close_once, vary_alike(fails, tables))
 
 
 def _action_rows(problem: PlanningProblem, condition_bits: UInt32[Array, "M W"]) -> ActionRow:

@@ -10,6 +10,7 @@ from potlp_jax.planning.history import ActionTerms
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.plan import Plan
 from potlp_jax.planning.situation import DecisionConfig, Situation
+from potlp_jax.precision import in_32_bits
 from potlp_jax.types import NO_ACTION, Status, status_array, status_if
 from potlp_jax.world.frontiers import Subgoals
 
@@ -77,6 +78,7 @@ class Move:
     status: UInt32[Array, "*batch"]
 
 
+@in_32_bits
 def move_to(
     situation: Situation,
     config: DecisionConfig,

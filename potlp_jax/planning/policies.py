@@ -45,6 +45,7 @@ from potlp_jax.planning.situation import (
     nearest_frontier,
     planning_problem,
 )
+from potlp_jax.precision import in_32_bits
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_ACTION, Status, status_if
 from potlp_jax.world.grid import BeliefMap
@@ -65,6 +66,7 @@ class Policy(StrEnum):
         return self in (Policy.ORACLE, Policy.POTLP)
 
 
+@in_32_bits
 def decide(
     belief: BeliefMap,
     cell: Int32[Array, "2"],

@@ -14,6 +14,7 @@ from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float32, Int32
 
 from potlp_jax.errors import ProblemError
+from potlp_jax.precision import in_32_bits
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_CLASS
 
@@ -157,6 +158,7 @@ def screen(problem: PlanningProblem) -> tuple[PlanningProblem, Bool[Array, ""]]:
     return cleaned, wrong
 
 
+@in_32_bits
 def enumerate_actions(problem: PlanningProblem) -> Bool[Array, "S E"]:
     """The paper's A(b_t) without finish: actions that are available at the root (section III-B).
 

@@ -27,6 +27,7 @@ from potlp_jax.errors import TaskError
 from potlp_jax.planning.move import Move, MoveKind, move_to
 from potlp_jax.planning.policies import Policy, direct_move
 from potlp_jax.planning.situation import Situation, assess
+from potlp_jax.precision import in_32_bits
 from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig, config_in
@@ -126,6 +127,7 @@ class TaskEnv:
         num_actions: S * E + 2.
     """
 
+    @in_32_bits
     def __init__(self, worlds: Sequence[World], task: Task, config: TrialConfig | None = None) -> None:
         """Stack the worlds.
 
@@ -180,12 +182,14 @@ class TaskEnv:
         """Entries of ``Observation.action_mask``."""
         return self._finish + 2
 
+    @in_32_bits
     def reset(self, key: PRNGKeyArray) -> tuple[EnvState, TimeStep]:
         """Begin an episode in a world drawn by ``key``."""
         # The key makes nothing but this choice: worlds are deterministic, and so is everything that follows.
         index = jax.random.randint(key, (), 0, self.worlds.occupied.shape[0])
         return self.reset_in(jax.tree.map(lambda leaf: leaf[index], self.worlds))
 
+    @in_32_bits
     def reset_in(self, world: World) -> tuple[EnvState, TimeStep]:
         """Begin an episode in this world. Its shape must be that of the others, for one compilation to serve all."""
         # A trial draws for its planner and its camera alone, and an episode has neither.
@@ -194,6 +198,7 @@ class TaskEnv:
         # Even an episode that cannot be won has a first step, as dm_env has it.
         return state, self._time_step(state, jnp.int8(StepType.FIRST), jnp.float32(0.0))
 
+    @in_32_bits
     def step(self, state: EnvState, action: Int32[Array, ""]) -> tuple[EnvState, TimeStep]:
         """Take an action.
 

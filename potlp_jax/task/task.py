@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int8, Int32
 
 from potlp_jax.errors import SpotMissingError, TaskError, TaskWarning, UnsatisfiableError
+from potlp_jax.precision import in_32_bits
 from potlp_jax.task.automaton import Dfa, canonical_dfa, check_size, translate
 from potlp_jax.task.formula import parse_formula, unknown_proposition
 from potlp_jax.task.guards import Phi, minimal_cover
@@ -250,6 +251,7 @@ class Task:
         """The device form, without more padding than ``sizes`` has."""
         return self.padded(self.sizes)
 
+    @in_32_bits
     def padded(self, sizes: TaskSizes) -> TaskArrays:
         """The device form in larger arrays. Padding changes no result.
 
@@ -317,6 +319,7 @@ def _check_that_it_asks_for_something(text: str, dfa: Dfa) -> None:
         warnings.warn(f"'{text}' is satisfied by every word: there is nothing to do", TaskWarning, stacklevel=4)
 
 
+@in_32_bits
 def stack_tasks(tasks: Sequence[Task], sizes: TaskSizes | None = None) -> TaskArrays:
     """Several tasks over the same propositions, padded and stacked along a new leading axis.
 

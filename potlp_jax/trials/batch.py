@@ -23,6 +23,7 @@ from potlp_jax.learning.memory import PanoramaMemory
 from potlp_jax.learning.serialization import require_propositions
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy, PolicyFunction, named_policy
+from potlp_jax.precision import in_32_bits
 from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.trials import rules
@@ -78,6 +79,7 @@ class Finished:
     seconds: float
 
 
+@in_32_bits
 def run_batch(
     starts: Iterable[Start],
     policy: Policy | PolicyFunction | str,

@@ -18,6 +18,7 @@ from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.move import Move, MoveKind
 from potlp_jax.planning.policies import Policy, PolicyFunction, decide, named_policy, policy_name
+from potlp_jax.precision import in_32_bits
 from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials import rules
@@ -38,6 +39,7 @@ _arrive = jax.jit(rules.arrive, static_argnames="config")
 _stop_of = jax.jit(rules.stop_of, static_argnames="config")
 
 
+@in_32_bits
 def run_trial(
     world: World,
     task: Task,
@@ -84,6 +86,7 @@ def run_trial(
     )
 
 
+@in_32_bits
 def run_robot(
     robot: Robot,
     task: Task,

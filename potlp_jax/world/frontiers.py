@@ -18,6 +18,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
+from potlp_jax.precision import in_32_bits
 from potlp_jax.types import NO_SUBGOAL, UNREACHABLE, Status, status_if
 from potlp_jax.world.grid import BeliefMap
 from potlp_jax.world.moves import NEIGHBOURS, beside
@@ -99,6 +100,7 @@ def frontier_cells(belief: BeliefMap, reachable: Bool[Array, "H W"]) -> Bool[Arr
     return belief.free & reachable & beside(belief.unknown, beyond=True)
 
 
+@in_32_bits
 def find_subgoals(
     belief: BeliefMap,
     reachable: Bool[Array, "H W"],

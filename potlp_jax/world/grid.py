@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float32, Int, Int8, Int32, Num, Shaped, UInt8
 
 from potlp_jax.errors import WorldError
 from potlp_jax.files import one_line
+from potlp_jax.precision import in_32_bits
 from potlp_jax.task.propositions import check_propositions, in_order
 from potlp_jax.task.reading import read_task
 from potlp_jax.task.task import Task
@@ -185,6 +186,7 @@ class BeliefMap:
         )
 
 
+@in_32_bits
 def make_world(
     occupied: Bool[np.ndarray, "H W"],
     letters: Int[np.ndarray, "_ _"],
@@ -267,6 +269,7 @@ def pad_world(world: World, height: int, width: int) -> World:
     )
 
 
+@in_32_bits
 def belief_from_numpy(
     cells: Num[np.ndarray, "H W"],
     letters: Int[np.ndarray, "H W"],

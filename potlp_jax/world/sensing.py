@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, Int32, UInt8
 
+from potlp_jax.precision import in_32_bits
 from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.moves import dilate
@@ -78,6 +79,7 @@ class _Lines:
     levels: int
 
 
+@in_32_bits
 def observe(belief: BeliefMap, world: World, cell: Int32[Array, "2"], config: SensorConfig) -> BeliefMap:
     """The belief with all that is in line of sight added.
 

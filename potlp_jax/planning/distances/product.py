@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float32, Int32
 
 from potlp_jax.planning.distances.portals import find_active_cells, portals_pay, table_by_portals
 from potlp_jax.planning.distances.sweeping import Links, Sweeper, Wildcard
+from potlp_jax.precision import in_32_bits
 from potlp_jax.task.relations import transitive_closure
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_STATE
@@ -26,6 +27,7 @@ SOURCES_AT_ONCE: int = 8
 """Sources solved side by side: enough to fill vector units, few enough for a layer of costs to stay in cache."""
 
 
+@in_32_bits
 def product_transitions(
     task: TaskArrays, letters: Int32[Array, "H W"], known_free: Bool[Array, "H W"]
 ) -> Int32[Array, "H W Z"]:
@@ -59,6 +61,7 @@ def reachable_states(task: TaskArrays, state: Int32[Array, ""]) -> Bool[Array, "
     return transitive_closure(one_letter_successors(task))[state]
 
 
+@in_32_bits
 def product_distances(
     transitions: Int32[Array, "H W Z"],
     free: Bool[Array, "H W"],

@@ -25,6 +25,7 @@ from potlp_jax.planning.search.graph import Tree
 from potlp_jax.planning.search.lockstep import SearchMethod, run_search
 from potlp_jax.planning.search.plan import Plan
 from potlp_jax.planning.search.uct import UCT, UctTree
+from potlp_jax.precision import in_32_bits
 
 
 def plan_actions(
@@ -54,6 +55,7 @@ def plan_actions(
     return search_tree(problem, key, config)[0]
 
 
+@in_32_bits
 def search_tree(
     problem: PlanningProblem,
     key: PRNGKeyArray,
@@ -81,6 +83,7 @@ def search_tree(
     return jax.tree.map(lambda leaf: leaf[0], run_search(_search_for(config), config, problems, seeds, trees))
 
 
+@in_32_bits
 def search(
     problems: PlanningProblem,
     keys: Key[Array, "B"],

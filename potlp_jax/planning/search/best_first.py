@@ -46,6 +46,7 @@ from potlp_jax.planning.search.guess import Rule, guess_outcomes, make_rule
 from potlp_jax.planning.search.lockstep import SearchMethod
 from potlp_jax.planning.search.model import FAILURE, SUCCESS, Model, make_model
 from potlp_jax.planning.search.plan import Plan, plan_of_least_score
+from potlp_jax.planning.sharding import vary_alike
 from potlp_jax.task.relations import transitive_closure
 from potlp_jax.types import Status
 
@@ -287,7 +288,7 @@ def _descend(context: Context, tree: Tree, config: BestFirstConfig) -> Descent:
     def goes_on(descent: Descent) -> Bool[Array, ""]:
         return jnp.any(descent.active) & (descent.level < config.max_depth)
 
-    return jax.lax.while_loop(goes_on, lambda descent: _descend_once(context, tree, descent), start)
+    return jax.lax.while_loop(goes_on, lambda descent: _descend_once(context, tree, descent), vary_alike(start))
 
 
 def _descend_once(context: Context, tree: Tree, descent: Descent) -> Descent:
@@ -567,7 +568,7 @@ def _back_up(tree: Tree, descent: Descent, leaf: Leaf) -> Tree:
         return level - 1, value, bound, tree
 
     start = (descent.level - 1, leaf.value, leaf.bound, tree)
-    tree = jax.lax.while_loop(lambda carry: carry[0] >= 0, ascend, start)[3]
+    tree = jax.lax.while_loop(lambda carry: carry[0] >= 0, ascend, vary_alike(start))[3]
     # Link the child last, to the node that the descent left the graph from.
     parent = jnp.where(leaf.child == Tree.UNVISITED, tree.capacity, descent.node)
     at = (rows, parent, descent.action, descent.success.astype(jnp.int32))

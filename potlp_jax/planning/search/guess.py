@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float32, Int32
 from potlp_jax.planning.history import ActionTables
 from potlp_jax.planning.rounding import rounded_product
 from potlp_jax.planning.search.arrays import first_of_least
+from potlp_jax.planning.sharding import vary_alike
 from potlp_jax.types import NO_STATE
 
 NEGLIGIBLE: float = 1e-3
@@ -218,7 +219,7 @@ def _costs_without(chain: _Chain) -> Float32[Array, "L N"]:
 
     levels, count = chain.action.shape
     nothing_yet = jnp.zeros((count,), jnp.float32), jnp.ones((count,), jnp.float32)
-    return jax.lax.scan(skip, nothing_yet, jnp.arange(levels, dtype=jnp.int32))[1]
+    return jax.lax.scan(skip, vary_alike(nothing_yet, chain), jnp.arange(levels, dtype=jnp.int32))[1]
 
 
 def _cost_to_begin_elsewhere(rule: Rule, starts: _Starts, chain: _Chain) -> Float32[Array, "R A"]:
@@ -315,7 +316,8 @@ def _value_successes(
         return after_success.at[problem, action].set(value, unique_indices=True)
 
     steps = todo * jnp.where(jnp.any(order.cyclic), PASSES, 1)
-    return dataclasses.replace(rule, after_success=jax.lax.fori_loop(0, steps, value_edge, rule.after_success))
+    start = vary_alike(rule.after_success, rule)
+    return dataclasses.replace(rule, after_success=jax.lax.fori_loop(0, steps, value_edge, start))
 
 
 def _attempt_cost(
@@ -344,7 +346,9 @@ def _follow_chain(rule: Rule, starts: _Starts, length: int) -> _Chain:
         chance=zeros,
     )
     walk = jax.lax.while_loop(
-        lambda walk: (walk.level < length) & jnp.any(walk.active), lambda walk: _fail_once(rule, starts, walk), walk
+        lambda walk: (walk.level < length) & jnp.any(walk.active),
+        lambda walk: _fail_once(rule, starts, walk),
+        vary_alike(walk, rule),
     )
 
     def add(rest, level):

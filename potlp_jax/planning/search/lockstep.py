@@ -15,6 +15,8 @@ from jaxtyping import Array, UInt32
 
 from potlp_jax.planning.problem import PlanningProblem, screen
 from potlp_jax.planning.search.plan import Plan
+from potlp_jax.planning.sharding import vary_alike
+from potlp_jax.precision import in_32_bits
 from potlp_jax.types import Status, status_array
 
 
@@ -70,6 +72,7 @@ def _routed_kernel(search: SearchMethod, config: Any, structure: Any, leaf_count
     """
 
     @jax.custom_batching.custom_vmap
+    @in_32_bits
     def kernel(seeds, *arrays):
         # The problem's leaves, and after them the tree's, where there is one.
         leaves, trees = arrays[:leaf_count], arrays[leaf_count:]
@@ -78,7 +81,9 @@ def _routed_kernel(search: SearchMethod, config: Any, structure: Any, leaf_count
         plan, tree = _search_batch(problems, seeds, tree, search=search, config=config)
         return _arrays_of(plan) + _arrays_of(tree)
 
+    # Called where the caller's vmap is traced, which may be outside of the library's own functions.
     @kernel.def_vmap
+    @in_32_bits
     def merge_axes(axis_size, in_batched, *arrays):
         # What is not batched is repeated: the kernel has one batch axis for all of its arguments.
         full = [
@@ -99,6 +104,7 @@ def _search_batch(
     problems: PlanningProblem, seeds: UInt32[Array, "B 2"], tree: Any, *, search: SearchMethod, config: Any
 ) -> tuple[Plan, Any]:
     """Simulate until no row is open or the simulations are spent, then choose."""
+    problems, seeds, tree = vary_alike((problems, seeds, tree))
     # A row with an invalid input becomes a dead end: nothing is planned with it, and no other row waits for it.
     problems, invalid = jax.vmap(screen)(problems)
     # Not part of the tree: a search that goes on prepares again, which costs a fraction of a search.
@@ -114,7 +120,7 @@ def _search_batch(
         count, tree = carry
         return count + 1, search.simulate(context, tree, config)
 
-    _, tree = jax.lax.while_loop(unfinished, advance, (jnp.int32(0), tree))
+    _, tree = jax.lax.while_loop(unfinished, advance, vary_alike((jnp.int32(0), tree)))
     plan = search.choose(context, tree)
     status = jnp.where(invalid, status_array(Status.INVALID), plan.status)
     return dataclasses.replace(plan, status=status), tree

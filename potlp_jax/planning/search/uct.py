@@ -42,6 +42,7 @@ from potlp_jax.planning.search.config import UctConfig
 from potlp_jax.planning.search.lockstep import SearchMethod
 from potlp_jax.planning.search.model import Model, make_model
 from potlp_jax.planning.search.plan import Plan, plan_of_least_score
+from potlp_jax.planning.sharding import vary_alike
 from potlp_jax.types import Status
 
 
@@ -281,7 +282,7 @@ def _descend(context: Context, tree: UctTree, config: UctConfig) -> Rollout:
     def goes_on(rollout: Rollout) -> Bool[Array, ""]:
         return jnp.any(rollout.active) & (rollout.level < depth)
 
-    return jax.lax.while_loop(goes_on, lambda rollout: _descend_once(context, tree, rollout, config), start)
+    return jax.lax.while_loop(goes_on, lambda rollout: _descend_once(context, tree, rollout, config), vary_alike(start))
 
 
 def _descend_once(context: Context, tree: UctTree, rollout: Rollout, config: UctConfig) -> Rollout:
@@ -400,7 +401,7 @@ def _back_up(tree: UctTree, rollout: Rollout, leaf: Leaf) -> UctTree:
 
     # Beyond the leaf the rollout costs nothing, or a dead end.
     start = (rollout.level - 1, leaf.value, tree)
-    tree = jax.lax.while_loop(lambda carry: carry[0] >= 0, ascend, start)[2]
+    tree = jax.lax.while_loop(lambda carry: carry[0] >= 0, ascend, vary_alike(start))[2]
     moved = rollout.nodes[0] < tree.capacity
     # The link of a node that was not added goes to the spare node.
     parent = jnp.where(leaf.child == UctTree.UNVISITED, tree.capacity, rollout.node)
