@@ -128,6 +128,10 @@ class SpecificationError(ConfigurationError):
     """A specification of a sweep cannot be used: names the file, the entry and what to do."""
 
 
+class SweepError(PotlpError):
+    """A sweep has ended before its end; the message says why, and that what is finished is kept."""
+
+
 class StoreError(PotlpError):
     """A store cannot be used: names the file, what is wrong, and what to do."""
 

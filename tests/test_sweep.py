@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -187,7 +188,7 @@ def test_other_files_are_no_store(tmp_path):
     old = Store(tmp_path / "b")
     old._connection.execute("UPDATE facts SET value = 'potlp-sweep-0' WHERE name = 'format'")
     old.close()
-    with pytest.raises(StoreError, match=r"'potlp-sweep-0'.*'potlp-sweep-3'"):
+    with pytest.raises(StoreError, match=r"'potlp-sweep-0'.*'potlp-sweep-4'"):
         Store(tmp_path / "b")
 
 
@@ -201,9 +202,9 @@ def finished(tmp_path_factory):
     return folder
 
 
-def _rows(folder):
+def _rows(folder, read_only=False):
     """Rows without what differs between runs."""
-    store = Store(folder / RESULTS)
+    store = Store(folder / RESULTS, read_only)
     rows = [dataclasses.replace(row, seconds=0.0) for row in store.rows()]
     store.close()
     return rows
@@ -297,6 +298,115 @@ def test_killed_many_times_at_random_moments_nothing_is_lost_and_nothing_is_ther
     rows = _rows(tmp_path)
     assert [(row.item.task, row.item.policy, row.item.world, row.cost) for row in rows] == expected
     assert not Store(tmp_path / RESULTS)._connection.execute("SELECT * FROM claims").fetchall()
+
+
+def _flip(file, table, column, value):
+    """Change one value behind the store's back, and what SQLite would check of it."""
+    store = Store(file)
+    store._connection.execute(f"UPDATE {table} SET {column} = {value}")
+    store.close()
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "value"),
+    [
+        ("trials", "cost", "cost + 1e-12"),
+        ("trials", "path", "'2,3:71'"),
+        ("trials", "world", "world + 1"),
+        ("trials", "key", "'[0, 1]'"),
+        ("trials", "outcome", "x'00ff'"),
+        ("worlds", "possible", "1 - possible"),
+        ("facts", "value", "replace(value, '3', '2')"),
+    ],
+)
+def test_what_was_changed_in_a_store_is_not_taken_for_a_result(table, column, value, tmp_path):
+    file = tmp_path / RESULTS
+    store = Store(file)
+    store.agree({"specification": {"worlds": 3}})
+    store.finish([_row(ITEMS[0])])
+    store.set_possible("toy", "F goal", {0: True})
+    assert len(store.rows()) == len(store.possible("toy", "F goal")) == len(store.facts()) == 1
+    store.close()
+    _flip(file, table, column, f"{value} WHERE name <> 'format'" if table == "facts" else value)
+    changed = Store(file, read_only=True)
+    read = {"trials": changed.rows, "worlds": lambda: changed.possible("toy", "F goal"), "facts": changed.facts}
+    with pytest.raises(StoreError, match=r"results\.sqlite: .* is damaged: its checksum .*another folder") as caught:
+        read[table]()
+    assert "\n" not in str(caught.value)
+
+
+def test_bits_that_flip_in_the_file_end_in_one_line_or_change_nothing(tmp_path):
+    store = Store(tmp_path / "whole")
+    rows = [_row(item, cost=item.world / 7) for item in ITEMS]
+    store.finish(rows)
+    store.close()
+    whole, random, refused = (tmp_path / "whole").read_bytes(), np.random.default_rng(3), 0
+    for _ in range(60):
+        damaged = bytearray(whole)
+        damaged[random.integers(len(whole))] ^= 1 << int(random.integers(8))
+        (tmp_path / "damaged").write_bytes(damaged)
+        try:
+            found = Store(tmp_path / "damaged", read_only=True).rows()
+        except StoreError as error:
+            refused += "\n" not in str(error)
+        else:
+            # Bits that no row lies on, such as those of free pages.
+            assert found == rows
+    assert refused > 3
+
+
+def test_a_full_disk_is_named_and_loses_nothing(tmp_path):
+    store = Store(tmp_path / RESULTS)
+    store.finish([_row(ITEMS[0])])
+    (pages,) = store._connection.execute("PRAGMA page_count").fetchone()
+    store._connection.execute(f"PRAGMA max_page_count = {pages}")
+    with pytest.raises(StoreError, match=r"the disk is full .*make room"):
+        store.finish([dataclasses.replace(_row(item), path="2,3:" + "7" * 9000) for item in ITEMS])
+    assert store.rows() == [_row(ITEMS[0])]
+    store._connection.execute("PRAGMA max_page_count = 100000")
+    store.finish([_row(ITEMS[1])])
+    assert store.count() == 2
+
+
+def test_a_store_that_another_program_holds_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("potlp_jax.sweep.store.PATIENCE", 0.01)
+    one, other = Store(tmp_path / RESULTS), Store(tmp_path / RESULTS)
+    with one._transaction(), pytest.raises(StoreError, match="another process has been writing"):
+        other.finish([_row(ITEMS[0])])
+
+
+@pytest.fixture(params=["whole", "killed"])
+def read_only(request, finished, tmp_path):
+    """A finished sweep on a medium that cannot be written; in the second case its log was not merged into the file."""
+    source, mounted = tmp_path / "source", tmp_path / "mounted"
+    shutil.copytree(finished, source)
+    mounted.mkdir()
+    if request.param == "killed":
+        code = (
+            "import os, sys; from potlp_jax.sweep.store import *; from pathlib import Path\n"
+            "store = Store(Path(sys.argv[1])); store.set_possible('toy', 'F x', {1: True}); os._exit(1)"
+        )
+        subprocess.run([sys.executable, "-c", code, str(source / RESULTS)])
+        assert (source / f"{RESULTS}-wal").stat().st_size
+        (source / f"{RESULTS}-shm").unlink()
+    if subprocess.run(["mount", "--bind", source, mounted], stderr=subprocess.DEVNULL).returncode:
+        pytest.skip("no right to mount")
+    subprocess.run(["mount", "-o", "remount,bind,ro", source, mounted], check=True)
+    yield mounted
+    subprocess.run(["umount", "--lazy", mounted], check=True)
+
+
+def test_a_finished_sweep_is_shown_from_a_medium_that_cannot_be_written(read_only, tmp_path):
+    assert _rows(read_only, read_only=True) == _rows(read_only, read_only=True)
+    told = _potlp("sweep", "show", read_only, "--json")
+    assert told.exit_code == 0, told.stderr
+    (cell,) = json.loads(told.stdout)["cells"]
+    assert cell["satisfied"]["pairs"] == 3
+    run_sweep(_specification(), read_only, 2)
+    told = _potlp("report", read_only, "--out", tmp_path / "page.html", "--replays", 0)
+    assert told.exit_code == 0, told.stderr
+    with pytest.raises(StoreError, match=r"cannot be (read or )?written"):
+        run_sweep(_specification(worlds=4), read_only, 1)
 
 
 WORKER = """

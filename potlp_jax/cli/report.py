@@ -53,7 +53,7 @@ def write_report(
     if page.suffix != ".html":
         fail(f"--out {page}: give a name that ends in .html")
     # The sweep of the store itself, whatever the file that began it says by now.
-    sweep = Sweep(specification_from_store(facts["specification"]), folder)
+    sweep = Sweep(specification_from_store(facts["specification"]), folder, read_only=True)
     policies = list(sweep.specification.policies)
     cells: list[Cell] = []
     rows: list[Row] = []

@@ -115,7 +115,11 @@ def run_reported(specification: "Specification", folder: Path, processes: int | 
 
     # The cores that this process may use, which on a cluster are fewer than the machine has.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    run_sweep(specification, folder, processes or cores, _Reporter().report)
+    reporter = _Reporter()
+    try:
+        run_sweep(specification, folder, processes or cores, reporter.report)
+    finally:
+        reporter.close()
 
 
 class _Reporter:
@@ -140,9 +144,10 @@ class _Reporter:
         if self._bar.disable and (finished or now - self._last_line >= SECONDS_BETWEEN_LINES):
             self._last_line = now
             logger.info(f"{progress.done} of {progress.total} trials{text}")
-        # A bar that is left running would keep the terminal's cursor hidden.
-        if finished:
-            self._bar.stop()
+
+    def close(self) -> None:
+        """A bar that is left running would keep the terminal's cursor hidden."""
+        self._bar.stop()
 
     def _rate(self, progress: "Progress") -> str:
         seconds, done = time.monotonic() - self._start, progress.done - self._done_before

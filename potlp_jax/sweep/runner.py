@@ -5,22 +5,30 @@ trial that has ended makes room for the next. A row is written as soon as its tr
 but the store, so workers may be killed, started again, or belong to several commands on one store.
 """
 
+import contextlib
 import dataclasses
 import itertools
 import logging
 import multiprocessing
 import os
 import signal
+import socket
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import NoReturn
 
 import jax
 
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, world_key
-from potlp_jax.errors import WorldError
+from potlp_jax.errors import PotlpError, SweepError, WorldError
+from potlp_jax.files import one_line
+from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import TrainedEstimator, identity_of, named_estimator
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy, named_policy
@@ -51,6 +59,16 @@ BLOCK: int = 8
 PORTION: int = 32
 """Worlds of each task that all policies visit before the next ones."""
 
+MOST_DEATHS: int = 5
+"""Workers that are killed in a row, without a trial finished between, after which the sweep ends."""
+
+KEPT: str = "what is finished is kept: the same command goes on"
+"""What messages say about rows."""
+
+# With the reading of the store and the end of the process that is less than two seconds.
+_GRACE: float = 1.0
+"""Seconds between asking a process to end and ending it."""
+
 # Short beside a trial, long beside a reading.
 WAIT: float = 0.3
 """Seconds between readings of the store while there is nothing to claim."""
@@ -67,14 +85,15 @@ class Progress:
 class Sweep:
     """A specification with its store: what is to be done, and how one piece of it is."""
 
-    def __init__(self, specification: Specification, folder: Path) -> None:
+    def __init__(self, specification: Specification, folder: Path, read_only: bool = False) -> None:
         self.specification = specification
-        self.store = Store(folder / RESULTS)
+        self.store = Store(folder / RESULTS, read_only)
         # Every policy visits the worlds of a block, and making one may take a second. The caches are the sweep's own: a
         # family that is defined anew under the same name, as in a notebook, is not mistaken for the old one.
         self._generator = lru_cache(maxsize=None)(make)
         self._world = lru_cache(maxsize=4 * BLOCK)(self._make_world)
-        self.store.agree({"specification": specification.to_dict(), "estimator": self._estimator_identity()})
+        facts = {"specification": specification.to_dict(), "estimator": self._estimator_identity()}
+        (self.store.compare if read_only else self.store.agree)(facts)
 
     @property
     def total(self) -> int:
@@ -233,7 +252,10 @@ class Sweep:
 
     def _asked(self, environment: str, policy: str) -> TrainedEstimator | Estimator | None:
         """What a policy asks in the worlds of an environment; None where it asks nothing."""
-        return estimator_of(named_policy(policy), self._generator(environment).propositions, self._estimator)
+        # Worlds of a family are alike in what decides whether an estimator serves them: the first stands for all.
+        world = self._world(environment, self.specification.first_world)
+        here = Domain.of_world(world, self.specification.config.camera)
+        return estimator_of(named_policy(policy), world.propositions, here, self._estimator)
 
     def _estimator_identity(self) -> str | None:
         """Of all that policies ask, so that a store never mixes two. Raises EstimatorError where there is none."""
@@ -261,18 +283,74 @@ def run_sweep(
         report: is called now and then with the progress.
 
     Raises:
-        StoreError: the folder holds another sweep.
-        RuntimeError: a worker ended with an error, which it has printed.
+        StoreError: the folder holds another sweep, or cannot be written; of a sweep that is finished nothing is.
+        SweepError: workers could not be started, or ended with an error; what is finished is kept.
+        SystemExit: the process was asked to end (SIGTERM); it and its workers do within two seconds.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    sweep = Sweep(specification, folder)
+    if _is_finished(specification, folder):
+        return
+    with ending_when_asked():
+        sweep = Sweep(specification, folder)
+        try:
+            if processes == 1:
+                _work_here(sweep, report)
+            else:
+                _Workers(sweep, folder, processes).run(report)
+        finally:
+            sweep.store.close()
+
+
+def _is_finished(specification: Specification, folder: Path) -> bool:
+    """Whether every trial has a row already: asked without writing, for the folder may be on a full or locked disk."""
+    if not (folder / RESULTS).is_file():
+        return False
+    sweep = Sweep(specification, folder, read_only=True)
     try:
-        if processes == 1:
-            _work_here(sweep, report)
-        else:
-            _work_in_processes(sweep, folder, processes, report)
+        return sweep.finished()
     finally:
         sweep.store.close()
+
+
+@contextlib.contextmanager
+def ending_when_asked() -> Iterator[None]:
+    """End the block by SIGTERM as by an error, so that it can tidy up, and the process soon, whatever it does.
+
+    Python runs a handler between its own steps alone, and compiling a program may be one step of a minute. So a thread
+    ends the process if the handler has not done so in time: nothing is lost, as rows are written as they end.
+    """
+    # Elsewhere than in the main thread no handler can be set, and whoever runs it has an own way to end it.
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    ended = threading.Event()
+    thread = threading.Thread(target=_end_late, args=(reader, ended), daemon=True)
+    before_fd, before = signal.set_wakeup_fd(writer.fileno()), signal.signal(signal.SIGTERM, _end)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        signal.set_wakeup_fd(before_fd)
+        signal.signal(signal.SIGTERM, before)
+        writer.close()
+        thread.join()
+        reader.close()
+
+
+def _end(number: int, frame: object) -> NoReturn:
+    logger.warning(f"ended by {signal.Signals(number).name}; {KEPT}")
+    # What a shell reports of a process that a signal has ended.
+    raise SystemExit(128 + number)
+
+
+def _end_late(reader: socket.socket, ended: threading.Event) -> None:
+    """Wait for SIGTERM, and end the process if nothing else has a while after it. Ends when the other side closes."""
+    while signals := reader.recv(1):
+        if signals[0] == signal.SIGTERM and not ended.wait(_GRACE):
+            os._exit(128 + signal.SIGTERM)
 
 
 def _work_here(sweep: Sweep, report: Callable[[Progress], None]) -> None:
@@ -282,47 +360,130 @@ def _work_here(sweep: Sweep, report: Callable[[Progress], None]) -> None:
         report(Progress(sweep.store.count(), sweep.total))
 
 
-def _work_in_processes(sweep: Sweep, folder: Path, processes: int, report: Callable[[Progress], None]) -> None:
-    # Spawned, not forked: a fork of a process in which jax has started its threads may hang.
-    context = multiprocessing.get_context("spawn")
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
-    workers = [
-        context.Process(target=_work, args=(sweep.specification, folder, cores[number % len(cores)]), daemon=True)
-        for number in range(processes)
-    ]
-    try:
-        for worker in workers:
-            worker.start()
-        while any(worker.is_alive() for worker in workers):
-            report(Progress(sweep.store.count(), sweep.total))
-            # One worker's error is the others' error soon: their trials are of the same sweep.
-            if any(worker.exitcode for worker in workers):
-                break
-            time.sleep(WAIT)
-    finally:
+class _Workers:
+    """Processes that work on one sweep. Another takes the place of one that dies."""
+
+    def __init__(self, sweep: Sweep, folder: Path, processes: int) -> None:
+        self._sweep, self._folder = sweep, folder
+        # Spawned, not forked: a fork of a process in which jax has started its threads may hang.
+        self._context = multiprocessing.get_context("spawn")
+        cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
+        self._cores = [cores[number % len(cores)] for number in range(processes)]
+        self._running: dict[int, tuple[BaseProcess, Connection]] = {}
+        # Deaths since the last row that was written, and how many rows there were.
+        self._deaths, self._rows = 0, sweep.store.count()
+
+    def run(self, report: Callable[[Progress], None]) -> None:
+        """Work until nothing remains, and end all processes, however this one comes to its end."""
+        try:
+            for place in range(len(self._cores)):
+                self._start(place)
+            while self._running:
+                done = self._sweep.store.count()
+                report(Progress(done, self._sweep.total))
+                if done > self._rows:
+                    self._deaths, self._rows = 0, done
+                for place in [place for place, (process, _) in self._running.items() if not process.is_alive()]:
+                    self._look_after(place)
+                time.sleep(WAIT)
+        finally:
+            self._end_all()
+        report(Progress(self._sweep.total, self._sweep.total))
+
+    def _start(self, place: int) -> None:
+        """Begin the worker of a place. Raises SweepError where none can be begun."""
+        ours, theirs = self._context.Pipe(duplex=False)
+        arguments = (self._sweep.specification, self._folder, self._cores[place], theirs)
+        process = self._context.Process(target=_work, args=arguments, daemon=True)
+        try:
+            process.start()
+        # Too many processes, or too little memory. The others do the work.
+        except OSError as error:
+            if not self._running:
+                raise SweepError(f"no worker could be started ({error}): give fewer --processes; {KEPT}") from error
+            logger.warning(
+                f"a worker could not be started ({error}); the sweep goes on with the other {len(self._running)}"
+            )
+        else:
+            self._running[place] = process, ours
+        finally:
+            theirs.close()
+
+    def _look_after(self, place: int) -> None:
+        """Replace a worker that was killed; raise what one has reported. One that has found nothing to do is done."""
+        process, connection = self._running.pop(place)
+        code, told = process.exitcode, _last_word(connection)
+        if code == 0:
+            return
+        # One worker's error is the others' error soon: their trials are of the same sweep.
+        if told is not None:
+            raise SweepError(f"a worker of the sweep ended with an error: {told}; {KEPT}")
+        self._deaths += 1
+        how = f"was killed by {_signal_name(-code)}" if code is not None and code < 0 else f"ended with code {code}"
+        if self._deaths >= MOST_DEATHS:
+            raise SweepError(
+                f"a worker of the sweep {how}, the {MOST_DEATHS}th in a row that has not finished a trial; if there is "
+                f"too little memory, give fewer --processes; {KEPT}"
+            )
+        logger.warning(f"a worker of the sweep {how}; another takes its place, and its trials begin again")
+        self._start(place)
+
+    def _end_all(self) -> None:
         # Also after an interrupt: claims of a process that is gone are void, so that nothing has to be given back.
-        for worker in workers:
-            worker.terminate()
-            worker.join()
-    if not sweep.finished():
-        raise RuntimeError("a worker of the sweep ended with an error; what is finished is kept")
-    report(Progress(sweep.total, sweep.total))
+        for process, _ in self._running.values():
+            process.terminate()
+        until = time.monotonic() + _GRACE
+        for process, connection in self._running.values():
+            process.join(max(0.0, until - time.monotonic()))
+            process.kill()
+            process.join()
+            connection.close()
 
 
-def _work(specification: Specification, folder: Path, core: int | None) -> None:
+def _last_word(connection: Connection) -> str | None:
+    """The error that a worker has reported; None where it could not."""
+    try:
+        with connection:
+            return connection.recv() if connection.poll() else None
+    except (EOFError, OSError):
+        return None
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def _work(specification: Specification, folder: Path, core: int | None, errors: Connection) -> None:
     """A worker: works until nothing remains, or the process that started it is gone."""
     # An interrupt from the terminal reaches all processes; the one that started this one ends it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     if core is not None:
         # Before XLA starts, which then uses one thread.
         os.sched_setaffinity(0, {core})
     from potlp_jax.cache import enable_compilation_cache
 
     enable_compilation_cache()
-    sweep, parent = Sweep(specification, folder), multiprocessing.parent_process()
-    while not sweep.finished():
-        # The parent may have been killed, and then nobody ends this process.
-        if parent is not None and not parent.is_alive():
-            return
-        if not sweep.step():
-            time.sleep(WAIT)
+    try:
+        sweep = Sweep(specification, folder)
+        while not sweep.finished():
+            if not sweep.step():
+                time.sleep(WAIT)
+    except PotlpError as error:
+        errors.send(str(error))
+        raise SystemExit(1) from error
+    # A fault of the program: its traceback is printed here, where it happened.
+    except Exception as error:
+        errors.send(f"{type(error).__name__}: {one_line(error)} (its traceback is above)")
+        raise
+
+
+def _end_with_parent() -> None:
+    """End this process when the one that started it has ended, killed or not: in a trial as between trials."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

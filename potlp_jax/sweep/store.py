@@ -3,15 +3,22 @@
 Work is handed out as claims. A claim belongs to a process. It is void once that process is gone or, of another host,
 once it is ``LEASE`` seconds old. So what a killed process had begun is begun again by another, and two processes on one
 store do not run the same trial. If two should run the same trial nevertheless, the first row stays.
+
+Everything but claims carries a checksum, so that what a disk or a program has changed is not taken for a result.
+Whatever SQLite raises becomes one ``StoreError`` that says what to do.
 """
 
 import contextlib
 import dataclasses
+import errno
+import hashlib
 import itertools
 import json
 import os
+import shutil
 import socket
 import sqlite3
+import tempfile
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,9 +26,10 @@ from typing import Any
 
 from potlp_jax.codec import differences, json_copy
 from potlp_jax.errors import StoreError
+from potlp_jax.files import one_line, short
 
 # Counts up whenever the tables change; a store of another format is refused, not converted.
-FORMAT = "potlp-sweep-3"
+FORMAT = "potlp-sweep-4"
 
 # Ten minutes: trials take seconds, so that only a worker that is gone holds a claim so long.
 LEASE: float = 600.0
@@ -71,17 +79,17 @@ class Row:
 
 
 _SCHEMA = """
-CREATE TABLE facts (name TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE facts (name TEXT PRIMARY KEY, value TEXT NOT NULL, checksum TEXT NOT NULL);
 CREATE TABLE worlds (
     environment TEXT NOT NULL, task TEXT NOT NULL, world INTEGER NOT NULL, possible INTEGER NOT NULL,
-    PRIMARY KEY (environment, task, world)
+    checksum TEXT NOT NULL, PRIMARY KEY (environment, task, world)
 ) WITHOUT ROWID;
 CREATE TABLE trials (
     environment TEXT NOT NULL, task TEXT NOT NULL, policy TEXT NOT NULL, world INTEGER NOT NULL,
     outcome TEXT NOT NULL, cost REAL NOT NULL, budget REAL NOT NULL, steps INTEGER NOT NULL,
     decisions INTEGER NOT NULL, fallbacks INTEGER NOT NULL, status INTEGER NOT NULL, key TEXT NOT NULL,
     path TEXT NOT NULL, configuration TEXT NOT NULL, versions TEXT NOT NULL, "commit" TEXT NOT NULL,
-    seconds REAL NOT NULL, world_digest TEXT NOT NULL,
+    seconds REAL NOT NULL, world_digest TEXT NOT NULL, checksum TEXT NOT NULL,
     PRIMARY KEY (environment, task, policy, world)
 ) WITHOUT ROWID;
 CREATE TABLE claims (
@@ -98,36 +106,86 @@ _THE_ITEM = "environment = ? AND task = ? AND policy = ? AND world = ?"
 
 
 class Store:
-    """The store in a file, which is made where there is none. One object per process and thread."""
+    """The store in a file. One object per process and thread.
 
-    def __init__(self, file: Path) -> None:
+    Args:
+        file: is made where there is none.
+        read_only: reads a store that is there, also from a medium that cannot be written, or that is full.
+
+    Raises:
+        StoreError: the file is no store of this format, is damaged, or cannot be opened.
+    """
+
+    def __init__(self, file: Path, read_only: bool = False) -> None:
         self.file = file
-        try:
-            # Without an isolation level the module begins no transactions of its own.
-            self._connection = sqlite3.connect(file, timeout=PATIENCE, isolation_level=None)
+        if read_only:
+            self._connection = self._open_to_read()
+        else:
+            with self._reporting():
+                # Without an isolation level the module begins no transactions of its own.
+                self._connection = sqlite3.connect(file, timeout=PATIENCE, isolation_level=None)
             # A write-ahead log lets others read while one writes; FULL syncs at every commit, so that a row that was
             # written is there after a power failure too.
-            self._connection.execute("PRAGMA journal_mode=WAL")
-            self._connection.execute("PRAGMA synchronous=FULL")
+            self._execute("PRAGMA journal_mode=WAL")
+            self._execute("PRAGMA synchronous=FULL")
             # Two processes that open a new file at once must not both make its tables.
             with self._transaction():
-                self._prepare()
-        except sqlite3.DatabaseError as error:
-            raise StoreError(f"{file}: not a store of results ({error}); choose another folder") from error
+                self._make_tables()
+        self._check_format()
 
-    def _prepare(self) -> None:
-        tables = {name for (name,) in self._connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-        if not tables:
+    def _open_to_read(self) -> sqlite3.Connection:
+        log = self.file.with_name(f"{self.file.name}-wal")
+        try:
+            return self._connect_to_read(self.file, "mode=ro")
+        except StoreError:
+            # SQLite wants to make files beside it, to share it with others, and cannot. Nobody else can, either.
+            if not _has_content(log):
+                return self._connect_to_read(self.file, "immutable=1")
+        # The log is of a process that was killed. It cannot be worked in where it lies, so a copy is.
+        with self._reporting(), tempfile.TemporaryDirectory() as folder:
+            for path in (self.file, log):
+                shutil.copyfile(path, Path(folder) / path.name)
+            with contextlib.closing(self._connect_to_read(Path(folder) / self.file.name, "mode=rw")) as copy:
+                memory = sqlite3.connect(":memory:", isolation_level=None)
+                copy.backup(memory)
+            return memory
+
+    def _connect_to_read(self, file: Path, how: str) -> sqlite3.Connection:
+        with self._reporting():
+            connection = sqlite3.connect(
+                f"{file.resolve().as_uri()}?{how}", uri=True, timeout=PATIENCE, isolation_level=None
+            )
+            # Connecting reads nothing.
+            connection.execute("SELECT count(*) FROM sqlite_master").fetchall()
+            return connection
+
+    @contextlib.contextmanager
+    def _reporting(self) -> Iterator[None]:
+        """Turn whatever SQLite and the system raise into one error with what to do."""
+        try:
+            yield
+        except (sqlite3.Error, OSError, OverflowError, MemoryError) as error:
+            raise StoreError(f"{self.file}: {_explained(error)}") from error
+
+    def _execute(self, statement: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+        """Run one statement; the rows that it gives, all read."""
+        with self._reporting():
+            return self._connection.execute(statement, values).fetchall()
+
+    def _make_tables(self) -> None:
+        if not self._execute("SELECT 1 FROM sqlite_master WHERE type = 'table'"):
             for statement in _SCHEMA.split(";\n"):
-                self._connection.execute(statement)
-            self._connection.execute("INSERT INTO facts VALUES ('format', ?)", (FORMAT,))
-        found = (
-            dict(self._connection.execute("SELECT name, value FROM facts")) if not tables or "facts" in tables else {}
-        )
-        if found.get("format") != FORMAT:
+                self._execute(statement)
+            self._execute("INSERT INTO facts VALUES ('format', ?, '')", (FORMAT,))
+
+    def _check_format(self) -> None:
+        if not self._execute("SELECT 1 FROM sqlite_master WHERE name = 'facts'"):
+            raise StoreError(f"{self.file}: not a store of results; choose another folder")
+        found = [value for (value,) in self._execute("SELECT value FROM facts WHERE name = 'format'")]
+        if found != [FORMAT]:
             raise StoreError(
-                f"{self.file}: its format is {found.get('format')!r}, this version reads {FORMAT!r}; "
-                "choose another folder"
+                f"{self.file}: its format is {', '.join(map(short, found)) or 'unknown'}, this version reads "
+                f"{FORMAT!r}; choose another folder"
             )
 
     def close(self) -> None:
@@ -138,14 +196,17 @@ class Store:
     def _transaction(self) -> Iterator[None]:
         """All or nothing; other processes wait."""
         # IMMEDIATE takes the lock for writing at once: a transaction that read first and wrote later could be refused.
-        self._connection.execute("BEGIN IMMEDIATE")
+        self._execute("BEGIN IMMEDIATE")
         try:
             yield
+            self._execute("COMMIT")
         # An interrupt too must not leave half a transaction.
         except BaseException:
-            self._connection.execute("ROLLBACK")
+            # After some errors, as of a full disk, SQLite has ended the transaction itself; and an error of going back
+            # must not hide the first one. What is not committed is gone with the connection in any case.
+            with contextlib.suppress(sqlite3.Error):
+                self._connection.rollback()
             raise
-        self._connection.execute("COMMIT")
 
     def agree(self, facts: Mapping[str, Any]) -> None:
         """Write down what the sweep is, or compare with what is written. More worlds than written make it longer.
@@ -154,23 +215,42 @@ class Store:
             StoreError: the store was begun with something else; the message names the entries.
         """
         with self._transaction():
-            written = self.facts()
-            for name, value in facts.items():
-                given = json_copy(value)
-                if name not in written or _is_longer(given, written[name]):
-                    self._connection.execute(
-                        "INSERT OR REPLACE INTO facts VALUES (?, ?)", (name, json.dumps(given, sort_keys=True))
-                    )
-                elif given != written[name]:
-                    raise StoreError(
-                        f"{self.file}: was begun with another {name}: {', '.join(differences(written[name], given))}. "
-                        "Give the sweep a folder of its own, or the specification that this one was begun with"
-                    )
+            for name, value in self._to_write(facts).items():
+                text = json.dumps(value, sort_keys=True)
+                self._execute("INSERT OR REPLACE INTO facts VALUES (?, ?, ?)", (name, text, _checksum(name, text)))
+
+    def compare(self, facts: Mapping[str, Any]) -> None:
+        """Raises StoreError as ``agree`` does, and writes nothing."""
+        self._to_write(facts)
+
+    def _to_write(self, facts: Mapping[str, Any]) -> dict[str, Any]:
+        """Those facts that are not written yet, or of which more worlds are asked for."""
+        written, missing = self.facts(), {}
+        for name, value in facts.items():
+            given = json_copy(value)
+            if name not in written or _is_longer(given, written[name]):
+                missing[name] = given
+            elif given != written[name]:
+                raise StoreError(
+                    f"{self.file}: was begun with another {name}: {', '.join(differences(written[name], given))}. "
+                    "Give the sweep a folder of its own, or the specification that this one was begun with"
+                )
+        return missing
 
     def facts(self) -> dict[str, Any]:
         """What ``agree`` wrote."""
-        rows = self._connection.execute("SELECT name, value FROM facts WHERE name <> 'format'").fetchall()
-        return {name: json.loads(value) for name, value in rows}
+        rows = self._execute("SELECT name, value, checksum FROM facts WHERE name <> 'format'")
+        for name, value, checksum in rows:
+            self._check(checksum, f"the fact {name!r}", name, value)
+        return {name: json.loads(value) for name, value, _ in rows}
+
+    def _check(self, checksum: Any, what: str, *values: Any) -> None:
+        """Raises StoreError where values are not those that were written."""
+        if checksum != _checksum(*values):
+            raise StoreError(
+                f"{self.file}: {one_line(what)} is damaged: its checksum is not that of its values; put back a copy of "
+                "the file, or begin the sweep again in another folder"
+            )
 
     def set_possible(self, environment: str, task: str, possible: Mapping[int, bool]) -> None:
         """Write down in which worlds a task is possible, and give up the claims on finding out.
@@ -183,17 +263,19 @@ class Store:
         with self._transaction():
             # Two processes find the same, so that the first answer may stay.
             for world, is_possible in possible.items():
-                self._connection.execute(
-                    "INSERT OR IGNORE INTO worlds VALUES (?, ?, ?, ?)", (environment, task, world, int(is_possible))
-                )
+                values = (environment, task, world, int(is_possible))
+                self._execute("INSERT OR IGNORE INTO worlds VALUES (?, ?, ?, ?, ?)", (*values, _checksum(*values)))
                 self._give_up(Item(environment, task, POSSIBLE, world))
 
     def possible(self, environment: str, task: str) -> dict[int, bool]:
         """In which worlds a task is possible, of those that were looked at, by number."""
-        rows = self._connection.execute(
-            "SELECT world, possible FROM worlds WHERE environment = ? AND task = ? ORDER BY world", (environment, task)
+        rows = self._execute(
+            "SELECT world, possible, checksum FROM worlds WHERE environment = ? AND task = ? ORDER BY world",
+            (environment, task),
         )
-        return {world: bool(possible) for world, possible in rows}
+        for world, possible, checksum in rows:
+            self._check(checksum, f"what is known of world {world}", environment, task, world, possible)
+        return {world: bool(possible) for world, possible, _ in rows}
 
     def claim(self, items: Sequence[Item], count: int) -> list[Item]:
         """Up to ``count`` of the items, in their order, that have no row and that no living process has claimed."""
@@ -201,10 +283,9 @@ class Store:
             # Lazily, up to as many as are wanted: each question reads the store, which may hold 10,000s of rows.
             free = list(itertools.islice(filter(self._is_free, items), count))
             now = time.time()
-            self._connection.executemany(
-                "INSERT OR REPLACE INTO claims VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-                [(*_key(item), socket.gethostname(), os.getpid(), process_start(os.getpid()), now) for item in free],
-            )
+            for item in free:
+                owner = (socket.gethostname(), os.getpid(), process_start(os.getpid()), now)
+                self._execute("INSERT OR REPLACE INTO claims VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (*_key(item), *owner))
         return free
 
     def finish(self, rows: Iterable[Row]) -> None:
@@ -212,33 +293,32 @@ class Store:
         with self._transaction():
             # Columns are in the order of the fields of `Row`, after those of `Item`.
             for row in rows:
-                values = {field.name: getattr(row, field.name) for field in dataclasses.fields(row)}
-                del values["item"]
-                values |= {"key": json.dumps(row.key), "versions": json.dumps(dict(row.versions), sort_keys=True)}
-                marks = ", ".join("?" * (4 + len(values)))
-                self._connection.execute(
-                    f"INSERT OR IGNORE INTO trials VALUES ({marks})", (*_key(row.item), *values.values())
-                )
+                values = [*_key(row.item), *_values(row)]
+                marks = ", ".join("?" * (len(values) + 1))
+                self._execute(f"INSERT OR IGNORE INTO trials VALUES ({marks})", (*values, _checksum(*values)))
                 self._give_up(row.item)
 
     def rows(self, environment: str | None = None, task: str | None = None) -> list[Row]:
         """Finished trials of an environment and task (None: of all), ordered by environment, task, policy, world."""
         # "commit" is a word of SQL, so that names of columns are quoted.
         names = ", ".join(f'"{field.name}"' for field in dataclasses.fields(Row) if field.name != "item")
-        found = self._connection.execute(
-            f"SELECT environment, task, policy, world, {names} FROM trials "
+        found = self._execute(
+            f"SELECT environment, task, policy, world, {names}, checksum FROM trials "
             "WHERE environment = coalesce(?, environment) AND task = coalesce(?, task) "
             "ORDER BY environment, task, policy, world",
             (environment, task),
         )
-        return [_row(entry) for entry in found]
+        for *values, checksum in found:
+            _, _, policy, world, *_ = values
+            self._check(checksum, f"the row of {policy} in world {world}", *values)
+        return [_row(entry[:-1]) for entry in found]
 
     def _give_up(self, item: Item) -> None:
-        self._connection.execute(f"DELETE FROM claims WHERE {_THE_ITEM}", _key(item))
+        self._execute(f"DELETE FROM claims WHERE {_THE_ITEM}", _key(item))
 
     def count(self) -> int:
         """Finished trials."""
-        return self._connection.execute("SELECT count(*) FROM trials").fetchone()[0]
+        return self._execute("SELECT count(*) FROM trials")[0][0]
 
     def _is_free(self, item: Item) -> bool:
         """Whether the item is neither finished nor claimed: looked up by itself, however large the store has grown."""
@@ -248,15 +328,55 @@ class Store:
         else:
             finished = f"SELECT 1 FROM trials WHERE {_THE_ITEM}"
             values = _key(item)
-        if self._connection.execute(finished, values).fetchone():
+        if self._execute(finished, values):
             return False
         claim = f"SELECT host, process, started, claimed FROM claims WHERE {_THE_ITEM}"
-        owner = self._connection.execute(claim, _key(item)).fetchone()
-        return owner is None or not _alive(*owner)
+        return not any(_alive(*owner) for owner in self._execute(claim, _key(item)))
 
 
 def _key(item: Item) -> tuple[str, str, str, int]:
-    return item.environment, item.task, item.policy, item.world
+    # Names of policies may be members of an enumeration, which are written otherwise than the texts that they equal.
+    return str(item.environment), str(item.task), str(item.policy), int(item.world)
+
+
+def _values(row: Row) -> list[Any]:
+    """The columns of a row after those of its item, in the order of the fields."""
+    # As SQLite gives them back: a column of real numbers makes 9.0 of 9, and numpy's numbers are Python's.
+    values = {
+        field.name: field.type(getattr(row, field.name)) if field.type in (int, float, str) else None
+        for field in dataclasses.fields(row)
+        if field.name != "item"
+    }
+    values |= {"key": json.dumps(row.key), "versions": json.dumps(dict(row.versions), sort_keys=True)}
+    return list(values.values())
+
+
+def _checksum(*values: Any) -> str:
+    """Sixteen hexadecimal digits of what is stored: one flipped bit gives others."""
+    # `repr` tells 1 from 1.0 and keeps every bit of a float, as SQLite does.
+    return hashlib.sha256(repr(values).encode("utf-8", "surrogatepass")).hexdigest()[:16]
+
+
+def _has_content(file: Path) -> bool:
+    try:
+        return file.stat().st_size > 0
+    except OSError:
+        return False
+
+
+def _explained(error: Exception) -> str:
+    """What went wrong and what to do, of an error of SQLite or the system."""
+    text = str(error)
+    why = f"({one_line(error)})"
+    if "full" in text or getattr(error, "errno", None) == errno.ENOSPC:
+        return f"the disk is full {why}: make room and give the same command again; finished trials are kept"
+    if "readonly" in text or getattr(error, "errno", None) == errno.EROFS:
+        return f"cannot be written {why}: copy the folder to where it can; `potlp sweep show` reads it here too"
+    if "locked" in text or "busy" in text:
+        return f"another process has been writing for more than {PATIENCE:g} s {why}: wait for it, or end it"
+    if (isinstance(error, sqlite3.OperationalError | OSError) and "I/O" in text) or "unable to open" in text:
+        return f"cannot be read or written {why}: look after the disk, its room and the rights to the folder"
+    return f"is damaged, or not a store of results {why}: put back a copy of it, or choose another folder"
 
 
 def _row(entry: tuple[Any, ...]) -> Row:
