@@ -191,8 +191,8 @@ def _estimator_trees(folder: Path) -> list[Tree]:
 
 
 def _read_estimator(folder: Path) -> Any:
-    params, config, metadata = load_estimator(folder / "estimator.npz")
-    return _summary((params, str(config), metadata))
+    params, config, domain, metadata = load_estimator(folder / "estimator.npz")
+    return _summary((params, str(config), str(domain), metadata))
 
 
 def _checkpoint_trees(folder: Path) -> list[Tree]:
