@@ -137,8 +137,7 @@ class EncodedMap:
 
 def map_channels(belief: BeliefMap, painting: Painting) -> Float32[Array, "H W K"]:
     """The picture of the building that the first stage reads; see the code for the order of its channels."""
-    bits = jnp.arange(len(belief.propositions), dtype=jnp.int32)
-    letters = (belief.letters[:, :, None] >> bits) & 1
+    letters = jnp.stack([(belief.letters >> bit) & 1 for bit in range(len(belief.propositions))], axis=-1)
     painted = jnp.isfinite(painting.distance)
     flags = (belief.free, belief.occupied, belief.unknown, frontier_cells(belief, belief.free), painted)
     colours = jnp.concatenate([painting.floor, painting.beyond], axis=-1).astype(jnp.float32)
