@@ -182,7 +182,7 @@ def test_trials_with_the_network_are_the_same_alone_and_in_a_batch(params):
             estimator=estimator,
         )
     )
-    alone = run_trial(world, task, Policy.POTLP, TRIAL, estimator=estimator, key=jax.random.key(0))
+    alone = run_trial(world, task, Policy.POTLP, jax.random.key(0), TRIAL, estimator=estimator)
     assert [trial.outcome for trial in trials] == [alone.outcome] * 3
     for trial in trials:
         np.testing.assert_array_equal(trial.path, np.asarray(alone.path))
