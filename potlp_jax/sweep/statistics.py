@@ -27,11 +27,8 @@ BASELINE = "baseline"
 KNOWN_MAP = "known-map"
 SATISFIED = "satisfied"
 
-LOSSES: Status = Status.SUBGOAL_OVERFLOW | Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW
-"""Status bits by which a fixed-size array or loop took something away from a trial; they are counted."""
-
-UNRELIABLE: Status = Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW
-"""Losses after which a trial is not what its planner would have done. It is never averaged in. (That only the nearest
+UNRELIABLE: Status = Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW | Status.VIEW_OVERFLOW | Status.INVALID
+"""Bits after which a trial is not what its planner would have done. It is never averaged in. (That only the nearest
 subgoals are kept is part of the model, docs/model.md section 6.)"""
 
 CONFIDENCE: float = 0.95
@@ -97,7 +94,7 @@ class Comparison:
 
     ``satisfied`` has the worlds in which every policy ended satisfied, without an ``UNRELIABLE`` bit;
     ``charged`` has all worlds, with a trial that did not end satisfied charged its budget. ``outcomes`` counts the
-    ends of trials per policy, ``losses`` the trials per policy and status bit of ``LOSSES``.
+    ends of trials per policy, ``losses`` the trials per policy and status bit.
     """
 
     worlds: int
@@ -315,5 +312,5 @@ def _count(names: Sequence[str]) -> dict[str, int]:
 
 
 def _count_losses(trials: Sequence[TrialResult]) -> dict[str, int]:
-    bits = [bit for trial in trials for bit in Status(trial.status & LOSSES)]
+    bits = [bit for trial in trials for bit in Status(trial.status)]
     return _count([str(bit.name).lower() for bit in bits])

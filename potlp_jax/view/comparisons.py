@@ -11,7 +11,8 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from potlp_jax.sweep.results import Pair
-from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, SATISFIED, Comparison, PolicyRow
+from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, SATISFIED, UNRELIABLE, Comparison, PolicyRow
+from potlp_jax.types import status_of
 from potlp_jax.view.style import FAINT, INK, PolicyStyle, new_figure, policy_styles
 
 FEW_WORLDS: int = 30
@@ -99,14 +100,17 @@ def remark_lines(comparison: Comparison) -> list[str]:
 
 
 def loss_lines(comparison: Comparison) -> list[str]:
-    """One line per policy whose trials lost something to the bounds of arrays or loops."""
+    """One line per policy whose trials have bits of ``Status``, and which of them are averaged in all the same."""
     return [
-        f"{policy}: "
-        + ", ".join(f"{count} trials with {name.replace('_', ' ')}" for name, count in counts.items())
-        + ", left out of costs and savings"
+        f"{policy}: {', '.join(_flagged(name, count) for name, count in counts.items())}"
         for policy, counts in comparison.losses.items()
         if counts
     ]
+
+
+def _flagged(name: str, count: int) -> str:
+    left_out = " (left out of costs and savings)" if status_of([name]) & UNRELIABLE else ""
+    return f"{count} trials with {name.replace('_', ' ')}{left_out}"
 
 
 def draw_scatter(pairs: Sequence[Pair], policies: Sequence[str], title: str) -> Figure:
