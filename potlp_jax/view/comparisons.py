@@ -93,24 +93,24 @@ def remark_lines(comparison: Comparison) -> list[str]:
         others = [f"{count} {name}" for name, count in counts.items() if name != SATISFIED]
         if others:
             lines.append(f"{policy}: {', '.join(others)}")
-    lines += loss_lines(comparison)
+    lines += flag_lines(comparison)
     if 0 < satisfied.pairs < FEW_WORLDS:
         lines.append(f"{satisfied.pairs} worlds are few: the interval says how far the share may be off.")
     return lines
 
 
-def loss_lines(comparison: Comparison) -> list[str]:
-    """One line per policy whose trials have bits of ``Status``, and which of them are averaged in all the same."""
+def flag_lines(comparison: Comparison) -> list[str]:
+    """One line per policy whose trials have status bits, and whether they count in costs and savings."""
     return [
-        f"{policy}: {', '.join(_flagged(name, count) for name, count in counts.items())}"
-        for policy, counts in comparison.losses.items()
+        f"{policy}: trials with " + ", ".join(_flag_words(name, count) for name, count in counts.items())
+        for policy, counts in comparison.flagged.items()
         if counts
     ]
 
 
-def _flagged(name: str, count: int) -> str:
+def _flag_words(name: str, count: int) -> str:
     left_out = " (left out of costs and savings)" if status_of([name]) & UNRELIABLE else ""
-    return f"{count} trials with {name.replace('_', ' ')}{left_out}"
+    return f"{name.replace('_', ' ')}: {count}{left_out}"
 
 
 def draw_scatter(pairs: Sequence[Pair], policies: Sequence[str], title: str) -> Figure:
