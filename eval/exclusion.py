@@ -29,7 +29,7 @@ MIDDLE = (0.3, 0.7)
 
 def pairs_of(estimator: Path, dataset: Path) -> Float64[np.ndarray, "pairs 5"]:
     """Distance in cells, and of both subgoals P_S as predicted and whether it succeeded, for every pair."""
-    params, config, _ = load_estimator(estimator)
+    params, config, _, _ = load_estimator(estimator)
     samples = read_dataset(dataset)
     logits = np.asarray(predict(EstimatorNetwork(config), params, samples).success_logit, float)
     chances, truth = 1.0 / (1.0 + np.exp(-logits)), np.asarray(samples.success, float)

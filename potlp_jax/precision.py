@@ -36,7 +36,7 @@ def in_32_bits(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, 
         if not _has_64_bits():
             return function(*args, **kwargs)
         with jax.enable_x64(False):
-            args, kwargs = jax.tree.map(_narrow, (args, kwargs))
+            args, kwargs = jax.tree.map(_narrow, (args, kwargs), is_leaf=_is_iterator)
             result = function(*args, **kwargs)
         return cast(_Result, _resumed_in_32_bits(result)) if isinstance(result, Generator) else result
 
@@ -52,6 +52,11 @@ def _resumed_in_32_bits(results: Generator[Any]) -> Iterator[Any]:
 
 def _has_64_bits() -> bool:
     return jnp.result_type(float) == jnp.float64
+
+
+def _is_iterator(value: Any) -> bool:
+    """Not looked into: jax will refuse iterators in a pytree."""
+    return isinstance(value, Iterator)
 
 
 def _narrow(leaf: Any) -> Any:

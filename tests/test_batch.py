@@ -8,7 +8,7 @@ import pytest
 
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
-from potlp_jax.errors import BatchError
+from potlp_jax.errors import BatchError, EstimatorError
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.policies import Policy
@@ -23,6 +23,7 @@ from potlp_jax.trials.record import Outcome
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import pad_world
 from potlp_jax.world.sensing import SensorConfig
+from tests.reference.domains import domain_of
 
 TOY = make("toy")
 TASKS = [Task.from_formula(text, propositions=TOY.propositions) for text in TOY.tasks.values()]
@@ -38,7 +39,9 @@ def _untrained():
         propositions=TOY.propositions, first_widths=(4,) * 4, second_widths=(4,) * 8, dense_widths=(8,) * 4, fovea=3
     )
     params = EstimatorNetwork(config).init(jax.random.key(0))
-    return TrainedEstimator(params=params, config=config, metadata={}, name="untrained", digest="")
+    return TrainedEstimator(
+        params=params, config=config, domain=domain_of("toy"), metadata={}, name="untrained", digest=""
+    )
 
 
 UNTRAINED = _untrained()
@@ -131,5 +134,5 @@ def test_what_does_not_fit_is_named():
         list(run_batch([first, large], Policy.BASELINE, CONFIG, slots=3))
     with pytest.raises(BatchError, match="slots is 0"):
         list(run_batch([first], Policy.BASELINE, CONFIG, slots=0))
-    with pytest.raises(BatchError, match="needs an estimator"):
+    with pytest.raises(EstimatorError, match="no estimator is shipped for the propositions goal"):
         list(run_batch([first], Policy.POTLP, CONFIG))

@@ -29,6 +29,7 @@ from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task
 from potlp_jax.world.frontiers import FrontierConfig
+from tests.reference.domains import domain_of
 
 QUICK = BestFirstConfig(simulations=12)
 
@@ -137,7 +138,9 @@ def test_phases_of_perception_and_decision(scene):
         propositions=Toy().propositions, first_widths=(4,) * 4, second_widths=(4,) * 8, dense_widths=(8,) * 4
     )
     params = EstimatorNetwork(config).init(jax.random.key(0))
-    trained = TrainedEstimator(params=params, config=config, metadata={}, name="tiny", digest="")
+    trained = TrainedEstimator(
+        params=params, config=config, domain=domain_of("rooms"), metadata={}, name="tiny", digest=""
+    )
     decision = DecisionConfig(frontiers=FrontierConfig(max_subgoals=2), search=QUICK)
     rows = measure_perception(scene, trained, decision, repeats=1)
     phases = [row.phase for row in rows]

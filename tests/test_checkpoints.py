@@ -13,6 +13,7 @@ from potlp_jax.learning import serialization as estimator_files
 from potlp_jax.learning.checkpoints import checkpoint_steps, load_checkpoint, save_checkpoint
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.learning.serialization import load_estimator, require_propositions, save_estimator
+from tests.reference.domains import domain_of
 
 CONFIG = NetworkConfig(
     propositions=("fire", "exit"),
@@ -22,6 +23,8 @@ CONFIG = NetworkConfig(
     dense_widths=(4, 4, 4, 4),
     success_cost_scale=12.5,
 )
+
+DOMAIN = domain_of("toy")
 IDENTITY = {"network": {"propositions": ["fire", "exit"]}, "versions": {"jax": "1"}}
 
 
@@ -116,10 +119,10 @@ def test_a_folder_that_is_no_checkpoint_is_refused(tmp_path):
 
 def test_an_estimator_comes_back_with_its_configuration(tmp_path, params):
     path = tmp_path / "deeper" / "estimator.npz"
-    save_estimator(path, params, CONFIG, {"figures": {"skill": 0.5}})
-    loaded, config, metadata = load_estimator(path)
+    save_estimator(path, params, CONFIG, DOMAIN, {"figures": {"skill": 0.5}})
+    loaded, config, domain, metadata = load_estimator(path)
     _assert_equal(loaded, params)
-    assert config == CONFIG
+    assert (config, domain) == (CONFIG, DOMAIN)
     assert metadata == {"figures": {"skill": 0.5}}
     assert [entry.name for entry in path.parent.iterdir()] == ["estimator.npz"]
 
@@ -130,7 +133,7 @@ def test_the_default_network_is_shipped_in_under_ten_megabytes(tmp_path):
     # Random bits: nothing in the format may depend on compression.
     random = np.random.default_rng(0)
     filled = jax.tree.map(lambda leaf: random.normal(size=leaf.shape).astype(np.float32), shapes)
-    save_estimator(tmp_path / "e.npz", filled, config, {})
+    save_estimator(tmp_path / "e.npz", filled, config, DOMAIN, {})
     assert (tmp_path / "e.npz").stat().st_size < 10_000_000
 
 
@@ -138,7 +141,7 @@ def test_estimators_that_are_not_whole_or_not_ours_are_refused(tmp_path, params)
     path = tmp_path / "e.npz"
     with pytest.raises(EstimatorError, match="there is no estimator"):
         load_estimator(path)
-    save_estimator(path, params, CONFIG, {})
+    save_estimator(path, params, CONFIG, DOMAIN, {})
     whole = path.read_bytes()
     flipped = bytearray(whole)
     flipped[len(whole) // 3] ^= 0x10
@@ -156,7 +159,7 @@ def test_parameters_that_are_no_numbers_are_refused_by_name(tmp_path, params, va
     """One of them reaches most estimates: every decision of a trial would be invalid."""
     leaves, structure = jax.tree.flatten(params)
     broken = jax.tree.unflatten(structure, [leaves[0].at[0].set(value), *leaves[1:]])
-    save_estimator(tmp_path / "e.npz", broken, CONFIG, {})
+    save_estimator(tmp_path / "e.npz", broken, CONFIG, DOMAIN, {})
     name = next(iter(estimator_files.named_leaves(broken)))
     with pytest.raises(EstimatorError, match=rf"e\.npz: the parameter {name} holds .* NaN or infinite"):
         load_estimator(tmp_path / "e.npz")
@@ -177,11 +180,11 @@ def test_a_checkpoint_with_parameters_that_are_no_numbers_is_refused(tmp_path, v
 def test_an_estimator_of_another_format_or_network_is_refused_by_name(tmp_path, params, monkeypatch):
     path = tmp_path / "e.npz"
     wider = dataclasses.replace(CONFIG, dense_widths=(4, 4, 4, 5))
-    save_estimator(path, params, wider, {})
+    save_estimator(path, params, wider, DOMAIN, {})
     with pytest.raises(EstimatorError, match=r"array\.second\.Dense_4\.bias was .*float32\[4\].*float32\[5\]"):
         load_estimator(path)
     monkeypatch.setattr(estimator_files, "ESTIMATOR_FORMAT", "potlp-estimator-99")
-    save_estimator(path, params, CONFIG, {})
+    save_estimator(path, params, CONFIG, DOMAIN, {})
     monkeypatch.undo()
     with pytest.raises(EstimatorError, match="'potlp-estimator-99'"):
         load_estimator(path)

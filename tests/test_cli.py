@@ -261,7 +261,7 @@ def test_the_search_is_chosen_by_name(tmp_path):
 def test_without_an_estimator_the_default_policy_is_the_baseline():
     result = _potlp("run", "toy", "-t", "2")
     assert result.exit_code == 0
-    assert "no estimator is shipped for toy" in result.stderr
+    assert "no estimator is shipped for the propositions goal, hazard: the policy is baseline" in result.stderr
     assert "baseline" in result.stdout
 
 
@@ -549,7 +549,7 @@ def test_quiet_and_verbose_govern_what_is_said_on_stderr(flag):
     if flag == "--quiet":
         assert result.stderr == ""
     else:
-        assert "no estimator is shipped for toy" in result.stderr
+        assert "no estimator is shipped for the propositions goal, hazard: the policy is baseline" in result.stderr
         assert "decision 0" in result.stderr
 
 

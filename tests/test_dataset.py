@@ -27,6 +27,7 @@ from potlp_jax.learning.dataset import (
 METADATA = DatasetMetadata(
     propositions=("fire", "exit", "alarm"),
     environment="somewhere",
+    family="somewhere",
     generator={"rooms": 2, "sizes": [3, 4]},
     split="training",
     camera={"height": 4},

@@ -36,6 +36,7 @@ from potlp_jax.world.grid import BeliefMap
 from potlp_jax.world.renderer import render
 from potlp_jax.world.sensing import SensorConfig, observe
 from tests.reference.dijkstra import product_distances
+from tests.reference.domains import domain_of
 
 TINY = {"first_widths": (4, 4, 4, 4), "second_widths": (4,) * 8, "dense_widths": (8, 8, 8, 8)}
 WITHIN = 16.0
@@ -53,7 +54,7 @@ def generator():
 def trained_file(generator, tmp_path_factory):
     config = NetworkConfig(propositions=generator.propositions, exclusive_within=WITHIN, fovea=4, **TINY)
     path = tmp_path_factory.mktemp("estimator") / "tiny.npz"
-    save_estimator(path, EstimatorNetwork(config).init(jax.random.key(3)), config, {})
+    save_estimator(path, EstimatorNetwork(config).init(jax.random.key(3)), config, domain_of("toy"), {})
     return path
 
 
@@ -184,12 +185,13 @@ def test_a_disturbed_camera_changes_what_is_estimated(world, task, trained, tria
 
 
 def test_which_estimator_is_used(trained, generator):
-    assert estimator_for(generator.propositions, trained) is trained
+    here = domain_of("toy")
+    assert estimator_for(generator.propositions, here, trained) is trained
     with pytest.raises(PropositionsError, match=r"task has the propositions \(other\), estimator"):
-        estimator_for(("other",), trained)
+        estimator_for(("other",), here, trained)
     with pytest.raises(EstimatorError, match="no estimator is shipped"):
-        estimator_for(("other",))
-    assert shipped_estimator(("other",)) is None
+        estimator_for(("other",), here)
+    assert shipped_estimator(("other",), here) is None
 
 
 ROWS, COLUMNS = 8, 64

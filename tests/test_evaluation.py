@@ -41,15 +41,17 @@ from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.learning.serialization import save_estimator
 from potlp_jax.view.calibration import draw_costs, draw_predictions, draw_reliability, probability_table
 from potlp_jax.view.style import CHOSEN, rgb
+from potlp_jax.world.camera import CameraConfig
 
 SHAPE = (64, 128)
 SIGMA = ("fire", "alarm", "exit")
 METADATA = DatasetMetadata(
     propositions=SIGMA,
     environment="synthetic",
+    family="synthetic",
     generator={},
     split="validation",
-    camera={"width": SHAPE[1]},
+    camera=dataclasses.asdict(CameraConfig(height=SHAPE[0], width=SHAPE[1])),
     disturbance={},
     encoding={"format": "png"},
     weights={"low": 1.0, "high": 50.0},
@@ -297,17 +299,19 @@ def test_the_prior_is_the_training_datas_where_it_is_known():
 
 def test_an_estimator_is_evaluated_on_data_of_its_own_kind_only():
     samples = make_samples(1, 5, 11)
-    learned = {"data": {"camera": dict(METADATA.camera), "unit": "cells"}}
+    learned = METADATA.domain
     check_fit(CONFIG, learned, samples, "net", "data")
-    check_fit(CONFIG, {}, samples, "net", "data")
+    check_fit(CONFIG, dataclasses.replace(learned, family="another"), samples, "net", "data")
     other = dataclasses.replace(CONFIG, propositions=("alarm", "fire", "exit"))
     with pytest.raises(PropositionsError, match=r"^data has .* net \(alarm, fire, exit\)"):
         check_fit(other, learned, samples, "net", "data")
     with pytest.raises(EvaluationError, match=r"\(64, 128\).*\(64, 192\)"):
         check_fit(dataclasses.replace(CONFIG, image_shape=(64, 192)), learned, samples, "net", "data")
-    for changed in ({"camera": {"width": 3}}, {"unit": "metres"}):
-        with pytest.raises(EvaluationError, match=next(iter(changed))):
-            check_fit(CONFIG, {"data": {**learned["data"], **changed}}, samples, "net", "data")
+    low = dataclasses.replace(learned, camera=dataclasses.replace(learned.camera, eye_height=0.3))
+    with pytest.raises(EvaluationError, match=r"data is not what net learned from: .* eye_height \(0.3, here 1.5\)"):
+        check_fit(CONFIG, low, samples, "net", "data")
+    with pytest.raises(EvaluationError, match="counts in metres"):
+        check_fit(CONFIG, dataclasses.replace(learned, unit="metres"), samples, "net", "data")
     with pytest.raises(EvaluationError, match="no panoramas"):
         check_fit(CONFIG, learned, dataclasses.replace(samples, images=[]), "net", "data")
 
@@ -390,7 +394,7 @@ def estimator(tmp_path_factory):
     figures = {"validation_brier": 0.125, "validation_success_rmse": math.nan}
     data = {"environment": "synthetic", "split": "training", "camera": {"width": SHAPE[1]}, "unit": "cells"}
     metadata = {"data": data, "prior": 0.25, "figures": figures, "steps": 1200, "best_step": 900, "panoramas": 77}
-    save_estimator(path, NETWORK.init(jax.random.key(2)), CONFIG, metadata)
+    save_estimator(path, NETWORK.init(jax.random.key(2)), CONFIG, METADATA.domain, metadata)
     return path
 
 
@@ -444,7 +448,7 @@ def test_evaluate_prints_tables_and_warns_of_worlds_it_was_trained_on(estimator,
     assert "trained on" not in result.stderr
     own = tmp_path / "own.npz"
     metadata = {"data": {"environment": "synthetic", "split": "validation"}}
-    save_estimator(own, NETWORK.init(jax.random.key(2)), CONFIG, metadata)
+    save_estimator(own, NETWORK.init(jax.random.key(2)), CONFIG, METADATA.domain, metadata)
     result = _potlp("evaluate", own, dataset[0])
     assert "trained on synthetic/validation" in result.stderr
     assert "the mean P_S of these samples" in result.stdout
@@ -465,7 +469,7 @@ def test_info_shows_what_the_file_says(estimator):
 @pytest.mark.parametrize(("fovea", "words"), [(0, "nothing"), (5, "11 columns × 48 rows")])
 def test_info_says_how_closely_a_subgoal_is_looked_at(tmp_path, fovea, words):
     config = dataclasses.replace(CONFIG, fovea=fovea)
-    save_estimator(tmp_path / "e.npz", EstimatorNetwork(config).init(jax.random.key(0)), config, {})
+    save_estimator(tmp_path / "e.npz", EstimatorNetwork(config).init(jax.random.key(0)), config, METADATA.domain, {})
     assert words in _potlp("info", tmp_path / "e.npz").stdout
 
 
@@ -473,7 +477,7 @@ def test_bad_input_is_one_clear_message(estimator, dataset, tmp_path, monkeypatc
     folder = dataset[0]
     other = tmp_path / "other.npz"
     config = dataclasses.replace(CONFIG, propositions=("goal",))
-    save_estimator(other, EstimatorNetwork(config).init(jax.random.key(0)), config, {})
+    save_estimator(other, EstimatorNetwork(config).init(jax.random.key(0)), config, METADATA.domain, {})
     broken = tmp_path / "broken.npz"
     broken.write_bytes(estimator.read_bytes()[:500])
     for arguments, part in (

@@ -29,6 +29,8 @@ from potlp_jax.world.grid import BeliefMap
 from potlp_jax.world.sensing import SensorConfig, observe
 from tests.reference.problems import random_fields
 
+pytestmark = pytest.mark.optimised
+
 pytest.importorskip("flatbuffers", reason="jax writes exported programs with flatbuffers")
 
 SUBGOALS = 2
@@ -171,8 +173,8 @@ def test_whole_decision_in_a_process_without_the_package(situation, exported, tm
     assert int(outputs["path_length"]) == length
     np.testing.assert_array_equal(outputs["path_cells"][: length + 1], move.path.cells[: length + 1])
     np.testing.assert_array_equal(outputs["path_states"][: length + 1], move.path.states[: length + 1])
-    np.testing.assert_allclose(outputs["value"], move.value, rtol=1e-6)
-    np.testing.assert_allclose(outputs["q_values"], plan.q_values, rtol=1e-6)
+    np.testing.assert_array_equal(outputs["value"], move.value)
+    np.testing.assert_array_equal(outputs["q_values"], plan.q_values)
 
 
 def test_exported_subgoals_are_the_librarys(situation, exported):

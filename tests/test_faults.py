@@ -26,9 +26,10 @@ from eval.faults import (
     texts,
 )
 from eval.faults.mutations import damaged, damaged_text
-from eval.faults.page import page, write_page
-from eval.faults.tally import TALLY, Row, Tally, open_tally, table
+from eval.faults.page import PAGE, page, write_page
+from eval.faults.tally import TALLY, Row, Tally, open_tally, read_tally, table
 from eval.faults.worker import Ending, _Clock, judged
+from eval.provenance import RESULTS
 from potlp_jax.codec import read_settings, settings_from_words
 from potlp_jax.environments.campus.floor_plan_xml import read_plan
 from potlp_jax.environments.ros.map_files import load_map, load_settings, parse_number
@@ -527,12 +528,20 @@ def test_the_page_has_the_counts_of_all_parts_that_were_run(tmp_path):
         (counts / part).mkdir(parents=True)
         Tally(1, made, rows).write(counts / part / TALLY)
     text = write_page(counts, results).read_text()
-    assert "| files | 6 | 0 | 4 | 0 | 2 | 0 | 0 |" in text
+    assert "- 6 files: 0 fine, 4 clear errors, 0 tracebacks, 2 hangs, 0 wrong answers, 0 lost rows\n" in text
     assert text.count("Cases that ended badly, by number (seed 1): a: 2.") == 2
     assert text.count("command: `python -m eval.faults x`; commit: `c0ffee0`; versions: jax 1.") == 2
     assert "## Formulas" not in text
     # The counts beside the page are all that it needs.
     assert page(results) == text
+
+
+def test_the_page_has_the_tables_of_its_counts():
+    text = (RESULTS / PAGE).read_text("utf-8")
+    counted = sorted((RESULTS / "faults").glob("*.json"))
+    assert counted
+    for file in counted:
+        assert table(read_tally(file)) in text, f"{file.name}: python -m eval.faults page writes the page"
 
 
 def test_words_of_the_command_line_end_well(tmp_path):

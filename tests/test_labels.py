@@ -14,6 +14,8 @@ from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy, make_world
 from tests.reference.labels import true_label
 
+pytestmark = pytest.mark.optimised
+
 FORMULAS = ("F a", "!b U a", "F a & F b", "F(a | b)", "F(a & X b)", "!b U (a & F b)")
 SIZES = TaskSizes(states=6, propositions=2, edges=12, classes=12, compound=2, cubes=3)
 SHAPE = (10, 13)

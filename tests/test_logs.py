@@ -362,7 +362,7 @@ def test_a_trial_is_written_replayed_and_viewed(trial, tmp_path):
     labels, out = tmp_path / "drive.labels.yaml", tmp_path / "replay"
     result = _potlp("log", "replay", tmp_path / "drive", "--labels", labels, "--task", "!hazard U goal", "--out", out)
     assert result.exit_code == 0, result.output
-    assert "no estimator is shipped for goal, hazard: the policy is baseline" in result.stderr
+    assert "no estimator is shipped for logs: the policy is baseline" in result.stderr
     found = load_trial(out / "trial.json")
     assert found.environment == "log:drive"
     assert [decision.target for decision in found.decisions] == [decision.target for decision in trial.decisions]

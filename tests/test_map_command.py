@@ -16,14 +16,14 @@ from typer.testing import CliRunner
 
 from potlp_jax.cli import app
 from potlp_jax.environments.registry import make
-from potlp_jax.environments.ros.cleaning import clean_map
+from potlp_jax.environments.ros.cleaning import Cause, clean_map
 from potlp_jax.environments.ros.map_files import load_map
 from potlp_jax.environments.ros.map_writer import save_map
 from potlp_jax.environments.ros.places import Disc, Places, Polygon, load_places, save_places
 from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig
 from potlp_jax.environments.ros.survey import find_passages, survey_map
 from potlp_jax.errors import MapError, MapWarning
-from potlp_jax.view.map_preview import OBSTACLE, REACHED, UNREACHED, draw_map, draw_places
+from potlp_jax.view.map_preview import CUT_OFF, OBSTACLE, REACHED, draw_map, draw_places
 from potlp_jax.view.style import area_colour, rgb
 from tests.reference.map_files import TWO_ROOMS, occupancy_map, p5, write_map
 
@@ -93,12 +93,14 @@ def test_inspect_finds_the_doors_and_the_room_that_is_cut_off(office):
     (part,) = found["cut_off"]
     assert part["at"] == pytest.approx(metres(49.5, 201.5), abs=0.25)
     assert 8 < part["area"] < 12
+    assert part["cause"] == "cells"
     assert any(f"{part['area']:.1f} m2" in defect for defect in found["defects"])
     smaller = as_json("map", "inspect", office, "--resolution", "0.05", "--radius", "0.1")
     assert smaller["cut_off"] == []
     assert all(passage["is_open"] for passage in smaller["passages"])
     # Through neither door fits a robot of this radius: rooms are out of reach, but not because of the cells.
-    assert as_json("map", "inspect", office, "--radius", "0.4")["cut_off"] == []
+    wide_robot = as_json("map", "inspect", office, "--radius", "0.4")["cut_off"]
+    assert [part["cause"] for part in wide_robot] == ["radius", "radius"]
     other = as_json("map", "inspect", office, "--start", "{:g},{:g}".format(*metres(50, 200)))
     assert other["reachable_cells"] * 0.04 < 12
     assert other["cut_off"][0]["area"] > 20
@@ -156,7 +158,9 @@ def test_narrowings_between_small_parts_are_no_passages(office):
 
 def test_a_world_on_a_map_with_a_part_cut_off_warns(office, tmp_path):
     places = Places((("a", (Disc(metres(50, 50), 0.5),)),))
-    with pytest.warns(MapWarning, match=r"cells of 0\.2 m close passages .* cut off \d+ m2 at \[9\.\d+, 4\.\d+\]; use"):
+    with pytest.warns(
+        MapWarning, match=r"cells of 0\.2 m close passages .* cut off [\d.]+ m2 at \[9\.\d+, 4\.\d+\]; use"
+    ):
         RosMap(RosMapConfig(office, places))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -165,6 +169,27 @@ def test_a_world_on_a_map_with_a_part_cut_off_warns(office, tmp_path):
     drawn = potlp("map", "preview", office, "--out", tmp_path / "office.png")
     assert drawn.exit_code == 0
     assert " ".join(drawn.stderr.split()).startswith(f"{office}: resolution: cells of 0.2 m close passages")
+
+
+def test_a_part_that_nothing_joins_on_the_map_is_named_and_painted(tmp_path):
+    """Half of the building: the door between the second room and the third is walled up."""
+    pixels = building()
+    pixels[60:66, 171] = 0
+    file = write_map(tmp_path, p5(pixels), name="office", origin=f"[{ORIGIN[0]}, {ORIGIN[1]}, 0]")
+    found = as_json("map", "inspect", file)
+    (part,) = found["cut_off"]
+    assert part["cause"] == "map"
+    assert part["area"] == pytest.approx(found["free_area"]["resampled"] - found["free_area"]["reachable"])
+    assert any("not connected with the rest on the map itself" in defect for defect in found["defects"])
+    with pytest.warns(MapWarning, match=rf"no free space joins {part['area']:.1f} m2 at .* with the rest"):
+        RosMap(RosMapConfig(file, Places((("a", (Disc(metres(50, 50), 0.5),)),))))
+    assert potlp("map", "preview", file, "--out", tmp_path / "office.png").exit_code == 0
+    with Image.open(tmp_path / "office.png") as image:
+        colours = {colour: count for count, colour in image.convert("RGB").getcolors(1 << 20)}
+    # As pink as the other rooms are blue.
+    share = part["area"] / found["free_area"]["resampled"]
+    pink, blue = colours[rgb(CUT_OFF)], colours[rgb(REACHED)]
+    assert pink / (pink + blue) == pytest.approx(share, abs=0.03)
 
 
 # Clean.
@@ -350,7 +375,7 @@ def test_everything_is_drawn_where_it_is(tmp_path, yaw):
         family = RosMap(RosMapConfig(file, places))
     figure = draw_places(family, family.generate(jax.random.key(0)), "a map")
     there = {(50, 60): area_colour(0), (50, 150): area_colour(1), (15, 85): REACHED, (20, 90): OBSTACLE}
-    there[20, 220] = UNREACHED
+    there[20, 220] = CUT_OFF
     shown = colours_at(figure, [frame.cell_to_metres(*pixel) for pixel in there])
     assert shown == [rgb(colour) for colour in there.values()]
     axes = figure.axes[0]
@@ -382,7 +407,7 @@ def test_preview_writes_pictures(office, tmp_path):
     def words(file):
         return ["".join(node.itertext()) for node in ElementTree.parse(file).iter("{http://www.w3.org/2000/svg}text")]
 
-    for part in ("x (m)", "y (m)", "2 m", "reachable", "cut off by the cells"):
+    for part in ("x (m)", "y (m)", "2 m", "reachable", "cut off, 10 m² in all"):
         assert part in words(tmp_path / "plain.svg")
     assert "kitchen" in words(tmp_path / "labelled.svg")
     assert "kitchen" not in words(tmp_path / "plain.svg")
@@ -443,8 +468,8 @@ def test_real_maps_go_all_the_way(external_data, tmp_path, name):
 
 def test_what_the_cells_cut_off_on_a_large_map(external_data):
     image_map = load_map(external_data / "maps/gdc_floor2.yaml")
-    assert clean_map(image_map, 0.2, 0.1).cut_off == ()
-    coarse = clean_map(image_map, 0.4, 0.1).cut_off
+    assert not [part for part in clean_map(image_map, 0.2, 0.1).cut_off if part.cause is Cause.CELLS]
+    coarse = [part for part in clean_map(image_map, 0.4, 0.1).cut_off if part.cause is Cause.CELLS]
     # The room in the south-east and the loop of corridors behind it.
     assert coarse[0].area > 50
     assert 5 < coarse[0].at[0] < 26

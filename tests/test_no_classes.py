@@ -25,6 +25,7 @@ from potlp_jax.trials.replay import replay_decision
 from potlp_jax.view.replay_page import replay_page
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.sensing import SensorConfig
+from tests.reference.domains import domain_of
 
 TOY = Toy(ToyConfig(door_row=4, start=(4, 2), goal=(2, 12), hazard=(6, 9)))
 GOAL = 1 << TOY.propositions.index("goal")
@@ -59,7 +60,9 @@ def _network():
         propositions=TOY.propositions, first_widths=(4,) * 4, second_widths=(4,) * 8, dense_widths=(8,) * 4
     )
     params = EstimatorNetwork(config).init(jax.random.key(0))
-    return TrainedEstimator(params=params, config=config, metadata={}, name="untrained", digest="")
+    return TrainedEstimator(
+        params=params, config=config, domain=domain_of("toy"), metadata={}, name="untrained", digest=""
+    )
 
 
 NETWORK = _network()

@@ -34,6 +34,7 @@ from potlp_jax.trials.run import run
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy, make_world
 from potlp_jax.world.sensing import SensorConfig, observe
+from tests.reference.domains import domain_of
 
 TOY = Toy()
 WORLD = TOY.world(0)
@@ -64,7 +65,7 @@ def _trained(propositions):
         propositions=propositions, first_widths=(4,) * 4, second_widths=(4,) * 8, dense_widths=(8,) * 4
     )
     params = EstimatorNetwork(config).init(KEY)
-    return TrainedEstimator(params=params, config=config, metadata={}, name="other", digest="")
+    return TrainedEstimator(params=params, config=config, domain=domain_of("toy"), metadata={}, name="other", digest="")
 
 
 def _batch(task, **others):
@@ -90,7 +91,7 @@ ENTRIES = {
     "collection": lambda task: Explorer(WORLD, [task], np.random.default_rng(0)),
     "stack_tasks": lambda task: stack_tasks([RIGHT, task]),
     "questions": lambda task: question_sheet((*questions_of(RIGHT), *questions_of(task)), 8, 4),
-    "estimator of a task": lambda task: estimator_for(task.propositions, _trained(TOY.propositions)),
+    "estimator of a task": lambda task: estimator_for(task.propositions, domain_of("toy"), _trained(TOY.propositions)),
     "network under a decision": lambda task: _trained(TOY.propositions).start(*WORLD.shape, 2)(
         dataclasses.replace(BELIEF, propositions=task.propositions), SUBGOALS, task.arrays
     ),

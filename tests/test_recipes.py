@@ -14,6 +14,7 @@ from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
 from potlp_jax.errors import ConfigurationError
 from potlp_jax.learning.dataset import read_metadata
+from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import shipped_estimator
 from potlp_jax.learning.serialization import load_estimator
 from potlp_jax.recipes.fitting import ESTIMATOR
@@ -50,7 +51,8 @@ def test_every_shipped_estimator_has_its_recipe():
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_shipped_recipe_is_what_made_the_shipped_file(name):
     recipe = read_recipe(name)
-    estimator = shipped_estimator(make(recipe.environment).propositions)
+    world = make(recipe.environment).world(0, Split.TRAINING)
+    estimator = shipped_estimator(world.propositions, Domain.of_world(world, recipe.collect.camera))
     assert estimator is not None
     made, data = estimator.metadata["training"], estimator.metadata["data"]
     options = json_copy(dataclasses.asdict(recipe.fit.training))
@@ -83,12 +85,13 @@ def test_a_small_recipe_makes_an_estimator_and_continues(tmp_path):
     )
     assert told == [(Split.TRAINING, 0), (Split.TRAINING, 2), (Split.TRAINING, 4), ("validation", 0), ("validation", 2)]
     assert any(line.startswith("epoch   1.0") for line in lines)
-    params, config, metadata = load_estimator(tmp_path / "out" / ESTIMATOR)
+    params, config, domain, metadata = load_estimator(tmp_path / "out" / ESTIMATOR)
     for found, expected in zip(jax.tree.leaves(params), jax.tree.leaves(trained.params), strict=True):
         np.testing.assert_array_equal(found, expected)
     assert config.propositions == make("toy").propositions
     assert config.second_widths == recipe.fit.second_widths
     assert metadata["training"]["seed"] == 3
+    assert domain == Domain.of_world(make("toy").world(0), recipe.collect.camera)
     assert read_metadata(tmp_path / "out" / "validation").split == "validation"
     again = follow(recipe, tmp_path / "out", display=Display(say=lines.append))
     assert lines[-1].startswith("resumed at step")
@@ -108,7 +111,7 @@ def test_the_commands_collect_and_fit_by_a_recipe(tmp_path):
     told = _potlp("fit", "--recipe", tmp_path / "small.yaml", "--out", tmp_path / "out", "--fovea", 2)
     assert told.exit_code == 0, told.stderr
     assert "ended by planned" in told.stdout
-    _, config, metadata = load_estimator(tmp_path / "out" / ESTIMATOR)
+    _, config, _, metadata = load_estimator(tmp_path / "out" / ESTIMATOR)
     assert config.fovea == 2
     assert metadata["training"]["seed"] == SMALL["fit"]["training"]["seed"]
     assert (tmp_path / "out" / "curves.png").stat().st_size > 1000

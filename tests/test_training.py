@@ -31,6 +31,7 @@ from potlp_jax.learning.training import (
     make_train_step,
     train,
 )
+from potlp_jax.world.camera import CameraConfig
 
 SHAPE = (64, 128)
 ROOT = Path(__file__).parents[1]
@@ -43,9 +44,10 @@ TINY = {"first_widths": (2, 2, 2, 3), "second_widths": (3,) * 8, "dense_widths":
 METADATA = DatasetMetadata(
     propositions=("red", "green"),
     environment="synthetic",
+    family="synthetic",
     generator={},
     split="training",
-    camera={},
+    camera=dataclasses.asdict(CameraConfig()),
     disturbance={},
     encoding={"format": "png"},
     weights={"low": 1.0, "high": 50.0},
@@ -413,8 +415,9 @@ def test_the_command_writes_an_estimator_and_resumes(tmp_path):
         assert done.returncode == 0, done.stderr
         assert expected in done.stderr
         assert "ended by planned" in done.stdout
-    params, config, metadata = load_estimator(tmp_path / "out" / "estimator.npz")
+    params, config, domain, metadata = load_estimator(tmp_path / "out" / "estimator.npz")
     assert config.propositions == ("red", "green")
+    assert domain == METADATA.domain
     assert (config.fovea, config.horizon, config.second_widths) == (3, 24.0, (3, 4, 5, 6, 7, 8, 9, 9))
     assert metadata["figures"]["step"] == metadata["best_step"]
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(params))

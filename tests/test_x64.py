@@ -81,9 +81,8 @@ def narrow(function, *arguments):
         # The batching rule of the search is called where the library's own functions have returned.
         (BestFirstConfig(simulations=20), lambda function: jax.vmap(jax.jit(function))),
         (UctConfig(simulations=20), lambda function: jax.vmap(jax.jit(function))),
-        (BestFirstConfig(simulations=20), lambda function: lambda rows: jax.lax.map(function, rows)),
     ],
-    ids=["jit of vmap", "vmap of jit", "vmap of jit, PO-UCT", "map"],
+    ids=["jit of vmap", "vmap of jit", "vmap of jit, PO-UCT"],
 )
 def test_a_plan_within_a_program_of_64_bits(config, transformed):
     # `plan` is wrapped anew, so that no program of the other kind is found.

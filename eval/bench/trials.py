@@ -15,7 +15,6 @@ import jax
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
-from potlp_jax.learning.estimator import shipped_estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
 from potlp_jax.trials.batch import Start, run_batch
@@ -41,10 +40,9 @@ def starts(worlds: int) -> list[Start]:
 
 def seconds_in_batch(trials: Sequence[Start], policy: Policy, slots: int) -> tuple[float, int]:
     """Wall time of all trials, and the decisions taken."""
-    estimator = shipped_estimator(make(ENVIRONMENT).propositions)
-    list(run_batch(trials[:1], policy, slots=slots, estimator=estimator))
+    list(run_batch(trials[:1], policy, slots=slots))
     began = time.perf_counter()
-    finished = list(run_batch(trials, policy, slots=slots, estimator=estimator))
+    finished = list(run_batch(trials, policy, slots=slots))
     return time.perf_counter() - began, sum(trial.decisions for trial in finished)
 
 

@@ -121,11 +121,9 @@ def _head(tallies: Mapping[str, Tally]) -> Iterator[str]:
 
 def _totals(tallies: Mapping[str, Tally]) -> Iterator[str]:
     """All cases by what they are, whatever part they are of."""
-    yield "| " + " | ".join(["", "cases", *Verdict]) + " |"
-    yield "|---|" + "---:|" * (1 + len(Verdict))
     for unit in sorted({unit for tally in tallies.values() for unit in tally.sums()}):
         row = summed([tally.sums()[unit] for tally in tallies.values() if unit in tally.sums()], unit)
-        yield "| " + " | ".join([unit, f"{row.cases:,}", *(f"{row.counts[verdict]:,}" for verdict in Verdict)]) + " |"
+        yield f"- {row.cases:,} {unit}: {', '.join(f'{row.counts[verdict]:,} {verdict}' for verdict in Verdict)}"
 
 
 def _section(name: str, tally: Tally) -> Iterator[str]:

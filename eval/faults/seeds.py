@@ -194,14 +194,17 @@ def make_record(folder: Path) -> None:
 
 def make_estimator(folder: Path) -> None:
     """An estimator that was never trained, of a small network."""
+    from potlp_jax.learning.domain import Domain
     from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
     from potlp_jax.learning.serialization import save_estimator
+    from potlp_jax.world.camera import CameraConfig
 
     config = NetworkConfig(("fire", "extinguisher"), (64, 64), (1,) * 4, (1,) * 8, (1,) * 4)
     # Zeros of the right shapes: initialising compiles for seconds.
     like = jax.eval_shape(EstimatorNetwork(config).init, jax.random.key(0))
     params = jax.tree.map(lambda leaf: jnp.full(leaf.shape, 0.5, leaf.dtype), like)
-    save_estimator(folder / "estimator.npz", params, config, {"made": "for damage"})
+    domain = Domain.of_cells("firefighting", CameraConfig(), 1.0)
+    save_estimator(folder / "estimator.npz", params, config, domain, {"made": "for damage"})
 
 
 CHECKPOINT_IDENTITY = {"training": {"seed": 1}}
@@ -225,7 +228,7 @@ def make_dataset(folder: Path) -> None:
 
     random = np.random.default_rng(0)
     metadata = DatasetMetadata(
-        ("fire", "extinguisher"), "toy", {}, "training", {}, {}, {}, {"low": 1.0, "high": 2.0}, {}, {}
+        ("fire", "extinguisher"), "toy", "toy", {}, "training", {}, {}, {}, {"low": 1.0, "high": 2.0}, {}, {}
     )
     for shard in range(2):
         images = [encode(random.integers(0, 255, (16, 32, 3)).astype(np.uint8)) for _ in range(3)]
@@ -254,6 +257,21 @@ def make_export(folder: Path) -> None:
     from potlp_jax.task.task import Task
 
     export_planner(Task.from_formula("!fire U extinguisher & F fire", ("fire", "extinguisher")), folder, ExportConfig())
+
+
+def make_store(folder: Path) -> None:
+    """The store of a finished sweep."""
+    from potlp_jax.sweep.runner import RESULTS
+    from potlp_jax.sweep.store import Item, Row, Store
+
+    store = Store(folder / RESULTS)
+    store.agree({"specification": {"worlds": 40}})
+    for policy in ("known-map", "baseline"):
+        items = [Item("toy", "F goal", policy, world) for world in range(40)]
+        rest = (100.0, 30, 2, 0, 0, (0, 7), "2,3:70", "abc", {"jax": "1"}, "", 0.5, "0123456789abcdef")
+        store.finish([Row(item, "satisfied", item.world / 7, *rest) for item in items])
+    store.set_possible("toy", "F goal", dict.fromkeys(range(40), True))
+    store.close()
 
 
 def make_plan(folder: Path) -> None:

@@ -68,8 +68,10 @@ def run_bench(
     from potlp_jax.bench.timing import environment as describe_environment
     from potlp_jax.cli.inputs import setting_changes, trial_config
     from potlp_jax.environments.registry import make
+    from potlp_jax.learning.domain import Domain
     from potlp_jax.learning.estimator import estimator_for
     from potlp_jax.planning.search.config import BestFirstConfig
+    from potlp_jax.world.camera import CameraConfig
 
     chosen = _read_parts(parts)
     # All words are read before anything is measured: measuring takes minutes.
@@ -89,9 +91,11 @@ def run_bench(
         if set(chosen) - {"search"}:
             progress.update(bar, description="exploring a world")
             asked = make(environment).task(task)
-            # First of all, so that a missing estimator is reported before anything long.
-            trained = estimator_for(asked.propositions) if "perception" in chosen else None
-            scene = make_scene(make_world(environment, size, world), asked)
+            made = make_world(environment, size, world)
+            here = Domain.of_world(made, CameraConfig())
+            # Before the world is explored, so that a missing estimator is reported before anything long.
+            trained = estimator_for(asked.propositions, here) if "perception" in chosen else None
+            scene = make_scene(made, asked)
             progress.update(bar, description="compiling and measuring")
             rows |= _measure_scene(
                 scene, parts=chosen, trained=trained, decision=decision, sources=sources, repeats=repeats

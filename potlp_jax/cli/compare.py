@@ -2,6 +2,7 @@
 
 import csv
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,6 +25,8 @@ from potlp_jax.cli.output import console, fail, file_console, make_folder, print
 from potlp_jax.cli.sweep import print_cell, run_reported
 
 if TYPE_CHECKING:
+    from potlp_jax.environments.base import Generator
+    from potlp_jax.environments.splits import Split
     from potlp_jax.sweep.results import CellResults, Results
     from potlp_jax.sweep.specification import Specification
 
@@ -75,7 +78,7 @@ def compare_policies(
     json: Json = False,
 ) -> None:
     """Compare policies in the same worlds, with the share of attainable savings and its uncertainty."""
-    from potlp_jax.cli.inputs import default_policy, read_names, read_split, setting_changes
+    from potlp_jax.cli.inputs import read_names, read_split, setting_changes
     from potlp_jax.environments.registry import make
     from potlp_jax.sweep.specification import specification_from_dict
 
@@ -83,15 +86,17 @@ def compare_policies(
     if picture is not None and out is None:
         fail("--picture needs --out, the folder in which the picture is written")
     generator = make(environment)
+    chosen_split = read_split(split, generator)
+    changes = setting_changes(simulations=simulations, search=search, camera=camera)
     # The same entries as in a sweep's file, checked by the same code.
     entries: dict[str, Any] = {
         "environments": [environment],
         "tasks": [task],
-        "policies": read_names(policies) or [default_policy(generator).value],
+        "policies": read_names(policies) or [_default_policy(generator, chosen_split, world, changes, estimator)],
         "worlds": trials,
-        "split": read_split(split, generator).value,
+        "split": chosen_split.value,
         "first_world": world,
-        "settings": setting_changes(simulations=simulations, search=search, camera=camera),
+        "settings": changes,
     }
     if estimator is not None:
         entries["estimator"] = estimator
@@ -115,6 +120,15 @@ def compare_policies(
     if out is not None:
         console().print(f"wrote {', '.join(file.name for file in files)} in {out}")
         console().print(f"next: potlp report {out}", style="dim")
+
+
+def _default_policy(
+    generator: "Generator", split: "Split", world: int, changes: Mapping[str, Any], estimator: str | None
+) -> str:
+    from potlp_jax.cli.inputs import default_policy, make_world, read_estimator, trial_config
+
+    made = make_world(generator, split, world)
+    return default_policy(made, trial_config(changes, generator), read_estimator(estimator)).value
 
 
 def _run(specification: "Specification", folder: Path, processes: int) -> "Results":

@@ -72,10 +72,10 @@ def evaluate_estimator(
 
     # Before the file is read and the network compiled, like every check of words.
     variants = _read_variants(ablate)
-    params, config, metadata = load_estimator(estimator)
+    params, config, domain, metadata = load_estimator(estimator)
     samples = read_dataset(dataset)
     # An estimator asked about propositions that it does not know would answer without meaning.
-    check_fit(config, metadata, samples, str(estimator), str(dataset))
+    check_fit(config, domain, samples, str(estimator), str(dataset))
     _warn(metadata, samples)
     folder = None if out is None else make_folder(out)
     predictions = _predict(EstimatorNetwork(config), params, samples, variants)
@@ -205,7 +205,7 @@ def show_estimator(estimator: EstimatorArgument, json: Json = False) -> None:
     from potlp_jax.learning.network import operation_counts, parameter_count
     from potlp_jax.learning.serialization import load_estimator
 
-    params, config, metadata = load_estimator(estimator)
+    params, config, domain, metadata = load_estimator(estimator)
     # The network runs in two parts: once for a panorama, then once for each subgoal and outcome class.
     per_panorama, per_answer = operation_counts(config)
     description = {
@@ -215,6 +215,7 @@ def show_estimator(estimator: EstimatorArgument, json: Json = False) -> None:
         "operations_per_panorama": per_panorama,
         "operations_per_answer": per_answer,
         "network": dataclasses.asdict(config),
+        "domain": dataclasses.asdict(domain),
         "metadata": metadata,
     }
     if json:
@@ -242,10 +243,11 @@ def _fovea(reach: int) -> str:
 def _rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     """Names and values for people; what the file does not say is left out."""
     # Estimators of others may lack any entry of the metadata; those of the network are always there.
-    network, metadata = description["network"], description["metadata"]
+    network, domain, metadata = (description[name] for name in ("network", "domain", "metadata"))
     data = metadata.get("data", {})
     rows = [
         ("propositions", ", ".join(network["propositions"])),
+        ("serves", f"worlds of {domain['family'] or 'no named family'}, costs in {domain['unit']}"),
         ("panorama", " × ".join(map(str, network["image_shape"])) + " pixels"),
         ("fovea", _fovea(network["fovea"])),
         ("file", f"{description['bytes'] / 1e6:.2f} MB, {description['parameters']:,} parameters"),
@@ -258,7 +260,7 @@ def _rows(description: dict[str, Any]) -> list[tuple[str, str]]:
         ("fully connected", f"{_list(network['dense_widths'])} units"),
     ]
     if data:
-        rows.append(("trained on", f"{data.get('environment')}/{data.get('split')}, costs in {data.get('unit')}"))
+        rows.append(("trained on", f"{data.get('environment')}/{data.get('split')}"))
     if "panoramas" in metadata:
         rows.append(("", f"{metadata['panoramas']:,} panoramas, {metadata.get('samples', 0):,} samples"))
     if "steps" in metadata:

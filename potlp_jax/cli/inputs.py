@@ -14,7 +14,8 @@ from potlp_jax.cli.output import fail
 from potlp_jax.codec import with_settings
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split, default_split, world_key
-from potlp_jax.learning.estimator import TrainedEstimator, named_estimator
+from potlp_jax.learning.domain import Domain
+from potlp_jax.learning.estimator import TrainedEstimator, named_estimator, why_none_is_shipped
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.runner import RESULTS
@@ -40,13 +41,12 @@ def record_file(trial: Path) -> Path:
     return trial / RECORD if trial.is_dir() else trial
 
 
-def default_policy(generator: Generator) -> Policy:
-    """PO-TLP where an estimator is shipped for the environment's propositions, otherwise the baseline, with a note."""
-    policy = run.default_policy(generator.propositions)
+def default_policy(world: World, config: TrialConfig, given: TrainedEstimator | Estimator | None = None) -> Policy:
+    """PO-TLP where an estimator is given or shipped for such worlds, otherwise the baseline, with a note."""
+    policy = run.default_policy(world, config, given)
     if policy is not Policy.POTLP:
-        logger.warning(
-            f"no estimator is shipped for {generator.name}: the policy is {policy}; choose another with --policy"
-        )
+        reason = why_none_is_shipped(world.propositions, Domain.of_world(world, config.camera))
+        logger.warning(f"{reason}: the policy is {policy}; choose another with --policy, or an --estimator")
     return policy
 
 

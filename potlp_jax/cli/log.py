@@ -219,7 +219,7 @@ def replay_log(
         typer.Option(
             "--policy",
             "-p",
-            help="potlp (the default where an estimator knows the propositions), baseline, optimistic or oracle.",
+            help="potlp (the default with --estimator), baseline, optimistic or oracle.",
             show_default=False,
             autocompletion=complete_policy,
         ),
@@ -390,12 +390,12 @@ def _read_drive(bag: Path, labels: Path, log: "LogConfig", grid: "GridConfig") -
 
 
 def _default_policy(drive: "Drive", trained: "TrainedEstimator | Estimator | None") -> "Policy":
-    """PO-TLP where an estimator knows the propositions and there are pictures, otherwise the baseline, with a note."""
-    from potlp_jax.learning.estimator import shipped_estimator
+    """PO-TLP where an estimator is given and there are pictures, otherwise the baseline, with a note."""
     from potlp_jax.planning.policies import Policy
 
-    if trained is None and shipped_estimator(drive.propositions) is None:
-        logger.warning(f"no estimator is shipped for {', '.join(drive.propositions)}: the policy is {Policy.BASELINE}")
+    # What a real robot sees is like nothing that a shipped one has learned from, whatever the propositions are called.
+    if trained is None:
+        logger.warning(f"no estimator is shipped for logs: the policy is {Policy.BASELINE}; give one with --estimator")
         return Policy.BASELINE
     # The network sees nothing without pictures; the baseline needs the map alone.
     if not drive.pictures:

@@ -374,13 +374,20 @@ def _defects(survey: "MapSurvey", clean: "CleanMap") -> Iterator[str]:
 
 
 def _cut_off_lines(clean: "CleanMap") -> Iterator[str]:
-    why = "cut off by the size of the cells: use smaller ones"
+    from potlp_jax.environments.ros.cleaning import Cause
+
+    why = {
+        Cause.MAP: "not connected with the rest on the map itself: open what joins them, or give a --start",
+        Cause.RADIUS: "cut off by the robot's radius: use a smaller one",
+        Cause.CELLS: "cut off by the size of the cells: use smaller ones",
+    }
     for part in clean.cut_off[:SHOWN]:
-        yield f"{part.area:.1f} m2 at [{part.at[0]:.2f}, {part.at[1]:.2f}] are {why}"
+        yield f"{part} are {why[part.cause]}"
     # Parts come largest first, so that those that are only counted are the small ones.
     rest = clean.cut_off[SHOWN:]
     if rest:
-        yield f"{len(rest)} smaller parts, {sum(part.area for part in rest):.1f} m2 in all, are {why}"
+        area = sum(part.area for part in rest)
+        yield f"{len(rest)} smaller parts, {area:.1f} m2 in all, cannot be reached either: --json has them"
 
 
 def _joined(

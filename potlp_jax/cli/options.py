@@ -83,7 +83,8 @@ EstimatorName = Annotated[
     typer.Option(
         "--estimator",
         metavar="FILE|NAME",
-        help="What the policy potlp asks: a trained estimator's file, or module:attribute; default: the shipped one.",
+        help="What the policy potlp asks: a trained estimator's file, the name of a shipped one, or module:attribute; "
+        "default: the one that is shipped for such worlds.",
         show_default=False,
     ),
 ]

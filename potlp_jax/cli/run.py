@@ -88,11 +88,12 @@ def run_one(
 
     generator = make(environment)
     chosen_split = read_split(split, generator)
-    chosen_policy = default_policy(generator) if policy is None else named_policy(policy)
+    named = None if policy is None else named_policy(policy)
     trained = read_estimator(estimator)
     asked = generator.task(task)
     made = make_world(generator, chosen_split, world)
     config = trial_config(setting_changes(simulations=simulations, search=search, camera=camera), generator)
+    chosen_policy = default_policy(made, config, trained) if named is None else named
     folder = None if out is None else make_folder(out)
     with progress_bar() as progress:
         # How many decisions a trial takes is not known before it ends.

@@ -32,6 +32,8 @@ class Generator(abc.ABC):
         tasks: formulas that belong to the family, by the number (or name) used on the command line.
         settings: what trials in its worlds need to be different from the defaults: fields of
             ``trials.config.TrialConfig``, nested as in a sweep's file. Every world of the family carries them.
+        family: what kind of worlds these are, to an estimator that learned from the like of them: a family that looks
+            like another has that one's name here. Every world carries it. Empty: ``name``.
         config: the parameters of the worlds, a frozen dataclass; None where there are none.
     """
 
@@ -40,6 +42,7 @@ class Generator(abc.ABC):
     # Defaults, so that a family of one's own has to say only what is special about it.
     tasks: Mapping[str, str] = MappingProxyType({})
     settings: Settings = NO_SETTINGS
+    family: str = ""
     config: Any = None
 
     @abc.abstractmethod
@@ -53,11 +56,11 @@ class Generator(abc.ABC):
 
     @in_32_bits
     def generate(self, key: PRNGKeyArray) -> World:
-        """The world of this key, with the settings of its family. Raises WorldError as ``draw``."""
+        """The world of this key, with the settings and the name of its family. Raises WorldError as ``draw``."""
         return self.signed(self.draw(key))
 
     def signed(self, world: World) -> World:
-        """The world with the settings of this family. Raises PropositionsError where it has other propositions."""
+        """The world with the settings and the name of this family. Raises PropositionsError for other propositions."""
         # The names come with the letters, from where these are written: put on afterwards they could be wrong.
         require_same_propositions(
             self.propositions,
@@ -66,8 +69,9 @@ class Generator(abc.ABC):
             knower="the world that it drew",
             remedy="make_world(..., propositions=self.propositions) in draw",
         )
-        # A world that says itself what it needs cannot be run with the settings of another family by oversight.
-        return dataclasses.replace(world, settings=self.settings)
+        # A world that says itself what it needs cannot be run with the settings, or the estimator, of another family by
+        # oversight.
+        return dataclasses.replace(world, settings=self.settings, family=self.family or self.name)
 
     def world(self, index: int, split: Split | str | None = None) -> World:
         """World number ``index`` of a split, by default of that from which the command line takes its worlds.

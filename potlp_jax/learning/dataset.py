@@ -25,6 +25,8 @@ from jaxtyping import Float32, Int8, Int32, UInt8
 from potlp_jax.codec import config_from_dict, differences, json_copy
 from potlp_jax.errors import ConfigurationError, DatasetError
 from potlp_jax.files import decode_image, one_line, reading, require_file, short
+from potlp_jax.learning.domain import Domain
+from potlp_jax.world.camera import CameraConfig
 
 SCHEMA_VERSION: int = 1
 """Changes when a column or its meaning does."""
@@ -76,7 +78,8 @@ class DatasetMetadata:
 
     Attributes:
         propositions: Sigma: the order of the entries of ``phi_stay`` and ``phi_go``.
-        environment: name of the family of worlds, or of the building.
+        environment: name of the worlds as it was given, or of the building.
+        family: what kind of worlds they are (``Generator.family``); ``learning.domain.LOGS`` for robots' logs.
         generator: the family's configuration.
         split: name of the split that the worlds are from (``environments.splits``); for real data any name.
         camera: geometry of the panorama.
@@ -93,6 +96,7 @@ class DatasetMetadata:
 
     propositions: tuple[str, ...]
     environment: str
+    family: str
     generator: Mapping[str, Any]
     split: str
     camera: Mapping[str, Any]
@@ -128,6 +132,15 @@ class DatasetMetadata:
             return config_from_dict(cls, data, "metadata")
         except ConfigurationError as error:
             raise DatasetError(f"not the metadata of a dataset: {error}") from error
+
+    @property
+    def domain(self) -> Domain:
+        """What an estimator serves that learns from this dataset. Raises DatasetError where ``camera`` is none."""
+        try:
+            camera = config_from_dict(CameraConfig, self.camera, "camera")
+        except ConfigurationError as error:
+            raise DatasetError(f"not the metadata of a dataset: {error}") from error
+        return Domain.of_cells(self.family, camera, self.resolution)
 
     def differences(self, other: "DatasetMetadata") -> list[str]:
         """What differs, with both values: of this dataset, and of the other."""

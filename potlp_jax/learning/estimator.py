@@ -1,13 +1,15 @@
-"""The trained network as an estimator: what it is asked in a decision, and which one belongs to which propositions.
+"""The trained network as an estimator: what it is asked in a decision, and which one belongs to which worlds.
 
 ``TrainedEstimator`` is what is read from a file, on the host; ``NetworkEstimator`` is the pytree that a decision calls
-inside jit, with the panoramas seen so far. Which propositions an estimator knows is written in its file.
+inside jit, with the panoramas seen so far. Which propositions an estimator knows, and which worlds it serves, its file
+says.
 """
 
 import dataclasses
 import functools
 import hashlib
 import math
+import warnings
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -19,7 +21,8 @@ from flax import struct
 from jaxtyping import Array, Float32, Int32, UInt8
 
 from potlp_jax import plugins
-from potlp_jax.errors import EstimatorError, PluginError
+from potlp_jax.errors import EstimatorError, PluginError, PotlpWarning
+from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.memory import (
     PanoramaMemory,
     empty_memory,
@@ -187,10 +190,12 @@ def _distances(belief: BeliefMap, poses: Int32[Array, "S 2"], subgoals: Subgoals
 
 @dataclasses.dataclass(frozen=True)
 class TrainedEstimator:
-    """An estimator read from a file. ``name`` and ``digest`` (of the file) identify it in records."""
+    """An estimator read from a file, for worlds of ``domain``. ``name`` and ``digest`` (of the file) identify it in
+    records."""
 
     params: Params
     config: NetworkConfig
+    domain: Domain
     metadata: Mapping[str, Any]
     name: str
     digest: str
@@ -222,30 +227,39 @@ observe_panorama = jax.jit(NetworkEstimator.observe)
 def read_estimator(path: Path) -> TrainedEstimator:
     """Read an estimator. Raises EstimatorError where the file is none."""
     # A digest and not the name: two files of one name are two estimators in records.
-    params, config, metadata = load_estimator(path)
+    params, config, domain, metadata = load_estimator(path)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
-    return TrainedEstimator(params=params, config=config, metadata=metadata, name=path.stem, digest=digest)
+    return TrainedEstimator(
+        params=params, config=config, domain=domain, metadata=metadata, name=path.stem, digest=digest
+    )
 
 
 def named_estimator(name: str | Path) -> TrainedEstimator | Estimator:
     """An estimator by the name that a command line or a sweep's file gives.
 
     Args:
-        name: a file; or ``module:attribute``, or an entry point in the group ``potlp_jax.estimators``, of a
-            ``TrainedEstimator``, of a function or other pytree that can be called as an ``Estimator``, or of a class
-            without arguments whose objects can.
+        name: a file; or the name of a shipped one; or ``module:attribute``, or an entry point in the group
+            ``potlp_jax.estimators``, of a ``TrainedEstimator``, of a function or other pytree that can be called as an
+            ``Estimator``, or of a class without arguments whose objects can.
 
     Returns:
         The estimator.
 
     Raises:
-        EstimatorError: there is no such file, or it is no estimator.
+        EstimatorError: there is no such file and none of that name is shipped, or the file is no estimator.
         PluginError: it cannot be imported, or is no estimator.
     """
     path = Path(name)
     # A file goes first: its name may well contain a colon.
-    if path.is_file() or not plugins.is_known(str(name), plugins.ESTIMATORS):
+    if path.is_file():
         return read_estimator(path)
+    if str(name) in shipped_files():
+        return read_estimator(shipped_files()[str(name)])
+    if not plugins.is_known(str(name), plugins.ESTIMATORS):
+        raise EstimatorError(
+            f"there is no estimator {name}: give a file (potlp fit makes one), module:attribute, or the name of one "
+            f"that is shipped: {', '.join(shipped_files())}"
+        )
     found = plugins.load(str(name), group=plugins.ESTIMATORS, kind="estimator")
     estimator = found() if isinstance(found, type) else found
     if isinstance(estimator, TrainedEstimator):
@@ -266,26 +280,68 @@ def identity_of(estimator: TrainedEstimator | Estimator) -> str:
     return plugins.reference_of(estimator.func if isinstance(estimator, functools.partial) else estimator)
 
 
-def shipped_estimator(propositions: tuple[str, ...]) -> TrainedEstimator | None:
-    """The estimator that comes with the package for these propositions, in this order; None where there is none."""
-    # Which propositions an estimator knows stands in its file, so a new shipped file needs no line of code.
-    with resources.as_file(resources.files("potlp_jax.learning") / "data") as folder:
-        found = [read_estimator(path) for path in sorted(folder.glob("*.npz"))]
-    return next((estimator for estimator in found if estimator.config.propositions == propositions), None)
+@functools.cache
+def shipped_files() -> dict[str, Path]:
+    """The files of the estimators that come with the package, by name."""
+    folder = Path(str(resources.files("potlp_jax.learning"))) / "data"
+    return {path.stem: path for path in sorted(folder.glob("*.npz"))}
 
 
-def estimator_for(propositions: tuple[str, ...], given: TrainedEstimator | None = None) -> TrainedEstimator:
-    """The estimator to use for a task: the one given, else the shipped one.
+def shipped_estimators() -> tuple[TrainedEstimator, ...]:
+    """All that come with the package, by name."""
+    # What an estimator knows and serves stands in its file, so a new shipped file needs no line of code.
+    return tuple(read_estimator(path) for path in shipped_files().values())
+
+
+def shipped_estimator(propositions: tuple[str, ...], here: Domain) -> TrainedEstimator | None:
+    """The estimator that comes with the package for these propositions, in this order, and serves these worlds."""
+    found = (
+        estimator
+        for estimator in shipped_estimators()
+        if estimator.config.propositions == propositions and not estimator.domain.misfits(here)
+    )
+    return next(found, None)
+
+
+def why_none_is_shipped(propositions: tuple[str, ...], here: Domain) -> str:
+    """Why ``shipped_estimator`` finds none, in words: none knows the propositions, or those that do serve others."""
+    knowing = [estimator for estimator in shipped_estimators() if estimator.config.propositions == propositions]
+    if not knowing:
+        return f"no estimator is shipped for the propositions {', '.join(propositions)}"
+    reasons = {estimator.name: " and ".join(estimator.domain.misfits(here)) for estimator in knowing}
+    return "; ".join(f"the shipped estimator {name} knows the propositions, but {why}" for name, why in reasons.items())
+
+
+def estimator_for(
+    propositions: tuple[str, ...], here: Domain, given: TrainedEstimator | None = None
+) -> TrainedEstimator:
+    """The estimator to use for a task in some worlds: the one given, else the shipped one that serves them.
+
+    Args:
+        propositions: of the task.
+        here: the worlds.
+        given: is used wherever it is asked for.
 
     Raises:
         EstimatorError: none is shipped for these.
         PropositionsError: the one given knows other propositions.
+
+    Warns:
+        PotlpWarning: the one given was made for other worlds.
     """
-    estimator = shipped_estimator(propositions) if given is None else given
+    estimator = shipped_estimator(propositions, here) if given is None else given
     if estimator is None:
         raise EstimatorError(
-            f"no estimator is shipped for the propositions {', '.join(propositions)}: choose another policy, or give "
-            "an estimator that was trained for them (docs/estimator.md)"
+            f"{why_none_is_shipped(propositions, here)}: choose another policy, or name the estimator to ask "
+            f"({', '.join(shipped_files())}, or one of your own: docs/estimator.md)"
         )
     require_propositions(estimator.config, propositions, f"estimator {estimator.name}")
+    misfits = estimator.domain.misfits(here)
+    if misfits:
+        # From this one place, so that Python shows it once and not for every trial.
+        warnings.warn(
+            f"the estimator {estimator.name} is asked about worlds that it was not made for: {'; '.join(misfits)}",
+            PotlpWarning,
+            stacklevel=1,
+        )
     return estimator

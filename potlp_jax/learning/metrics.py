@@ -30,6 +30,7 @@ from jaxtyping import Bool, Float32, Float64, Int8, Int64
 from potlp_jax.errors import EvaluationError
 from potlp_jax.learning.batches import Batch, Batches, batch_answers
 from potlp_jax.learning.dataset import Samples, decode, encode
+from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.network import Answers, EstimatorNetwork, NetworkConfig, Params
 from potlp_jax.learning.serialization import require_propositions
 
@@ -143,14 +144,12 @@ class Report:
         return {"overall": dataclasses.asdict(self.overall), "groups": groups}
 
 
-def check_fit(
-    config: NetworkConfig, metadata: Mapping[str, Any], samples: Samples, estimator: str, dataset: str
-) -> None:
+def check_fit(config: NetworkConfig, domain: Domain, samples: Samples, estimator: str, dataset: str) -> None:
     """Whether the estimator's answers mean the same as the data set's labels.
 
     Args:
         config: the estimator's network.
-        metadata: the estimator's, as ``load_estimator`` gives them.
+        domain: of the worlds that the estimator learned from.
         samples: the data set.
         estimator, dataset: their names in messages.
 
@@ -167,14 +166,12 @@ def check_fit(
             f"{dataset} has panoramas of {size} pixels; {estimator} was made for {config.image_shape}"
         )
     # The unit and the camera decide what the numbers and pictures mean; another split or family is fair to ask about.
-    trained_on = metadata.get("data", {})
-    for name in ("camera", "unit"):
-        here = getattr(samples.metadata, name)
-        if name in trained_on and trained_on[name] != here:
-            raise EvaluationError(
-                f"{estimator} learned from data with {name} {trained_on[name]}; {dataset} has {here}: collect a data "
-                "set with the same, or train an estimator for this one"
-            )
+    misfits = domain.measure_misfits(samples.metadata.domain)
+    if misfits:
+        raise EvaluationError(
+            f"{dataset} is not what {estimator} learned from: {'; '.join(misfits)}. Collect a data set with the same, "
+            "or train an estimator for this one"
+        )
 
 
 def prior_of(metadata: Mapping[str, Any], samples: Samples) -> Prior:

@@ -1,8 +1,9 @@
 """The estimator that is shipped: one ``.npz`` file.
 
 The network's parameters as float32 arrays by name, and one JSON text with the network's configuration (Sigma included),
-training metadata and figures. One file, not a checkpoint's folder, because it is shipped with the package and copied by
-people: it is read with NumPy alone, needs no device topology, and the zip's checksums find damage.
+the domain that it serves, training metadata and figures. One file, not a checkpoint's folder, because it is shipped
+with the package and copied by people: it is read with NumPy alone, needs no device topology, and the zip's checksums
+find damage.
 """
 
 import dataclasses
@@ -19,10 +20,11 @@ import numpy as np
 from potlp_jax.codec import config_from_dict, differences
 from potlp_jax.errors import ConfigurationError, EstimatorError, NetworkError, PotlpError
 from potlp_jax.files import read_npz, reading, require_mapping, short
+from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
 from potlp_jax.task.propositions import require_same_propositions
 
-ESTIMATOR_FORMAT: str = "potlp-estimator-3"
+ESTIMATOR_FORMAT: str = "potlp-estimator-4"
 """Changed when older files can no longer be read."""
 
 
@@ -30,20 +32,24 @@ ESTIMATOR_FORMAT: str = "potlp-estimator-3"
 _HEADER = "header"
 
 
-def save_estimator(path: Path | str, params: Params, config: NetworkConfig, metadata: Mapping[str, Any]) -> None:
+def save_estimator(
+    path: Path | str, params: Params, config: NetworkConfig, domain: Domain, metadata: Mapping[str, Any]
+) -> None:
     """Write an estimator.
 
     Args:
         path: the file; its folder is made if it is not there.
         params: float32 arrays.
         config: of the network.
+        domain: of the worlds that it learned from.
         metadata: any JSON-able mapping: how the estimator was made.
     """
     # Under a temporary name first: a process that is killed leaves the old estimator or the new one.
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     arrays = named_arrays(params)
-    header = json.dumps({"format": ESTIMATOR_FORMAT, "network": dataclasses.asdict(config), "metadata": metadata})
+    description = {"network": dataclasses.asdict(config), "domain": dataclasses.asdict(domain), "metadata": metadata}
+    header = json.dumps({"format": ESTIMATOR_FORMAT, **description})
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("wb") as file:
         # Not compressed: random bits of parameters hardly shrink, and the file loads faster.
@@ -55,8 +61,8 @@ def save_estimator(path: Path | str, params: Params, config: NetworkConfig, meta
     temporary.replace(path)
 
 
-def load_estimator(path: Path | str) -> tuple[Params, NetworkConfig, dict[str, Any]]:
-    """Parameters, network configuration and metadata of an estimator.
+def load_estimator(path: Path | str) -> tuple[Params, NetworkConfig, Domain, dict[str, Any]]:
+    """Parameters, network configuration, domain and metadata of an estimator.
 
     Raises:
         EstimatorError: no such file, damaged, of another format, parameters that do not fit the configuration, or a
@@ -74,7 +80,7 @@ def load_estimator(path: Path | str) -> tuple[Params, NetworkConfig, dict[str, A
         )
     # Widths of a damaged header may be beyond what any array can have, which shows when shapes are worked out.
     with reading(path, EstimatorError, "an estimator"):
-        config, metadata = _configuration(path, header)
+        config, domain, metadata = _configuration(path, header)
         # What the network would have, without computing it: names and shapes must agree before anything is used.
         like = jax.eval_shape(EstimatorNetwork(config).init, jax.random.key(0))
         wanted = named_leaves(like)
@@ -83,7 +89,7 @@ def load_estimator(path: Path | str) -> tuple[Params, NetworkConfig, dict[str, A
         raise EstimatorError(f"{path}: the parameters do not fit the network. {'; '.join(found)}")
     require_finite(arrays, str(path), EstimatorError)
     leaves = [jnp.asarray(arrays[name]) for name in wanted]
-    return jax.tree.unflatten(jax.tree.structure(like), leaves), config, metadata
+    return jax.tree.unflatten(jax.tree.structure(like), leaves), config, domain, metadata
 
 
 def require_finite(arrays: Mapping[str, np.ndarray], where: str, kind: type[PotlpError]) -> None:
@@ -108,12 +114,13 @@ def require_finite(arrays: Mapping[str, np.ndarray], where: str, kind: type[Potl
             )
 
 
-def _configuration(path: Path | str, header: Mapping[str, Any]) -> tuple[NetworkConfig, dict[str, Any]]:
+def _configuration(path: Path | str, header: Mapping[str, Any]) -> tuple[NetworkConfig, Domain, dict[str, Any]]:
     try:
         config = config_from_dict(NetworkConfig, header["network"], "network")
+        domain = config_from_dict(Domain, header["domain"], "domain")
     except (ConfigurationError, NetworkError) as error:
         raise EstimatorError(f"{path}: {error}") from error
-    return config, require_mapping(path, header["metadata"], EstimatorError, "an estimator with metadata")
+    return config, domain, require_mapping(path, header["metadata"], EstimatorError, "an estimator with metadata")
 
 
 def require_propositions(

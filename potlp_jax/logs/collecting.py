@@ -10,6 +10,7 @@ from potlp_jax.environments.ros.places import Places
 from potlp_jax.errors import DatasetError, LogError
 from potlp_jax.learning import recording
 from potlp_jax.learning.dataset import DatasetMetadata, finished_shards, write_shard
+from potlp_jax.learning.domain import LOGS
 from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.sample_weights import WeightBounds
 from potlp_jax.logs.drive import Drive, PanoramaReader
@@ -99,6 +100,7 @@ def _metadata(
         versions(),
         propositions=places.names,
         environment=environment,
+        family=LOGS,
         generator={"logs": [drive.log.path.name for drive in drives], "labels": Path(places.source).name},
         split=split,
         unit="metres",

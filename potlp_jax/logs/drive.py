@@ -18,6 +18,7 @@ from scipy import ndimage
 from potlp_jax.environments.ros.map_files import GridFrame
 from potlp_jax.environments.ros.places import Places, place_letters
 from potlp_jax.errors import LogError
+from potlp_jax.learning.domain import LOGS
 from potlp_jax.logs.log import Log, MapMessage, Picture
 from potlp_jax.logs.pictures import match_pictures, vertical_field
 from potlp_jax.logs.poses import drive_path, read_poses
@@ -135,9 +136,10 @@ def read_drive(log: Log, places: Places, config: GridConfig = GridConfig()) -> D
     # Before the first map nothing was known, and no policy could have decided.
     path, times = path[start:], poses.times[entered][start:]
     pictures, bearings = match_pictures(log, poses, path, times, grid.frame, notes)
+    world = make_world(~grid.free, letters, path[0], resolution=grid.frame.resolution, propositions=places.names)
     return Drive(
         log=log,
-        world=make_world(~grid.free, letters, path[0], resolution=grid.frame.resolution, propositions=places.names),
+        world=replace(world, family=LOGS),
         frame=grid.frame,
         seen=grid.seen,
         path=tuple(path),

@@ -48,7 +48,7 @@ def inspect(log: Log) -> dict[str, Any]:
         "pictures": _pictures(log),
         "uses": {
             "replay without pictures (baseline, optimistic, oracle)": replay or "yes",
-            "replay of potlp": with_panoramas or "yes, where an estimator knows the propositions",
+            "replay of potlp": with_panoramas or "yes, with an estimator (--estimator)",
             "to-dataset": with_panoramas or "yes",
         },
         "problems": list(log.problems),

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Int32, PRNGKeyArray, UInt8
 
 from potlp_jax.errors import LogError
+from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.logs.drive import Drive, PanoramaReader
 from potlp_jax.planning.distances.paths import KnownPath
@@ -113,7 +114,7 @@ def replay(
         policy: one of the library's, or a function of one's own (``planning.policies.PolicyFunction``).
         key: drives the planner's search.
         config: settings; the sensor is the log's own.
-        estimator: what the policy asks; by default ``potlp`` asks the one that is shipped for the task's propositions.
+        estimator: what the policy asks. No shipped estimator was made for logs: ``potlp`` asks none but the one given.
 
     Returns:
         The trial, and the panoramas that its decisions used, by number of the decision.
@@ -121,7 +122,10 @@ def replay(
     Raises:
         LogError: the policy needs panoramas and the log has none, or it needs no log.
         PropositionsError: the labels, the task and the estimator are not over the same propositions.
-        EstimatorError: no estimator is shipped for them.
+        EstimatorError: the policy is ``potlp``, and no estimator is given.
+
+    Warns:
+        PotlpWarning: the estimator given was made for other worlds.
     """
     if policy is Policy.KNOWN_MAP:
         raise LogError("the policy known-map knows all from the start: choose baseline, optimistic, oracle or potlp")
@@ -129,7 +133,8 @@ def replay(
         task.propositions, drive.propositions, asker=f"the task {task.text!r}", knower="the labels of the log"
     )
     config = TrialConfig() if config is None else config
-    asked = estimator_of(policy, task.propositions, estimator)
+    here = Domain.of_world(drive.world, config.camera)
+    asked = estimator_of(policy, task.propositions, here, estimator)
     reader = None
     if isinstance(asked, TrainedEstimator):
         drive = from_first_picture(drive, config.camera)

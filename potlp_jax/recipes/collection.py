@@ -33,6 +33,7 @@ from potlp_jax.learning.dataset import (
     remove_unfinished_files,
     write_shard,
 )
+from potlp_jax.learning.domain import unit_of
 from potlp_jax.learning.questions import HELD_OUT, TaskDistribution
 from potlp_jax.learning.recording import (
     Pose,
@@ -180,9 +181,10 @@ def dataset_metadata(generator: Generator, environment: str, split: Split, confi
         versions(),
         propositions=generator.propositions,
         environment=environment,
+        family=world.family,
         generator=json_copy(dataclasses.asdict(generator.config)),
         split=split.value,
-        unit="cells" if resolution == 1.0 else "metres",
+        unit=unit_of(resolution),
         resolution=resolution,
     )
 

@@ -113,7 +113,7 @@ def fit(training: Samples, validation: Samples, out: Path, config: FitConfig, di
         journal.close()
     # Whoever has the file alone can still say how it was made.
     metadata = _metadata(training, validation, plan, trained, journal)
-    save_estimator(out / ESTIMATOR, trained.params, network.config, metadata)
+    save_estimator(out / ESTIMATOR, trained.params, network.config, training.metadata.domain, metadata)
     return trained
 
 

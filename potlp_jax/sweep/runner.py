@@ -28,6 +28,7 @@ from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, world_key
 from potlp_jax.errors import PotlpError, SweepError, WorldError
 from potlp_jax.files import one_line
+from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import TrainedEstimator, identity_of, named_estimator
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy, named_policy
@@ -251,7 +252,10 @@ class Sweep:
 
     def _asked(self, environment: str, policy: str) -> TrainedEstimator | Estimator | None:
         """What a policy asks in the worlds of an environment; None where it asks nothing."""
-        return estimator_of(named_policy(policy), self._generator(environment).propositions, self._estimator)
+        # Worlds of a family are alike in what decides whether an estimator serves them: the first stands for all.
+        world = self._world(environment, self.specification.first_world)
+        here = Domain.of_world(world, self.specification.config.camera)
+        return estimator_of(named_policy(policy), world.propositions, here, self._estimator)
 
     def _estimator_identity(self) -> str | None:
         """Of all that policies ask, so that a store never mixes two. Raises EstimatorError where there is none."""

@@ -27,6 +27,7 @@ from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
 from potlp_jax.errors import PluginError, SpecificationError, TaskError, WorldError
 from potlp_jax.files import short
+from potlp_jax.learning.estimator import shipped_files
 from potlp_jax.planning.policies import Policy, named_policy
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 
@@ -195,7 +196,8 @@ def _policies(names: list[Any], where: str) -> tuple[str, ...]:
 def _estimator(name: str, folder: Path) -> str:
     """A file beside the specification, or a name as it stands."""
     beside = folder / name
-    return name if plugins.is_known(name, plugins.ESTIMATORS) and not beside.is_file() else str(beside)
+    is_name = name in shipped_files() or plugins.is_known(name, plugins.ESTIMATORS)
+    return name if is_name and not beside.is_file() else str(beside)
 
 
 def _split(name: Any, environments: Sequence[str], where: str) -> Split:

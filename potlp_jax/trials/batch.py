@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Int32, PRNGKeyArray
 
 from potlp_jax.errors import BatchError
+from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.memory import PanoramaMemory
-from potlp_jax.learning.serialization import require_propositions
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy, PolicyFunction, named_policy
 from potlp_jax.precision import in_32_bits
@@ -95,7 +95,7 @@ def run_batch(
         policy: one of the library's, or a function of one's own (``planning.policies.PolicyFunction``).
         config: settings, which all trials share; by default what their worlds call for.
         slots: trials that run at a time.
-        estimator: what the policy asks, as in ``run_trial``; ``potlp`` has no default here.
+        estimator: what the policy asks, as in ``run_trial``.
 
     Returns:
         The trials in the order in which they end.
@@ -103,24 +103,25 @@ def run_batch(
     Raises:
         PropositionsError: world, task and estimator of a trial are not over the same propositions, or are over others
             than the first trial of the batch.
-        BatchError: a world or task has another shape than the first one, its world is of a family with other settings,
-            or ``potlp`` has no estimator.
+        EstimatorError: no estimator is shipped for the first trial's task in its world.
+        BatchError: a world or task has another shape than the first one, or its world is of another family or has other
+            settings.
+
+    Warns:
+        PotlpWarning: the estimator given was made for other worlds.
     """
     policy = named_policy(policy)
     if slots < 1:
         raise BatchError(f"slots is {slots}, must be at least 1")
-    if policy is Policy.POTLP and estimator is None:
-        raise BatchError("policy potlp needs an estimator (learning.estimator.estimator_for)")
     starts = iter(starts)
     first = next(starts, None)
     if first is None:
         return
     _check_start(first, first)
     config = rules.config_of(policy, config_in(first.world, config))
-    asked = rules.asked_of(policy, estimator)
+    here = Domain.of_world(first.world, config.camera)
+    asked = rules.estimator_of(policy, first.arrays.propositions, here, estimator)
     network = asked.config if isinstance(asked, TrainedEstimator) else None
-    if isinstance(asked, TrainedEstimator):
-        require_propositions(asked.config, first.arrays.propositions, f"estimator {asked.name}")
     yield from _run(first, starts, Setup(policy=policy, config=config, network=network), slots, asked)
 
 
@@ -171,9 +172,10 @@ def _check_start(start: Start, first: Start) -> None:
         knower="that of the first trial of the batch",
         remedy="run trials over other ones in a batch of their own",
     )
-    mine, other = start.world.settings, first.world.settings
-    if mine != other:
-        raise BatchError(f"trial {start.name!r}: its world has the settings {mine}, the first of the batch {other}")
+    for what in ("settings", "family"):
+        mine, other = getattr(start.world, what), getattr(first.world, what)
+        if mine != other:
+            raise BatchError(f"trial {start.name!r}: its world has the {what} {mine}, the first of the batch {other}")
     # Another shape would compile anew in the middle of the batch, without a word: refused instead.
     for what, mine, other in (("world", start.world, first.world), ("task", start.arrays, first.arrays)):
         found, expected = ([leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (mine, other))

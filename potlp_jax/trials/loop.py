@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int32, PRNGKeyArray
 
+from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import NetworkEstimator, TrainedEstimator, identity_of, observe_panorama
 from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimator
@@ -64,14 +65,18 @@ def run_trial(
         world_number: which world of it, for the record.
         arrays: the task's arrays where they shall be padded; by default ``task.arrays``.
         estimator: what the policy asks: one read from a file, or any ``Estimator``. By default ``potlp`` asks the one
-            that is shipped for the task's propositions, and a policy of one's own asks none.
+            that is shipped for the task's propositions and serves such worlds (``learning.domain``), and a policy of
+            one's own asks none.
 
     Returns:
         The record of the trial.
 
     Raises:
         PropositionsError: world, task and estimator are not over the same propositions.
-        EstimatorError: no estimator is shipped for the task's propositions.
+        EstimatorError: no estimator is shipped for the task's propositions in such worlds.
+
+    Warns:
+        PotlpWarning: the estimator given was made for other worlds.
     """
     # Before anything is compiled, and by the world's own name.
     require_same_propositions(task.propositions, world.propositions, asker=f"the task {task.text!r}")
@@ -79,7 +84,7 @@ def run_trial(
     config = rules.config_of(policy, config_in(world, config))
     # One key for everything, and a use of its own for each: disturbing the camera does not change the search.
     robot = SimulatedRobot(world, config, rules.sensing_key(key))
-    asked = rules.estimator_of(policy, task.propositions, estimator)
+    asked = rules.estimator_of(policy, task.propositions, Domain.of_world(world, config.camera), estimator)
     run = run_robot(robot, task, policy, key, config, arrays=arrays, estimator=asked, world=world)
     return make_trial(
         run, task, policy, config, asked, world, robot.first_seen, environment=environment, world_number=world_number
@@ -107,7 +112,8 @@ def run_robot(
         key: drives the search where it samples (``UctConfig``).
         config: settings; the sensor, the camera and ``revealed`` are the simulator's and matter not here.
         arrays: the task's arrays where they shall be padded; by default ``task.arrays``.
-        estimator: what the policy asks, as in ``run_trial``.
+        estimator: what the policy asks, as in ``run_trial``. What worlds without a true map look like is not known: no
+            shipped estimator serves them, and one is asked on request only.
         world: the true map, where it is known; only the policy ``oracle`` asks it.
 
     Returns:
@@ -116,7 +122,7 @@ def run_robot(
 
     Raises:
         PropositionsError: the robot's map, task, estimator and ``world`` are not over the same propositions.
-        EstimatorError: no estimator is shipped for the task's propositions.
+        EstimatorError: no estimator is shipped for the task's propositions in such a world.
         PotlpError: the policy is ``oracle`` and there is no ``world``.
     """
     policy = named_policy(policy)
@@ -125,10 +131,12 @@ def run_robot(
     require_same_propositions(
         task.propositions, belief.propositions, asker=f"the task {task.text!r}", knower="the robot's map"
     )
-    asked = rules.estimator_of(policy, task.propositions, estimator)
+    config = TrialConfig() if config is None else config
+    resolution = float(belief.resolution)
+    here = Domain.of_robot(resolution) if world is None else Domain.of_world(world, config.camera)
+    asked = rules.estimator_of(policy, task.propositions, here, estimator)
     # An estimator that remembers where it was needs to know how large the map is.
     height, width = belief.cells.shape
-    config = TrialConfig() if config is None else config
     loop = _Loop(
         robot,
         task,

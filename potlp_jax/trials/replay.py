@@ -9,7 +9,7 @@ from jaxtyping import Array, Int32, UInt8
 
 from potlp_jax.codec import config_from_dict
 from potlp_jax.errors import EstimatorError, RecordError
-from potlp_jax.learning.estimator import TrainedEstimator, identity_of, observe_panorama
+from potlp_jax.learning.estimator import TrainedEstimator, identity_of, observe_panorama, shipped_estimators
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.estimates import Estimator, ask
 from potlp_jax.planning.policies import Policy
@@ -23,7 +23,7 @@ from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import LOG_PREFIX, Decision, Trial
 from potlp_jax.trials.robot import photograph
-from potlp_jax.trials.rules import estimator_of
+from potlp_jax.trials.rules import asked_of
 from potlp_jax.world.camera import Disturbance
 from potlp_jax.world.grid import BeliefMap
 
@@ -36,7 +36,7 @@ def replay_decision(
     Args:
         trial: from ``run_trial`` or ``load_trial``.
         index: number of the decision.
-        estimator: the one of the trial, where its policy asks one; by default the shipped one.
+        estimator: the one of the trial, where its policy asks one; by default the shipped one that it names.
 
     Returns:
         The planning problem of the decision, its plan and the searched tree.
@@ -59,7 +59,7 @@ def replay_decision(
         jnp.asarray(decision.cell, jnp.int32),
         jnp.int32(decision.state),
         task.arrays,
-        _replayed_estimator(trial, index, task, estimator, config),
+        _replayed_estimator(trial, index, estimator, config),
         config.decision,
     )
     # The decision's own key: no need to know how it came from the trial's.
@@ -69,19 +69,12 @@ def replay_decision(
 
 
 def _replayed_estimator(
-    trial: Trial, index: int, task: Task, estimator: TrainedEstimator | Estimator | None, config: TrialConfig
+    trial: Trial, index: int, estimator: TrainedEstimator | Estimator | None, config: TrialConfig
 ) -> Estimator | None:
     """The estimator with all that it had seen at a decision: the panoramas are taken again."""
     if trial.policy != Policy.POTLP:
         return TrueMapEstimator(world=trial.world)
-    given = estimator_of(Policy.POTLP, task.propositions, estimator)
-    assert given is not None, "potlp asks an estimator"
-    # Another estimator would answer otherwise, and the replay would explain a decision that was never taken.
-    if trial.versions.get("estimator") != identity_of(given):
-        raise EstimatorError(
-            f"the trial was made with the estimator {trial.versions.get('estimator')}, not {identity_of(given)}: "
-            "give that one"
-        )
+    given = _estimator_of_record(trial, asked_of(Policy.POTLP, estimator))
     if not isinstance(given, TrainedEstimator):
         # A function of the belief alone: it has seen nothing that would have to be seen again.
         return given
@@ -91,6 +84,18 @@ def _replayed_estimator(
         cell = jnp.asarray(decision.cell, jnp.int32)
         asked = observe_panorama(asked, panorama_at(trial, decision, config), trial.belief_at(decision.step), cell)
     return asked
+
+
+def _estimator_of_record(trial: Trial, given: TrainedEstimator | Estimator | None) -> TrainedEstimator | Estimator:
+    """The estimator that a trial was made with: the one given, or a shipped one. Raises EstimatorError for another."""
+    made_with = trial.versions.get("estimator")
+    # Another estimator would answer otherwise, and the replay would explain a decision that was never taken.
+    candidates = shipped_estimators() if given is None else (given,)
+    for estimator in candidates:
+        if identity_of(estimator) == made_with:
+            return estimator
+    wrong = "which is not one of those that are shipped" if given is None else f"not {identity_of(given)}"
+    raise EstimatorError(f"the trial was made with the estimator {made_with}, {wrong}: give that one")
 
 
 def panorama_at(trial: Trial, decision: Decision, config: TrialConfig | None = None) -> UInt8[Array, "rows columns 3"]:

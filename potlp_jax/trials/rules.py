@@ -15,6 +15,7 @@ from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float32, Int8, Int32, PRNGKeyArray, UInt32
 
 from potlp_jax.errors import PotlpError
+from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.commitment import Intention
@@ -78,27 +79,34 @@ def config_of(policy: Policy | PolicyFunction, config: TrialConfig) -> TrialConf
 
 
 def estimator_of(
-    policy: Policy | PolicyFunction, propositions: tuple[str, ...], given: TrainedEstimator | Estimator | None
+    policy: Policy | PolicyFunction,
+    propositions: tuple[str, ...],
+    here: Domain,
+    given: TrainedEstimator | Estimator | None,
 ) -> TrainedEstimator | Estimator | None:
     """The estimator that a policy asks, before anything was seen; the true map of ``oracle`` is not among them.
 
     Args:
-        policy: ``potlp`` asks the one given, or the one that is shipped for the task. A policy of the user's asks the
-            one given, or none. The other policies ask none, whatever is given.
+        policy: ``potlp`` asks the one given, or the one that is shipped for the task and the worlds. A policy of the
+            user's asks the one given, or none. The other policies ask none, whatever is given.
         propositions: of the task.
+        here: the worlds.
         given: read from a file, or any pytree that can be called as an ``Estimator``; a plain function is made one.
 
     Returns:
         The estimator, or None where the policy asks none.
 
     Raises:
-        EstimatorError: none is shipped for these propositions.
+        EstimatorError: none is shipped for these propositions in these worlds.
         PropositionsError: a trained estimator knows other ones.
+
+    Warns:
+        PotlpWarning: a trained estimator was made for other worlds.
     """
     # The shipped one is read late, so that policies which ask nothing need none.
     asked = asked_of(policy, given)
-    if policy is Policy.POTLP and (asked is None or isinstance(asked, TrainedEstimator)):
-        return estimator_for(propositions, asked)
+    if isinstance(asked, TrainedEstimator) or (policy is Policy.POTLP and asked is None):
+        return estimator_for(propositions, here, asked)
     return asked
 
 

@@ -3,14 +3,16 @@
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, default_split
+from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import TrainedEstimator, named_estimator, shipped_estimator
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy, PolicyFunction
 from potlp_jax.task.task import Task
-from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.config import TrialConfig, trial_config_for
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import Trial
 from potlp_jax.trials.rules import trial_key
+from potlp_jax.world.grid import World
 
 
 def run(
@@ -30,7 +32,7 @@ def run(
         environment: a name that ``make`` knows, or a generator.
         task: number of one of the environment's tasks, a formula over its propositions, or a task.
         policy: a name or a function (``planning.policies.named_policy``); default: ``potlp`` where an estimator is
-            shipped for the environment, otherwise ``baseline``.
+            given, or shipped for such worlds, otherwise ``baseline``.
         world: number of the world in the split.
         split: default: that of the command line, ``validation`` (``test`` for real buildings).
         config: default: what the environment calls for.
@@ -45,23 +47,30 @@ def run(
         PluginError: there is no such environment, policy or estimator.
         TaskError: there is no such task.
         WorldError: there is no such world.
-        EstimatorError: no estimator is shipped for the task.
+        EstimatorError: no estimator is shipped for the task in such worlds.
         PropositionsError: the task, or the estimator, is over other propositions than the environment.
     """
     generator = make(environment) if isinstance(environment, str) else environment
     chosen = Split(default_split(generator.name) if split is None else split)
+    made = generator.world(world, chosen)
+    asked = named_estimator(estimator) if isinstance(estimator, str) else estimator
     return run_trial(
-        generator.world(world, chosen),
+        made,
         task if isinstance(task, Task) else generator.task(task),
-        default_policy(generator.propositions) if policy is None else policy,
+        default_policy(made, config, asked) if policy is None else policy,
         trial_key(world, seed),
         config,
         environment=f"{environment if isinstance(environment, str) else generator.name}/{chosen}",
         world_number=world,
-        estimator=named_estimator(estimator) if isinstance(estimator, str) else estimator,
+        estimator=asked,
     )
 
 
-def default_policy(propositions: tuple[str, ...]) -> Policy:
-    """PO-TLP where an estimator is shipped for the propositions, otherwise the baseline."""
-    return Policy.BASELINE if shipped_estimator(propositions) is None else Policy.POTLP
+def default_policy(
+    world: World, config: TrialConfig | None = None, given: TrainedEstimator | Estimator | None = None
+) -> Policy:
+    """PO-TLP where an estimator is given, or shipped for such a world and camera; otherwise the baseline."""
+    config = trial_config_for(world) if config is None else config
+    here = Domain.of_world(world, config.camera)
+    is_shipped = shipped_estimator(world.propositions, here) is not None
+    return Policy.POTLP if given is not None or is_shipped else Policy.BASELINE

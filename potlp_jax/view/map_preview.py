@@ -23,6 +23,8 @@ from potlp_jax.world.grid import World
 
 # Reachable space is of a light blue, which neither states (dark) nor areas (warm) have.
 OBSTACLE, UNREACHED, UNKNOWN, REACHED = "#3A3A3A", "#FFFFFF", "#D2D2D2", "#D7E8F7"
+CUT_OFF: str = "#F6C9DC"
+"""Pink: parts as large as a room in which a robot fits, and which it does not reach."""
 LONGEST: float = 10.0
 """Inches of the longer side of the map."""
 
@@ -88,6 +90,7 @@ def _plan(
     # Walls above cells: a cell is free only if all of its pixels are, but its square reaches over their edges.
     block = _block(image_map.frame)
     _show(axes, _map_raster(image_map, block), image_map.frame, zorder=0, block=block)
+    _show(axes, _painted(clean.lost, CUT_OFF), clean.whole, zorder=1)
     for raster in (_painted(clean.free, REACHED), *letters):
         _show(axes, raster, clean.frame, zorder=1)
     _show(axes, _wall_raster(image_map, block), image_map.frame, zorder=2, block=block)
@@ -233,7 +236,10 @@ def _finish(figure: Figure, axes: Axes, clean: CleanMap, handles: list[Patch | L
     if clean.cut_off:
         x, y = zip(*(part.at for part in clean.cut_off), strict=True)
         axes.plot(x, y, "X", ms=10, mfc=CHOSEN, mec="white", mew=1.0, ls="", zorder=6)
-        shown.append(Line2D([], [], marker="X", ls="", ms=9, mfc=CHOSEN, mec="white", label="cut off by the cells"))
+        for part in clean.cut_off:
+            axes.annotate(f"{part.area:.0f} m²", part.at, (0, -14), textcoords="offset points", ha="center", size=8)
+        total = sum(part.area for part in clean.cut_off)
+        shown.append(Patch(facecolor=CUT_OFF, edgecolor=FAINT, label=f"cut off, {total:.0f} m² in all"))
     shown += handles
     columns = legend_columns(shown, figure.get_figwidth())
     figure.legend(handles=shown, loc="lower center", ncols=columns, fontsize=8.5, frameon=False, handlelength=1.4)

@@ -78,6 +78,10 @@ class CameraConfig:
         if broken:
             raise ValueError("not a camera: " + "; ".join(broken))
 
+    def lengths(self, scale: float = 1.0) -> dict[str, float]:
+        """The fields that are lengths, by name, in cells that are ``scale`` times smaller."""
+        return {name: getattr(self, name) * scale for name in ("far", "eye_height", "wall_height", "texture_reach")}
+
 
 @dataclasses.dataclass(frozen=True)
 class Disturbance:

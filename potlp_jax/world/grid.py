@@ -99,6 +99,7 @@ class World:
         appearance: what a camera sees.
         propositions: bit ``i`` of a letter is ``propositions[i]``. Static under jit.
         settings: what trials in this world need to be different from the defaults. Static under jit.
+        family: what kind of worlds it is one of (``Generator.family``); empty where nobody says. Static under jit.
     """
 
     occupied: Bool[Array, "*batch H W"]
@@ -109,6 +110,7 @@ class World:
     appearance: Appearance
     propositions: tuple[str, ...] = struct.field(pytree_node=False)
     settings: Settings = struct.field(pytree_node=False, default=NO_SETTINGS)
+    family: str = struct.field(pytree_node=False, default="")
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -322,6 +324,7 @@ def world_to_dict(world: World) -> dict[str, Any]:
         "extent": np.asarray(world.extent).tolist(),
         "propositions": list(world.propositions),
         "settings": world.settings.to_dict(),
+        "family": world.family,
         "appearance": {name: pack_array(np.asarray(getattr(appearance, name))) for name in _APPEARANCE_FIELDS},
     }
 
@@ -336,7 +339,7 @@ def world_digest(world: World) -> str:
         array = np.ascontiguousarray(values)
         digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
         digest.update(array.tobytes())
-    digest.update(json.dumps([world.propositions, world.settings.to_dict()], sort_keys=True).encode())
+    digest.update(json.dumps([world.propositions, world.settings.to_dict(), world.family], sort_keys=True).encode())
     return digest.hexdigest()[:16]
 
 
@@ -347,10 +350,12 @@ def world_from_dict(data: Mapping[str, Any]) -> World:
         appearance = {name: jnp.asarray(unpack_array(values)) for name, values in data["appearance"].items()}
         row, column = (int(entry) for entry in data["start"])
         rows, columns = (int(size) for size in data["extent"])
-        settings, propositions = Settings(data["settings"]), data["propositions"]
+        settings, propositions, family = Settings(data["settings"]), data["propositions"], data["family"]
         # A mapping has keys where a list has names, and a text has letters.
         if not isinstance(propositions, list):
             raise TypeError(f"propositions is a list of names, found {propositions!r}")
+        if not isinstance(family, str):
+            raise TypeError(f"family is a name, found {family!r}")
         world = make_world(
             unpack_array(data["occupied"]),
             unpack_array(data["letters"]),
@@ -367,7 +372,7 @@ def world_from_dict(data: Mapping[str, Any]) -> World:
         raise WorldError(f"the extent {rows}x{columns} does not fit the {world.shape[0]}x{world.shape[1]} grid")
     # The border was closed when the world was made, so ``make_world`` has added no ring; padding is told by the extent.
     extent = jnp.asarray(np.array([rows, columns], np.int32))
-    return dataclasses.replace(world, extent=extent, settings=settings)
+    return dataclasses.replace(world, extent=extent, settings=settings, family=family)
 
 
 def pack_array(array: Shaped[np.ndarray, "..."]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ are padded to one shape.
 
 import dataclasses
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import jax
 import numpy as np
@@ -34,10 +35,17 @@ from potlp_jax.environments.campus.furnishing import (
     missing_kinds,
 )
 from potlp_jax.errors import WorldError
+from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.grid import World
+
+DELIVERY_FAMILY: str = "delivery"
+PARCELS_FAMILY: str = "parcels"
+"""Names of the two families: floors with people in rooms of their kind, and floors with two parcels to deliver."""
 
 _HALLWAYS = 0
 """Number of the room that all hallways are."""
+REPLAN_DISTANCE: float = 4.0
+"""Cells between decisions, as in every family: 2 m."""
 _MIN_SIDE = 5
 """Least side of a room, in cells: 2.5 m at half a metre a cell."""
 _DEEPEST_SMALL = 13
@@ -118,6 +126,16 @@ class DeliveryConfig:
             raise WorldError("not a delivery building: " + "; ".join(broken))
 
 
+def scaled_to(resolution: float) -> dict[str, Any]:
+    """Settings of trials with which cells of another size, in metres, are seen and decided upon as those of the family.
+
+    The camera and the distance between decisions count in cells: their lengths are scaled, so that a picture shows the
+    same metres and the robot decides as often.
+    """
+    scale = DeliveryConfig().resolution / resolution
+    return {"camera": CameraConfig().lengths(scale), "replan_distance": REPLAN_DISTANCE * scale}
+
+
 class Delivery(Generator):
     """Generator of academic floors with people to find: by default the three of section V-B.
 
@@ -128,7 +146,9 @@ class Delivery(Generator):
 
     settings = MANY_DOORS
 
-    def __init__(self, config: DeliveryConfig | None = None, name: str = "delivery", errand: Errand = PEOPLE) -> None:
+    def __init__(
+        self, config: DeliveryConfig | None = None, name: str = DELIVERY_FAMILY, errand: Errand = PEOPLE
+    ) -> None:
         self.config = DeliveryConfig() if config is None else config
         self.name = name
         self.errand = errand
@@ -143,7 +163,7 @@ class Delivery(Generator):
     @classmethod
     def parcels(cls) -> "Delivery":
         """Floors with a document and a package to deliver in two rooms of any kind, which nothing but light tells."""
-        return cls(DeliveryConfig(furnishing=FurnishConfig(coloured=False)), "parcels", PARCELS)
+        return cls(DeliveryConfig(furnishing=FurnishConfig(coloured=False)), PARCELS_FAMILY, PARCELS)
 
     def draw(self, key: PRNGKeyArray) -> World:
         """The world of this key."""

@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Int, Int32, PRNGKeyArray
 
 from potlp_jax.environments.base import Generator, host_generators
+from potlp_jax.environments.campus.delivery import DELIVERY_FAMILY, scaled_to
 from potlp_jax.environments.campus.floor_plan_xml import FloorPlan, PlanDoor, PlanRoom, read_kinds, read_plan
 from potlp_jax.environments.campus.furnishing import (
     MANY_DOORS,
@@ -47,6 +48,7 @@ from potlp_jax.environments.ros.places import Polygon, component_labels
 from potlp_jax.environments.splits import FLOOR_PLAN_PREFIX
 from potlp_jax.errors import MapError, MapWarning
 from potlp_jax.world.grid import World
+from potlp_jax.world.settings import Settings
 
 DOOR_WIDTH = 0.9
 """Metres; the door by which the corpus's files are scaled, too."""
@@ -150,7 +152,8 @@ class FloorPlans(Generator):
 
     propositions = PEOPLE.propositions
     tasks = PEOPLE.tasks
-    settings = MANY_DOORS
+    # They look like the generator's, and the camera shows the same metres.
+    family = DELIVERY_FAMILY
 
     def __init__(self, config: FloorPlanConfig) -> None:
         """Reads and rasterises the plans.
@@ -176,6 +179,7 @@ class FloorPlans(Generator):
             raise MapError(path, "", "no plan can be used:\n" + "\n".join(self.left_out.values()))
         self.floors: tuple[PlanFloor, ...] = tuple(floors)
         self.name = f"{FLOOR_PLAN_PREFIX}{path.stem}"
+        self.settings = Settings({**MANY_DOORS, **scaled_to(config.resolution)})
         shapes = np.array([floor.floor.rooms.shape for floor in floors])
         self._shape = int(shapes[:, 0].max()), int(shapes[:, 1].max())
         self._warn_of_losses(path)

@@ -11,10 +11,13 @@ space without a wall between. `clean_map` therefore
    largest such component;
 5. crops to it, with a ring of obstacles around.
 
-Steps 2 and 3 can close a doorway. What a robot of this radius can reach on the map's own pixels but not on the grid is
-named: in ``CleanMap.cut_off``, and by a warning where a world is made of the map.
+Steps 2 and 3 can close a doorway, and on the map itself a building may fall into parts that nothing joins. What step 4
+drops is named, with its area and its cause: in ``CleanMap.cut_off``, and by a warning where a world is made of the map.
 """
 
+import enum
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -25,7 +28,7 @@ from scipy import ndimage
 
 from potlp_jax.environments.ros.map_files import GridFrame, OccupancyMap
 from potlp_jax.environments.ros.places import Point, component_labels, nearest_free
-from potlp_jax.errors import MapError
+from potlp_jax.errors import MapError, MapWarning
 
 CUT_OFF_AREA = 2.0
 """Square metres of free cells from which on a part that is cut off counts as a room, not as a niche."""
@@ -48,17 +51,33 @@ class FreeArea:
     reachable: float
 
 
+class Cause(enum.StrEnum):
+    """Why a part of the building cannot be reached."""
+
+    MAP = "map"
+    """No free pixels join it with the rest."""
+    RADIUS = "radius"
+    """The robot is too wide for what joins it."""
+    CELLS = "cells"
+    """The robot fits, and the working grid closes the passage."""
+
+
 @dataclass(frozen=True)
 class CutOff:
-    """A part of the building that the robot fits into, behind a passage that the working grid closes.
+    """A part of the building that the robot fits into and does not reach.
 
     Attributes:
         at: metres (x, y) of one of its free cells, near its middle.
         area: of its free cells, in square metres.
+        cause: why it is not reached.
     """
 
     at: Point
     area: float
+    cause: Cause
+
+    def __str__(self) -> str:
+        return f"{self.area:.1f} m2 at [{self.at[0]:.2f}, {self.at[1]:.2f}]"
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,13 +88,17 @@ class CleanMap:
         free: the cells that can be reached.
         frame: metres to cells.
         area: what cleaning left of the map's free space.
-        cut_off: parts of `CUT_OFF_AREA` or more that resampling has closed off, the largest first.
+        cut_off: parts of `CUT_OFF_AREA` or more that are not reached, the largest first.
+        lost: the cells of these parts, on the grid before it was cropped.
+        whole: metres to cells of ``lost``.
     """
 
     free: Bool[np.ndarray, "H W"]
     frame: GridFrame
     area: FreeArea
     cut_off: tuple[CutOff, ...]
+    lost: Bool[np.ndarray, "h w"]
+    whole: GridFrame
 
 
 def clean_map(
@@ -120,7 +143,16 @@ def clean_map(
         *(float(pixels.sum()) * float(pixel) ** 2 for pixels in (image_map.free, inflated)),
         *(float(cells.sum()) * frame.resolution**2 for cells in (free, kept)),
     )
-    return _crop(kept, frame, area, _cut_off(inflated, image_map.frame, free & ~kept, kept, frame))
+    lost = free & ~kept
+    causes = {
+        Cause.CELLS: (reached := _joined_cells(inflated, image_map.frame, kept, frame)),
+        Cause.RADIUS: (joined := _joined_cells(image_map.free, image_map.frame, kept, frame)) & ~reached,
+        Cause.MAP: ~joined,
+    }
+    parts = [part for cause, where in causes.items() for part in _parts(lost & where, cause, frame)]
+    parts.sort(key=lambda part: -part[0].area)
+    all_lost = np.any([cells for _, cells in parts], axis=0) if parts else np.zeros_like(lost)
+    return _crop(kept, frame, area, tuple(part for part, _ in parts), all_lost)
 
 
 def _exact(file: Path, field: str, number: float) -> Fraction:
@@ -193,24 +225,22 @@ def _component_of(
     return labels == labels[cell]
 
 
-def _cut_off(
-    inflated: Bool[np.ndarray, "H W"],
-    pixels: GridFrame,
-    lost: Bool[np.ndarray, "h w"],
-    kept: Bool[np.ndarray, "h w"],
-    frame: GridFrame,
-) -> tuple[CutOff, ...]:
-    """Components of ``lost`` cells whose pixels are connected with those of the cells that are kept."""
-    # On the map's own pixels the robot gets there; only the size of the cells keeps it out.
-    components = component_labels(inflated)
-    numbers = components[_pixels_of(frame, pixels)]
-    labels = component_labels(lost & (numbers == numbers[tuple(np.argwhere(kept)[0])]))
+def _joined_cells(
+    passable: Bool[np.ndarray, "H W"], pixels: GridFrame, kept: Bool[np.ndarray, "h w"], frame: GridFrame
+) -> Bool[np.ndarray, "h w"]:
+    """Cells whose pixels are connected with those of the cells that are kept, through ``passable`` pixels."""
+    numbers = component_labels(passable)[_pixels_of(frame, pixels)]
+    return numbers == numbers[tuple(np.argwhere(kept)[0])]
+
+
+def _parts(
+    lost: Bool[np.ndarray, "h w"], cause: Cause, frame: GridFrame
+) -> list[tuple[CutOff, Bool[np.ndarray, "h w"]]]:
+    """The components of lost cells that are no niches, and the cells of each."""
+    labels = component_labels(lost)
     sizes = np.bincount(labels.ravel())[1:] * frame.resolution**2
-    found = [
-        CutOff(_middle(labels == 1 + index, frame), float(sizes[index]))
-        for index in np.flatnonzero(sizes >= CUT_OFF_AREA).tolist()
-    ]
-    return tuple(sorted(found, key=lambda part: -part.area))
+    found = [(float(sizes[index]), labels == 1 + index) for index in np.flatnonzero(sizes >= CUT_OFF_AREA).tolist()]
+    return [(CutOff(_middle(cells, frame), area, cause), cells) for area, cells in found]
 
 
 def _pixels_of(frame: GridFrame, pixels: GridFrame) -> tuple[Int[np.ndarray, "h 1"], Int[np.ndarray, "1 w"]]:
@@ -234,9 +264,43 @@ def _middle(part: Bool[np.ndarray, "h w"], frame: GridFrame) -> Point:
     return frame.cell_to_metres(row, col)
 
 
-def _crop(kept: Bool[np.ndarray, "H W"], frame: GridFrame, area: FreeArea, cut_off: tuple[CutOff, ...]) -> CleanMap:
+def _crop(
+    kept: Bool[np.ndarray, "H W"],
+    frame: GridFrame,
+    area: FreeArea,
+    cut_off: tuple[CutOff, ...],
+    lost: Bool[np.ndarray, "H W"],
+) -> CleanMap:
     rows, cols = np.flatnonzero(kept.any(axis=1)), np.flatnonzero(kept.any(axis=0))
     # All kept cells, and one ring of obstacles: sensors and sweeps rely on a closed border.
     content = kept[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
     free = np.pad(content, 1)
-    return CleanMap(free, frame.window(int(rows[0]) - 1, int(cols[0]) - 1, *free.shape), area, cut_off)
+    cropped = frame.window(int(rows[0]) - 1, int(cols[0]) - 1, *free.shape)
+    return CleanMap(free=free, frame=cropped, area=area, cut_off=cut_off, lost=lost, whole=frame)
+
+
+CUT_OFF_NAMED = 3
+"""Parts that a warning names; `CleanMap.cut_off` has all."""
+
+
+def warn_of_cut_off(file: str | Path, clean: CleanMap, resolution: float, radius: float) -> None:
+    """Say what of a map cannot be reached, one MapWarning for each cause."""
+    remarks = {
+        Cause.MAP: "field start: on the map itself no free space joins {parts} with the rest, {total:.0f} of the "
+        "{free:.0f} m2 in which a robot fits; open what joins them in the image, or give a start in the part you mean",
+        Cause.RADIUS: f"radius: passages are too narrow for a robot of radius {radius} m, and cut off {{parts}}; "
+        "use a smaller radius to keep them",
+        Cause.CELLS: f"resolution: cells of {resolution} m close passages into which a robot of radius {radius} m "
+        "fits, and cut off {parts}; use smaller cells to keep them",
+    }
+    for cause, remark in remarks.items():
+        parts = [part for part in clean.cut_off if part.cause is cause]
+        if parts:
+            total, free = sum(part.area for part in parts), clean.area.resampled
+            text = remark.format(parts=_named(parts), total=total, free=free)
+            warnings.warn(f"{file}: {text}", MapWarning, stacklevel=3)
+
+
+def _named(parts: Sequence[CutOff]) -> str:
+    rest = len(parts) - CUT_OFF_NAMED
+    return ", ".join(map(str, parts[:CUT_OFF_NAMED])) + (f" and {rest} more" if rest > 0 else "")

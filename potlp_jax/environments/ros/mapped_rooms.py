@@ -23,16 +23,15 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from potlp_jax.environments.base import Generator
-from potlp_jax.environments.campus.delivery import DeliveryConfig
+from potlp_jax.environments.campus.delivery import PARCELS_FAMILY, scaled_to
 from potlp_jax.environments.campus.furnishing import NO_ROOM, PARCELS, Floor, FurnishConfig, Kind, Placement, furnish
 from potlp_jax.environments.options import parse_options
-from potlp_jax.environments.ros.cleaning import CleanMap, clean_map
+from potlp_jax.environments.ros.cleaning import CleanMap, clean_map, warn_of_cut_off
 from potlp_jax.environments.ros.map_files import load_map
 from potlp_jax.environments.ros.places import Region, load_regions
 from potlp_jax.environments.ros.ros_map import NARROW_DOORS
 from potlp_jax.environments.splits import PARCELS_PREFIX
 from potlp_jax.errors import MapError, MapWarning
-from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.grid import World
 from potlp_jax.world.settings import Settings
 
@@ -41,12 +40,6 @@ PERSON_RADIUS = 0.5
 
 LEAST_ROOM = 2.0
 """Square metres that the robot must be able to reach of a room."""
-
-LEARNED_RESOLUTION = DeliveryConfig().resolution
-"""Metres a cell in the worlds of ``parcels``, whose camera this one equals."""
-
-REPLAN_DISTANCE = 2.0
-"""Metres between decisions, as there."""
 
 MANY_SLIVERS = 64
 """Subgoals that there is room for: where doors may be as narrow as a cell, slivers between clutter are frontiers too,
@@ -85,6 +78,8 @@ class MappedRooms(Generator):
 
     propositions = PARCELS.propositions
     tasks = PARCELS.tasks
+    # They look like the generator's, and the camera shows the same metres.
+    family = PARCELS_FAMILY
 
     def __init__(self, config: MappedRoomsConfig) -> None:
         """Reads the map and its rooms.
@@ -93,13 +88,15 @@ class MappedRooms(Generator):
             MapError: one of them cannot be used, or fewer than two rooms can be reached.
 
         Warns:
-            MapWarning: rooms are left out, because the robot can reach less than ``LEAST_ROOM`` of them.
+            MapWarning: a part of the building cannot be reached, or rooms are left out, because the robot can reach
+                less than ``LEAST_ROOM`` of them.
         """
         self.config = config
         file = Path(config.rooms) if config.rooms is not None else Path(config.file).with_suffix(".rooms.yaml")
         regions = load_regions(file, ("rooms",))["rooms"]
         self.clean: CleanMap = clean_map(load_map(config.file), config.resolution, config.radius)
         self.name = f"{PARCELS_PREFIX}{Path(config.file).stem}"
+        warn_of_cut_off(config.file, self.clean, config.resolution, config.radius)
         self.rooms, self.left_out, self.floor = _floor(regions, self.clean)
         # The hallway counts as the first; two people need two rooms.
         if len(self.rooms) < 3 or not np.any(self.floor.rooms == _HALLWAY):
@@ -145,14 +142,8 @@ class MappedRooms(Generator):
 
 def _settings(resolution: float) -> Settings:
     """Camera and replanning as in ``parcels``, in metres, space for all frontiers, and none too narrow."""
-    # The camera counts in cells. On other cells its lengths are scaled, so that the picture shows the same metres.
-    scale, camera = LEARNED_RESOLUTION / resolution, CameraConfig()
-    lengths = {name: getattr(camera, name) * scale for name in ("far", "eye_height", "wall_height", "texture_reach")}
     frontiers = {"max_subgoals": MANY_SLIVERS, **NARROW_DOORS["decision"]["frontiers"]}
-    replan_distance = REPLAN_DISTANCE / resolution
-    return Settings(
-        {**NARROW_DOORS, "decision": {"frontiers": frontiers}, "camera": lengths, "replan_distance": replan_distance}
-    )
+    return Settings({**NARROW_DOORS, "decision": {"frontiers": frontiers}, **scaled_to(resolution)})
 
 
 def _floor(

@@ -6,7 +6,6 @@ follow after commas: ``map:FILE.yaml,places=OTHER.yaml,resolution=0.2,radius=0.1
 Costs are in metres, since ``World.resolution`` is the size of a cell in metres.
 """
 
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,17 +14,14 @@ from jaxtyping import Int32, PRNGKeyArray
 
 from potlp_jax.environments.base import Generator, host_generators
 from potlp_jax.environments.options import parse_options
-from potlp_jax.environments.ros.cleaning import CleanMap, clean_map
+from potlp_jax.environments.ros.cleaning import clean_map, warn_of_cut_off
 from potlp_jax.environments.ros.map_files import OccupancyMap, load_map
 from potlp_jax.environments.ros.places import Places, load_places, place_letters
-from potlp_jax.errors import MapError, MapWarning
+from potlp_jax.errors import MapError
 from potlp_jax.world.grid import World, make_world
 from potlp_jax.world.settings import Settings
 
 PREFIX = "map:"
-
-CUT_OFF_NAMED = 3
-"""Parts that a warning names; `CleanMap.cut_off` has all."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +69,7 @@ class RosMap(Generator):
             MapError: the map or the places cannot be used; the message names the file, the field, and what to do.
 
         Warns:
-            MapWarning: a part of the building is cut off by the size of the cells; see also
+            MapWarning: a part of the building cannot be reached; see also
                 `potlp_jax.environments.ros.map_files.load_map`.
         """
         self.config = config
@@ -82,7 +78,7 @@ class RosMap(Generator):
         places = config.places if isinstance(config.places, Places) else _find_places(config, self.image_map)
         self.places = places
         self.clean = clean_map(self.image_map, config.resolution, config.radius, places.start, places.source)
-        _warn_of_cut_off(config, self.clean)
+        warn_of_cut_off(config.file, self.clean, config.resolution, config.radius)
         # Not the path as typed: the name goes into the keys of its worlds, and a map is the same map from every folder.
         self.name = f"{PREFIX}{Path(config.file).stem}"
         self.propositions = places.names
@@ -134,21 +130,6 @@ def parse_spec(spec: str) -> RosMapConfig:
     usage = "write map:FILE.yaml[,places=FILE][,resolution=METRES][,radius=METRES]"
     file, values = parse_options(spec, PREFIX, "map", {"places": str, "resolution": float, "radius": float}, usage)
     return RosMapConfig(file, **values)
-
-
-def _warn_of_cut_off(config: RosMapConfig, clean: CleanMap) -> None:
-    if clean.cut_off:
-        named = [
-            f"{part.area:.0f} m2 at [{part.at[0]:.2f}, {part.at[1]:.2f}]" for part in clean.cut_off[:CUT_OFF_NAMED]
-        ]
-        rest = len(clean.cut_off) - len(named)
-        warnings.warn(
-            f"{config.file}: resolution: cells of {config.resolution} m close passages into which a robot of radius "
-            f"{config.radius} m fits, and cut off {', '.join(named)}{f' and {rest} more' if rest else ''}; "
-            "use smaller cells to keep them",
-            MapWarning,
-            stacklevel=3,
-        )
 
 
 def _find_places(config: RosMapConfig, image_map: OccupancyMap) -> Places:
