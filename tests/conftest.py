@@ -13,7 +13,7 @@ from pathlib import Path
 
 import jax
 import pytest
-from hypothesis import settings
+from hypothesis import Phase, settings
 from jax._src import compiler
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -21,6 +21,8 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 # The same examples in every run; HYPOTHESIS_PROFILE=default draws new ones.
 settings.register_profile("same", derandomize=True)
+# The first failure is enough to know that a mutant is caught (`eval.mutants`): nobody reads its smallest example.
+settings.register_profile("mutants", derandomize=True, phases=[Phase.explicit, Phase.generate])
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
 

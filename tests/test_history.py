@@ -125,6 +125,71 @@ def test_several_cubes_leave_the_last_one():
     assert closure.add_outcome(known, 0, False) == (0b110, 0b001)
 
 
+def after(problem, *events):
+    """The history after attempts at the first subgoal, each an edge and its outcome."""
+    history = initial_history(problem)
+    for edge, success in events:
+        history = step_jit(problem, history, jnp.int32(edge), jnp.asarray(success))
+    return history
+
+
+def known(problem, history):
+    """Conditions that hold and that fail at the first subgoal."""
+    holds, fails = unpacked(history, problem.task.condition_mask.shape[0])
+    return set(np.flatnonzero(holds[0]).tolist()), set(np.flatnonzero(fails[0]).tolist())
+
+
+def even_chances(formula):
+    """A problem with one subgoal where everything is within reach and succeeds in half of the cases."""
+    task = task_of(formula)
+    fields = random_fields(task, 1, 0, unreachable=0.0)
+    fields["success_probability"] = np.full((1, len(task.classes)), 0.5)
+    return task, problem_of(task, fields)
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_condition_fails_with_the_last_of_its_cubes(order):
+    """From three states the same letters lead on: from two of them by one of two cubes each, from the third by both."""
+    task, problem = even_chances("(a & F(a & b)) | (!b U c)")
+    conditions = task.outcomes.edge_condition.tolist()
+    either = next(edge for edge, m in enumerate(conditions) if len(task.conditions[m].classes) == 2)
+    cubes = task.conditions[conditions[either]].classes
+    # The failure of which edge's condition says that a cube fails.
+    edges = [next(e for e, m in enumerate(conditions) if task.outcomes.implies[c, m] and e != either) for c in cubes]
+    assert not any(task.outcomes.implies[conditions[either], conditions[edge]] for edge in edges)
+    once = after(problem, (edges[order[0]], False))
+    assert cubes[order[0]] in known(problem, once)[1]
+    assert conditions[either] not in known(problem, once)[1]
+    assert float(terms_jit(problem, once).success_probability[either]) == 0.5
+    twice = after(problem, *((edges[place], False) for place in order))
+    assert {*cubes, conditions[either]} <= known(problem, twice)[1]
+    assert float(terms_jit(problem, twice).success_probability[either]) == 0.0
+
+
+def test_a_condition_that_holds_is_certain_before_it_is_known_which_cube():
+    task, problem = even_chances("F((a | b) & X F a)")
+    conditions = task.outcomes.edge_condition.tolist()
+    either = next(edge for edge, m in enumerate(conditions) if len(task.conditions[m].classes) == 2)
+    assert float(terms_jit(problem, initial_history(problem)).success_probability[either]) == 0.75
+    history = after(problem, (either, True))
+    assert not known(problem, history)[0] & set(task.conditions[conditions[either]].classes)
+    terms = terms_jit(problem, history)
+    assert bool(terms.certain[either])
+    assert float(terms.success_probability[either]) == 1.0
+
+
+def test_where_one_of_two_cubes_must_hold_and_one_fails_the_other_holds():
+    task, problem = even_chances("F((a | b) & X F a)")
+    conditions = task.outcomes.edge_condition.tolist()
+    either = next(edge for edge, m in enumerate(conditions) if len(task.conditions[m].classes) == 2)
+    cubes = set(task.conditions[conditions[either]].classes)
+    single = next(edge for edge in range(len(conditions)) if edge != either)
+    (ruled_out,) = [c for c in cubes if task.outcomes.implies[c, conditions[single]]]
+    holds, fails = known(problem, after(problem, (either, True), (single, False)))
+    assert ruled_out in fails
+    assert cubes - {ruled_out} <= holds
+
+
 def test_success_is_certain_the_second_time_and_owes_the_way_back():
     task = task_of("F(a & F(b & F a))")
     fields = random_fields(task, 2, 0, unreachable=0.0)

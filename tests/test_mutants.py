@@ -2,10 +2,12 @@
 
 import collections
 import dataclasses
+import json
 
 import pytest
 
-from eval.mutants.__main__ import judge, stale, table
+from eval.mutants import __main__ as program
+from eval.mutants.__main__ import judge, page, stale
 from eval.mutants.core import MUTANTS, Mutant
 
 # 1 + 1 made wrong; what is imported stands beside the test.
@@ -53,12 +55,20 @@ def test_verdicts(tree):
     assert (tree / "sums.py").read_text() == sound
 
 
-def test_the_table_counts_what_is_caught():
+def test_tests_that_never_end_are_stopped(tree, monkeypatch):
+    monkeypatch.setattr(program, "LIMIT", 1)
+    endless = dataclasses.replace(SUM, old="return a + b", new="while True: pass")
+    assert judge(endless, tree) | {"seconds": 0} == {"verdict": "caught", "by": "the time limit", "seconds": 0}
+
+
+def test_the_page_counts_what_is_caught(tmp_path):
     rows = [
         {"part": "a part", "fault": "one", "file": "potlp_jax/a.py", "verdict": "caught", "by": "test_a.py::test_b"},
         {"part": "a part", "fault": "two", "file": "potlp_jax/a.py", "verdict": "survived", "by": ""},
     ]
-    text = table(rows)
-    assert "1 of 2 mutants are caught." in text
-    assert "| one | `a.py` | `test_a.py::test_b` |" in text
-    assert "| two | `a.py` | **survived** |" in text
+    (tmp_path / "mutants.json").write_text(json.dumps({"provenance": {"commit": "1" * 40}, "rows": rows}))
+    text = page(rows, tmp_path / "mutants.json")
+    assert "1 of 2 faults are noticed." in text
+    assert "| a part | one | `a.py` | `test_a.py::test_b` |" in text
+    assert "| a part | two | `a.py` | **survived** |" in text
+    assert "commit: `1111111`" in text

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from potlp_jax.errors import TaskError
@@ -246,6 +246,19 @@ def test_implications_are_sound_and_complete_on_corridors(formula):
     expected = np.array([[bool((~first | second).all()) for second in verdicts] for first in verdicts])
     assert np.array_equal(task.outcomes.implies, expected)
     assert expected.sum() > len(expected), "the formula has implications to find"
+
+
+@settings(max_examples=60, deadline=None)
+@given(states=st.integers(3, 5), propositions=st.integers(1, 3), seed=st.integers(0, 10**6))
+def test_each_cube_of_a_condition_implies_it(states, propositions, seed):
+    """What a rollout knows relies on it: where a condition fails, so do all of its cubes."""
+    transitions = np.random.default_rng(seed).integers(0, states, (states, 2**propositions))
+    transitions[0] = 0
+    dfa = canonical_dfa(transitions, np.arange(states) == 0, states - 1)
+    assume(not dfa.trap[dfa.initial])
+    outcomes = find_outcomes(dfa)
+    for m, condition in enumerate(outcomes.conditions):
+        assert outcomes.implies[list(condition.classes), m].all()
 
 
 @settings(max_examples=60, deadline=None)

@@ -111,6 +111,18 @@ def test_enumerated_actions_by_hand():
     np.testing.assert_array_equal(found, expected)
 
 
+def test_a_satisfied_task_leaves_nothing_to_enumerate():
+    """Whatever could be reached, as long as a caller's table says so."""
+    fields = random_fields(task_of(TASK), 2, seed=0, unreachable=0.0)
+    fields["travel"] = np.full_like(fields["travel"], 5.0)
+    fields["success_probability"] = np.full((2, 5), 0.5)
+    found = {}
+    for fields["dfa_state"] in range(4):
+        problem = problem_of(task_of(TASK), fields)
+        found[fields["dfa_state"]] = bool(np.any(enumerate_actions(problem)))
+    assert found == {state: not task_of(TASK).dfa.accepting[state] for state in range(4)}
+
+
 @pytest.mark.parametrize(("formula", "subgoals"), [("F a & F b", 0), ("X a", 2), ("X a", 0)])
 def test_nothing_to_enumerate(formula, subgoals):
     problem = random_problem(formula, subgoals, 0)

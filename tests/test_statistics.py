@@ -76,7 +76,7 @@ def test_trial_that_lost_something_is_counted_apart_and_not_averaged():
     lossy = _trials(OURS)
     lossy[1] = TrialResult(25.0, "satisfied", BUDGET, int(Status.TREE_OVERFLOW | Status.FALLBACK))
     comparison = Comparison.from_results(_results(ours=lossy), resamples=100)
-    assert comparison.losses == {"known-map": {}, "baseline": {}, "ours": {"tree_overflow": 1}}
+    assert comparison.flagged == {"known-map": {}, "baseline": {}, "ours": {"fallback": 1, "tree_overflow": 1}}
     assert (comparison.satisfied.pairs, comparison.satisfied.dropped) == (2, 1)
     assert _row(comparison.satisfied, "known-map").mean_cost == 20.0
     assert _row(comparison.charged, "ours").mean_cost == pytest.approx(70 / 3)

@@ -4,6 +4,7 @@ Where a format has checksums, what is read from a damaged file must be what was 
 it has none (PGM images, ROS 1 bags, YAML), a flipped bit in a value is a value, and nobody can tell.
 """
 
+import contextlib
 import os
 import shutil
 import warnings
@@ -165,6 +166,19 @@ def _record_trees(folder: Path) -> list[Tree]:
 
 def _read_record(folder: Path) -> Any:
     return load_trial(folder / "trial.json").to_dict()
+
+
+def _store_trees(folder: Path) -> list[Tree]:
+    return [kept(folder, "store", seeds.make_store)]
+
+
+def _read_store(folder: Path) -> Any:
+    """What ``potlp sweep show`` reads."""
+    from potlp_jax.sweep.runner import RESULTS
+    from potlp_jax.sweep.store import Store
+
+    with contextlib.closing(Store(folder / RESULTS, read_only=True)) as store:
+        return store.facts(), store.rows(), store.possible("toy", "F goal")
 
 
 def _read_recipe(folder: Path) -> None:
@@ -398,6 +412,7 @@ KINDS = (
         lambda folder: [{"sweep.yaml": seeds.SWEEP_YAML.encode()}],
         lambda folder: read_specification(folder / "sweep.yaml"),
     ),
+    _kind("store of a sweep", _store_trees, _read_store, True),
     _kind("recipe", lambda folder: [{"recipe.yaml": seeds.RECIPE_YAML.encode()}], _read_recipe),
     _kind("training plan and table", lambda folder: [kept(folder, "plan", seeds.make_plan)], _read_training),
     _kind("estimator", _estimator_trees, _read_estimator, True),

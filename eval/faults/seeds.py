@@ -259,6 +259,21 @@ def make_export(folder: Path) -> None:
     export_planner(Task.from_formula("!fire U extinguisher & F fire", ("fire", "extinguisher")), folder, ExportConfig())
 
 
+def make_store(folder: Path) -> None:
+    """The store of a finished sweep."""
+    from potlp_jax.sweep.runner import RESULTS
+    from potlp_jax.sweep.store import Item, Row, Store
+
+    store = Store(folder / RESULTS)
+    store.agree({"specification": {"worlds": 40}})
+    for policy in ("known-map", "baseline"):
+        items = [Item("toy", "F goal", policy, world) for world in range(40)]
+        rest = (100.0, 30, 2, 0, 0, (0, 7), "2,3:70", "abc", {"jax": "1"}, "", 0.5, "0123456789abcdef")
+        store.finish([Row(item, "satisfied", item.world / 7, *rest) for item in items])
+    store.set_possible("toy", "F goal", dict.fromkeys(range(40), True))
+    store.close()
+
+
 def make_plan(folder: Path) -> None:
     """The plan and the table of a training."""
     asked = {"epochs": 2, "minutes": None, "seed": 0}

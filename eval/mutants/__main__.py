@@ -1,11 +1,11 @@
 """Make each fault of ``eval.mutants.core`` in a copy of the tree and run the tests that are to notice it.
 
-    python -m eval.mutants --out out/mutants
-    python -m eval.mutants --only 'pending cost' --out out/mutants
+    python -m eval.mutants --report docs/results/mutants
+    python -m eval.mutants --only 'pending cost' --report out/mutants
 
 A mutant is caught where a test fails, or runs into the time limit: run this on a tree whose tests pass. Results are
-kept in FOLDER/mutants.json, so that the same command again goes on where it was stopped; mutants whose text or tests
-have changed run again. FOLDER/mutants.md has the table. Ends with exit code 1 where a mutant survives, or is stale: its
+kept in PREFIX.json, so that the same command again goes on where it was stopped; mutants whose file or tests have
+changed run again. The page about them stands beside it. Ends with exit code 1 where a mutant survives, or is stale: its
 text does not occur exactly once.
 """
 
@@ -15,7 +15,9 @@ import hashlib
 import json
 import os
 import re
+import resource
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -25,11 +27,12 @@ from pathlib import Path
 from typing import Any
 
 from eval.mutants.core import MUTANTS, Mutant
+from eval.provenance import lines_of
 from potlp_jax.sweep.rows import provenance
 
 ROOT = Path(__file__).parents[2]
-LIMIT: float = 600.0
-"""Seconds that the tests of one mutant may take: many times what they take, for a mutant may never end."""
+LIMIT: int = 600
+"""Seconds of the processor for the tests of one mutant: many times what they take, for a mutant may never end."""
 
 KEPT = ("potlp_jax", "eval", "train", "tests", "docs", "examples", "pyproject.toml", "README.md", "Makefile")
 """Of the tree: what the tests of mutants need."""
@@ -46,19 +49,27 @@ def stale(mutant: Mutant, root: Path = ROOT) -> str | None:
 
 
 def run_tests(folder: Path, tests: Sequence[str], only: str) -> tuple[int, str]:
-    """Exit code of the tests in a copy of the tree, and the first one that failed; 124 at the time limit."""
+    """Exit code of the tests in a copy of the tree, and the first one that failed, or the time limit."""
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
     command += ["-k", only] if only else []
     # The copy is what is imported, whatever is installed.
-    environment = os.environ | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
-    try:
-        done = subprocess.run(
-            command, cwd=folder, env=environment, capture_output=True, text=True, timeout=LIMIT, check=False
-        )
-    except subprocess.TimeoutExpired:
-        return 124, "the time limit"
+    environment = os.environ | {
+        "PYTHONPATH": str(folder),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "HYPOTHESIS_PROFILE": "mutants",
+    }
+    done = subprocess.run(
+        command, cwd=folder, env=environment, preexec_fn=_limit, capture_output=True, text=True, check=False
+    )
+    if done.returncode == -signal.SIGXCPU:
+        return done.returncode, "the time limit"
     failed = re.search(r"^(?:FAILED|ERROR) tests/(\S+)", done.stdout, re.M)
     return done.returncode, failed[1] if failed else ""
+
+
+def _limit() -> None:
+    # Not of the clock: on a busy machine a sound test would run into it, and the mutant count as caught.
+    resource.setrlimit(resource.RLIMIT_CPU, (LIMIT, LIMIT + 10))
 
 
 def judge(mutant: Mutant, folder: Path) -> dict[str, Any]:
@@ -81,9 +92,8 @@ def identity(mutant: Mutant) -> str:
     return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:16]
 
 
-def run(mutants: Sequence[Mutant], out: Path) -> list[dict[str, Any]]:
-    """Judge those that are not judged yet; returns the rows of all."""
-    results = out / "mutants.json"
+def run(mutants: Sequence[Mutant], results: Path) -> list[dict[str, Any]]:
+    """Judge those that the file of results does not have yet; returns the rows of all."""
     rows = {row["identity"]: row for row in json.loads(results.read_text())["rows"]} if results.exists() else {}
     with tempfile.TemporaryDirectory(prefix="potlp-mutants-") as temporary:
         folder = Path(temporary)
@@ -103,23 +113,47 @@ def run(mutants: Sequence[Mutant], out: Path) -> list[dict[str, Any]]:
     return [rows[identity(mutant)] for mutant in mutants]
 
 
+PAGE: str = """# Mutation check of the core
+
+**Question.** Would the tests notice a small fault in the core: in what a rollout knows and costs, the searches,
+sensing, frontiers, distances, automata, labels, the loss, the rules of a trial, the auditor?
+
+**Answer.** {caught} of {all} faults are noticed. Each is made alone in a copy of the repository, and the tests that are
+to notice it run there; the last column names the first one that failed. The faults, with the exchange of text that
+makes each, are in `eval/mutants/core.py`.
+
+**Command.**
+
+```sh
+python -m eval.mutants --report docs/results/mutants
+```
+
+{table}
+<!-- made: {data} -->
+"""
+"""The page of results."""
+
+
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """The rows as Markdown, by part of the core."""
-    caught = sum(row["verdict"] == "caught" for row in rows)
-    lines = [f"{caught} of {len(rows)} mutants are caught."]
-    for part in dict.fromkeys(row["part"] for row in rows):
-        lines += ["", f"### {part[0].upper()}{part[1:]}", "", "| fault | in | noticed by |", "|---|---|---|"]
-        for row in rows:
-            if row["part"] == part:
-                found = f"`{row['by']}`" if row["verdict"] == "caught" else f"**{row['verdict']}**"
-                lines.append(f"| {row['fault']} | `{row['file'].removeprefix('potlp_jax/')}` | {found} |")
+    """The rows as Markdown, in the order of the parts of the core."""
+    lines = ["| part | fault | in | noticed by |", "|---|---|---|---|"]
+    for row in rows:
+        found = f"`{row['by']}`" if row["verdict"] == "caught" else f"**{row['verdict']}**"
+        lines.append(f"| {row['part']} | {row['fault']} | `{row['file'].removeprefix('potlp_jax/')}` | {found} |")
     return "\n".join(lines) + "\n"
+
+
+def page(rows: Sequence[dict[str, Any]], results: Path) -> str:
+    """The page about the rows that a file of results holds."""
+    caught = sum(row["verdict"] == "caught" for row in rows)
+    text = PAGE.format(caught=caught, all=len(rows), table=table(rows), data=results.name)
+    return lines_of(text, results.parent)
 
 
 def main() -> int:
     """Command line; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="folder of the results")
+    parser.add_argument("--report", type=Path, required=True, metavar="PREFIX", help="of the results' files")
     parser.add_argument("--only", default="", help="mutants whose description contains this")
     arguments = parser.parse_args()
     mutants = [mutant for mutant in MUTANTS if arguments.only in mutant.says]
@@ -127,9 +161,10 @@ def main() -> int:
     if wrong:
         print("\n".join(wrong), file=sys.stderr)
         return 1
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    rows = run(mutants, arguments.out)
-    (arguments.out / "mutants.md").write_text(table(rows))
+    results = arguments.report.with_suffix(".json")
+    results.parent.mkdir(parents=True, exist_ok=True)
+    rows = run(mutants, results)
+    results.with_suffix(".md").write_text(page(rows, results))
     survivors = [row for row in rows if row["verdict"] != "caught"]
     print("".join(f"{row['verdict']}: {row['fault']}\n" for row in survivors) or "every mutant is caught")
     return 1 if survivors else 0

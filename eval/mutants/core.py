@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-PLANNING, SEARCH, WORLD, DISTANCES, TASK, LEARNING, TRIALS, JUDGES = (
+PLANNING, SEARCH, WORLD, DISTANCES, TASK, LEARNING, TRIALS, FLAGS, JUDGES = (
     "what a rollout knows and costs",
     "search",
     "sensing and frontiers",
@@ -10,6 +10,7 @@ PLANNING, SEARCH, WORLD, DISTANCES, TASK, LEARNING, TRIALS, JUDGES = (
     "tasks",
     "labels and loss",
     "trials",
+    "status bits",
     "judges",
 )
 """Parts of the core, in the order of the table."""
@@ -146,16 +147,16 @@ _PLANNING_MUTANTS = (
         PLANNING,
         "what holds keeps its chance",
         _HISTORY,
-        "probability = jnp.where(certain, 1.0, jnp.where(impossible, 0.0, probability))",
-        "probability = jnp.where(impossible, 0.0, probability)",
+        "    probability = jnp.where(certain, 1.0, probability)\n",
+        "",
         _ROLLOUTS,
     ),
     Mutant(
         PLANNING,
         "what fails keeps its chance",
         _HISTORY,
-        "probability = jnp.where(certain, 1.0, jnp.where(impossible, 0.0, probability))",
-        "probability = jnp.where(certain, 1.0, probability)",
+        "jnp.where(failed, 0.0, rows.cube_probability[..., k])",
+        "rows.cube_probability[..., k]",
         _ROLLOUTS,
     ),
     Mutant(
@@ -250,12 +251,21 @@ _SEARCH_MUTANTS = (
     ),
     Mutant(
         SEARCH,
-        "satisfying the task costs what a node there would",
-        _BEST_FIRST,
-        "value=jnp.where(descent.accepted, 0.0, value)",
-        "value=value",
+        "a guess takes the satisfied task for a dead end",
+        "potlp_jax/planning/search/guess.py",
+        "after_success=jnp.where(rows.accepts, 0.0, dead_end_cost[:, None])",
+        "after_success=jnp.broadcast_to(dead_end_cost[:, None], rows.accepts.shape)",
         _CONVERGED,
-        "converges or consistent",
+        "converges or wrong_guess or regret",
+    ),
+    Mutant(
+        SEARCH,
+        "a satisfied root costs a dead end",
+        "potlp_jax/planning/search/plan.py",
+        "    value = jnp.where(accepted, 0.0, value)\n",
+        "",
+        _CONVERGED,
+        "accepting_root",
     ),
     Mutant(
         SEARCH,
@@ -331,10 +341,10 @@ _SEARCH_MUTANTS = (
     ),
     Mutant(
         SEARCH,
-        "PO-UCT does not try each action once",
+        "PO-UCT takes an action that it has never tried to be the worst",
         _UCT,
         "jnp.where(visits == 0, -jnp.inf, q_values - width)",
-        "q_values - width",
+        "jnp.where(visits == 0, jnp.inf, q_values - width)",
         ("tests/test_uct.py",),
         "tried_once or literal",
     ),
@@ -482,6 +492,24 @@ _DISTANCE_MUTANTS = (
 _TASK_MUTANTS = (
     Mutant(
         TASK,
+        "the order of Σ does not matter",
+        "potlp_jax/task/propositions.py",
+        "    if tuple(asked) == tuple(known):\n",
+        "    if sorted(asked) == sorted(known):\n",
+        ("tests/test_propositions.py",),
+        "refused",
+    ),
+    Mutant(
+        TASK,
+        "a world may have propositions that the task does not know",
+        "potlp_jax/task/propositions.py",
+        "    if tuple(asked) == tuple(known):\n",
+        "    if tuple(asked) == tuple(known)[: len(asked)]:\n",
+        ("tests/test_propositions.py",),
+        "refused",
+    ),
+    Mutant(
+        TASK,
         "bits of Σ are those of the automaton's own order",
         "potlp_jax/task/task.py",
         "bits = [propositions.index(name) for name in automaton.propositions]",
@@ -496,7 +524,6 @@ _TASK_MUTANTS = (
         "            return ~_reaches(adjacency, avoiding)",
         "            return ~avoiding",
         ("tests/test_automaton.py",),
-        "operators or avoid",
     ),
     Mutant(
         TASK,
@@ -547,8 +574,8 @@ _TASK_MUTANTS = (
         TASK,
         "max_positive_literals drops cubes that need just so many",
         _OUTCOMES,
-        "cube.count(1) <= max_positive_literals",
-        "cube.count(1) < max_positive_literals",
+        "positive <= max_positive_literals",
+        "positive < max_positive_literals",
         ("tests/test_outcomes.py",),
         "max_positive_literals_drops",
     ),
@@ -573,18 +600,18 @@ _LEARNING_MUTANTS = (
     ),
     Mutant(
         LEARNING,
-        "R_F: the farthest observed cell counts too",
+        "R_F: observed cells beyond count too",
         _LABELS,
-        "explored = hidden & jnp.isfinite(cost[HIDDEN])",
-        "explored = jnp.isfinite(cost[HIDDEN])",
+        "enter((hidden, HIDDEN), (way_back, SEEN)),",
+        "enter((hidden | way_back, HIDDEN)),",
         ("tests/test_labels.py",),
     ),
     Mutant(
         LEARNING,
         "R_F: the nearest cell",
         _LABELS,
-        "failure_cost = jnp.max(jnp.where(explored, cost[HIDDEN], 0.0), axis=(0, 1))",
-        "failure_cost = jnp.min(jnp.where(explored, cost[HIDDEN], 0.0), axis=(0, 1))",
+        "failure_cost = jnp.max(jnp.where(jnp.isfinite(cost[HIDDEN]), cost[HIDDEN], 0.0), axis=(0, 1))",
+        "failure_cost = jnp.min(jnp.where(jnp.isfinite(cost[HIDDEN]), cost[HIDDEN], jnp.inf), axis=(0, 1))",
         ("tests/test_labels.py",),
     ),
     Mutant(
@@ -607,10 +634,10 @@ _LEARNING_MUTANTS = (
     ),
     Mutant(
         LEARNING,
-        "loss: R_S is learned from failures too",
+        "loss: R_S is learned from failures too, and R_F from successes",
         _LOSS,
-        "known_success = batch.mask & (success > 0) & jnp.isfinite(batch.success_cost)",
-        "known_success = batch.mask & jnp.isfinite(batch.success_cost)",
+        "jnp.where(known, share * error**2, jnp.float32(0))",
+        "jnp.where(known, error**2, jnp.float32(0))",
         ("tests/test_training.py",),
         "written_out or nan_gradient",
     ),
@@ -626,6 +653,14 @@ _LEARNING_MUTANTS = (
 )
 
 _TRIAL_MUTANTS = (
+    Mutant(
+        TRIALS,
+        "products are contracted with the sum that they are added to (rounding)",
+        "potlp_jax/planning/rounding.py",
+        "return jnp.abs(first * second)",
+        "return first * second",
+        ("tests/test_rounding.py",),
+    ),
     Mutant(
         TRIALS,
         "the word begins with the second cell",
@@ -681,10 +716,10 @@ _TRIAL_MUTANTS = (
     ),
     Mutant(
         TRIALS,
-        "slots of a batch without a running trial go on",
+        "a path of a batch is written over its last cell",
         "potlp_jax/trials/slots.py",
-        "went = jax.lax.cond(progress.tally.running, go, lambda progress, *_: progress, without, scene, move, stop)",
-        "went = go(without, scene, move, stop)",
+        "cells[1:].astype(jnp.int16), (tally.steps + 1, 0))",
+        "cells[1:].astype(jnp.int16), (tally.steps, 0))",
         ("tests/test_batch.py",),
         "alone",
     ),
@@ -696,6 +731,80 @@ _TRIAL_MUTANTS = (
         "kind = jnp.where(acts, MoveKind.ACTION, MoveKind.NONE)",
         ("tests/test_trial.py",),
         "lose_nothing or keep_their_promises",
+    ),
+)
+
+_FLAG_MUTANTS = (
+    Mutant(
+        FLAGS,
+        "a full tree of best-first search is not flagged",
+        _BEST_FIRST,
+        "status_of_rows(is_new & ~added, Status.TREE_OVERFLOW)",
+        "status_of_rows(is_new & ~is_new, Status.TREE_OVERFLOW)",
+        ("tests/test_search.py",),
+        "flagged",
+    ),
+    Mutant(
+        FLAGS,
+        "a rollout of PO-UCT that was cut is not flagged",
+        _UCT,
+        "    overflow |= status_of_rows(rollout.active, Status.DEPTH_OVERFLOW)\n",
+        "",
+        ("tests/test_uct.py",),
+        "flagged",
+    ),
+    Mutant(
+        FLAGS,
+        "an invalid problem is a dead end and nothing more",
+        "potlp_jax/planning/search/lockstep.py",
+        "status = jnp.where(invalid, status_array(Status.INVALID), plan.status)",
+        "status = plan.status",
+        ("tests/test_status.py",),
+        "situation",
+    ),
+    Mutant(
+        FLAGS,
+        "a satisfied root counts as a dead end",
+        "potlp_jax/planning/search/plan.py",
+        "status_of_rows(~available & ~accepted, Status.DEAD_END)",
+        "status_of_rows(~available, Status.DEAD_END)",
+        ("tests/test_status.py",),
+        "situation",
+    ),
+    Mutant(
+        FLAGS,
+        "the bit of a forgotten panorama is lost with the next one",
+        "potlp_jax/learning/memory.py",
+        "status=memory.status | status_if(needed[place], Status.VIEW_OVERFLOW)",
+        "status=status_if(needed[place], Status.VIEW_OVERFLOW)",
+        ("tests/test_memory.py",),
+    ),
+    Mutant(
+        FLAGS,
+        "a fallback is not flagged",
+        "potlp_jax/planning/policies.py",
+        "plan.status | status_if(kind == MoveKind.FALLBACK, Status.FALLBACK)",
+        "plan.status",
+        ("tests/test_status.py",),
+        "situation",
+    ),
+    Mutant(
+        FLAGS,
+        "a move forgets what was cut off among the subgoals",
+        "potlp_jax/planning/move.py",
+        "bits | situation.status | status_if(~goes, Status.NO_FRONTIER)",
+        "bits | status_if(~goes, Status.NO_FRONTIER)",
+        ("tests/test_status.py",),
+        "situation",
+    ),
+    Mutant(
+        FLAGS,
+        "a trial keeps the bits of its last decision alone",
+        _RULES,
+        "status=tally.status | move.status",
+        "status=move.status",
+        ("tests/test_status.py",),
+        "stays",
     ),
 )
 
@@ -755,5 +864,6 @@ MUTANTS: tuple[Mutant, ...] = (
     *_TASK_MUTANTS,
     *_LEARNING_MUTANTS,
     *_TRIAL_MUTANTS,
+    *_FLAG_MUTANTS,
     *_JUDGE_MUTANTS,
 )

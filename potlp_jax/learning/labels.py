@@ -147,7 +147,6 @@ def _labels_of_lanes(
     def cheapest(go: Bool[Array, " L"]) -> Float32[Array, " lanes"]:
         return jnp.min(jnp.where((go[world.letters] & free)[:, :, None], last, jnp.inf), axis=(0, 1))
 
-    # What a robot explores in vain: all that it can reach beyond the subgoal while it keeps the state.
-    explored = hidden & jnp.isfinite(cost[HIDDEN])
-    failure_cost = jnp.max(jnp.where(explored, cost[HIDDEN], 0.0), axis=(0, 1))
+    # What a robot explores in vain: all unobserved cells that it can reach beyond the subgoal while it keeps the state.
+    failure_cost = jnp.max(jnp.where(jnp.isfinite(cost[HIDDEN]), cost[HIDDEN], 0.0), axis=(0, 1))
     return jax.lax.map(cheapest, task.class_go).T, failure_cost

@@ -164,9 +164,9 @@ def loss_sums(answers: Answers, batch: Batch, config: NetworkConfig, scale: Data
     missed = success * of_success * jax.nn.softplus(-answers.success_logit)
     taken = (1 - success) * of_failure * jax.nn.softplus(answers.success_logit)
     probability = answers.success_probability
-    # A label of 0 < P_S < 1, as real data may have, counts in both costs, each by its share.
-    known_success = batch.mask & (success > 0) & jnp.isfinite(batch.success_cost)
-    known_failure = batch.mask & (success < 1) & jnp.isfinite(batch.failure_cost)
+    # Each cost counts by the share of its outcome: of a label of 0 < P_S < 1, as real data may have, both do.
+    known_success = batch.mask & jnp.isfinite(batch.success_cost)
+    known_failure = batch.mask & jnp.isfinite(batch.failure_cost)
     return Sums(
         count=jnp.sum(real),
         cross_entropy=jnp.sum(real * (missed + taken)),

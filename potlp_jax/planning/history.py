@@ -274,7 +274,6 @@ def knowledge_terms(
       P_S, R_S (0 where nothing can succeed), and True where the condition is known to hold.
     """
     certain = _overlaps(holds, rows.condition_bits)
-    impossible = _overlaps(fails, rows.condition_bits)
     probability = jnp.zeros(certain.shape, jnp.float32)
     cost = jnp.full(certain.shape, jnp.inf, jnp.float32)
     # Few cubes, unrolled: the recurrence holds P and R_S of the cubes so far.
@@ -290,8 +289,9 @@ def knowledge_terms(
         first = (probability == 0) & ((chance > 0) | (jnp.isinf(cost) & ~failed))
         cost = jnp.where(first, cube_cost, jnp.where(share > 0, mean, cost))
         probability = jnp.where(first, chance, total)
-    # What is known of the condition overrules what follows from its cubes.
-    probability = jnp.where(certain, 1.0, jnp.where(impossible, 0.0, probability))
+    # A condition may be known to hold before it is known which of its cubes does. One that fails needs no such case:
+    # each of its cubes implies it, so that all of them are known to fail.
+    probability = jnp.where(certain, 1.0, probability)
     return probability, jnp.where(jnp.isinf(cost), 0.0, cost), certain
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Float64, Int64
 from scipy.stats import DegenerateDataWarning, bootstrap
 
 from potlp_jax.codec import finite_or_null
-from potlp_jax.types import Status
+from potlp_jax.types import Status, status_names
 
 # Names as rows hold them. The enumerations that define them (`planning.policies`, `trials.record`) load the planner,
 # which statistics of finished trials do not need.
@@ -27,12 +27,9 @@ BASELINE = "baseline"
 KNOWN_MAP = "known-map"
 SATISFIED = "satisfied"
 
-LOSSES: Status = Status.SUBGOAL_OVERFLOW | Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW
-"""Status bits by which a fixed-size array or loop took something away from a trial; they are counted."""
-
-UNRELIABLE: Status = Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW
-"""Losses after which a trial is not what its planner would have done. It is never averaged in. (That only the nearest
-subgoals are kept is part of the model, docs/model.md section 6.)"""
+UNRELIABLE: Status = Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW | Status.INVALID
+"""Status bits after which a trial is not what its planner would have done: it is never averaged in. (That only the
+nearest subgoals are kept is part of the model, docs/model.md section 6.)"""
 
 CONFIDENCE: float = 0.95
 # 10,000 less one: the ends of the interval are then the 250th resample from either side.
@@ -97,14 +94,14 @@ class Comparison:
 
     ``satisfied`` has the worlds in which every policy ended satisfied, without an ``UNRELIABLE`` bit;
     ``charged`` has all worlds, with a trial that did not end satisfied charged its budget. ``outcomes`` counts the
-    ends of trials per policy, ``losses`` the trials per policy and status bit of ``LOSSES``.
+    ends of trials per policy, ``flagged`` the trials per policy and status bit, by its name.
     """
 
     worlds: int
     satisfied: Table
     charged: Table
     outcomes: Mapping[str, Mapping[str, int]]
-    losses: Mapping[str, Mapping[str, int]]
+    flagged: Mapping[str, Mapping[str, int]]
 
     @classmethod
     def from_results(
@@ -152,7 +149,10 @@ class Comparison:
             ),
             charged=_table(charged, bootstrapped, len(kept)),
             outcomes={policy: _count([trial.outcome for trial in trials]) for policy, trials in results.items()},
-            losses={policy: _count_losses(trials) for policy, trials in results.items()},
+            flagged={
+                policy: _count([name for trial in trials for name in status_names(trial.status)])
+                for policy, trials in results.items()
+            },
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -312,8 +312,3 @@ def _check(results: Mapping[str, Sequence[TrialResult]]) -> None:
 
 def _count(names: Sequence[str]) -> dict[str, int]:
     return dict(sorted(Counter(str(name) for name in names).items()))
-
-
-def _count_losses(trials: Sequence[TrialResult]) -> dict[str, int]:
-    bits = [bit for trial in trials for bit in Status(trial.status & LOSSES)]
-    return _count([str(bit.name).lower() for bit in bits])

@@ -11,7 +11,8 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from potlp_jax.sweep.results import Pair
-from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, SATISFIED, Comparison, PolicyRow
+from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, SATISFIED, UNRELIABLE, Comparison, PolicyRow
+from potlp_jax.types import status_of
 from potlp_jax.view.style import FAINT, INK, PolicyStyle, new_figure, policy_styles
 
 FEW_WORLDS: int = 30
@@ -92,21 +93,24 @@ def remark_lines(comparison: Comparison) -> list[str]:
         others = [f"{count} {name}" for name, count in counts.items() if name != SATISFIED]
         if others:
             lines.append(f"{policy}: {', '.join(others)}")
-    lines += loss_lines(comparison)
+    lines += flag_lines(comparison)
     if 0 < satisfied.pairs < FEW_WORLDS:
         lines.append(f"{satisfied.pairs} worlds are few: the interval says how far the share may be off.")
     return lines
 
 
-def loss_lines(comparison: Comparison) -> list[str]:
-    """One line per policy whose trials lost something to the bounds of arrays or loops."""
+def flag_lines(comparison: Comparison) -> list[str]:
+    """One line per policy whose trials have status bits, and whether they count in costs and savings."""
     return [
-        f"{policy}: "
-        + ", ".join(f"{count} trials with {name.replace('_', ' ')}" for name, count in counts.items())
-        + ", left out of costs and savings"
-        for policy, counts in comparison.losses.items()
+        f"{policy}: trials with " + ", ".join(_flag_words(name, count) for name, count in counts.items())
+        for policy, counts in comparison.flagged.items()
         if counts
     ]
+
+
+def _flag_words(name: str, count: int) -> str:
+    left_out = " (left out of costs and savings)" if status_of([name]) & UNRELIABLE else ""
+    return f"{name.replace('_', ' ')}: {count}{left_out}"
 
 
 def draw_scatter(pairs: Sequence[Pair], policies: Sequence[str], title: str) -> Figure:
