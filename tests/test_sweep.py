@@ -11,7 +11,9 @@ import signal
 import subprocess
 import sys
 import time
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import cast
 
 import jax
 import numpy as np
@@ -355,6 +357,20 @@ def test_bits_that_flip_in_the_file_end_in_one_line_or_change_nothing(tmp_path):
     assert refused > 3
 
 
+def test_rows_that_went_with_a_part_of_the_file_are_missed(tmp_path):
+    store = Store(tmp_path / RESULTS)
+    store.finish([_row(item) for item in ITEMS])
+    root = store._connection.execute("SELECT rootpage FROM sqlite_master WHERE name = 'trials'").fetchone()[0]
+    (size,) = store._connection.execute("PRAGMA page_size").fetchone()
+    store.close()
+    whole = bytearray((tmp_path / RESULTS).read_bytes())
+    # The number of rows on a page stands at its fourth and fifth byte.
+    whole[(root - 1) * size + 4] -= 3
+    (tmp_path / RESULTS).write_bytes(whole)
+    with pytest.raises(StoreError, match="is damaged"):
+        Store(tmp_path / RESULTS, read_only=True)
+
+
 def test_a_full_disk_is_named_and_loses_nothing(tmp_path):
     store = Store(tmp_path / RESULTS)
     store.finish([_row(ITEMS[0])])
@@ -515,7 +531,7 @@ def test_what_a_worker_died_of_is_said(code, told, message, tmp_path, monkeypatc
         if told is not None:
             theirs.send(told)
         theirs.close()
-        workers._running[1] = _Dead(code), ours
+        workers._running[1] = cast("BaseProcess", _Dead(code)), ours
         workers._look_after(1)
 
     if told is None:
