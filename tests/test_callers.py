@@ -11,6 +11,7 @@ from potlp_jax import BestFirstConfig, DecisionConfig, FrontierConfig, PlanningP
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.trials.config import TrialConfig
+from tests.reference.domains import domain_of
 
 TOY = potlp_jax.make("toy")
 TASK = TOY.task(2)
@@ -60,7 +61,9 @@ def test_no_key_is_used_twice():
         with pytest.raises(jax.errors.KeyReuseError):
             jax.random.uniform(key)
         params = EstimatorNetwork(NETWORK).init(jax.random.key(0))
-        estimator = TrainedEstimator(params=params, config=NETWORK, metadata={}, name="untrained", digest="")
+        estimator = TrainedEstimator(
+            params=params, config=NETWORK, domain=domain_of("toy"), metadata={}, name="untrained", digest=""
+        )
         trial = potlp_jax.run(TOY, 2, "potlp", config=settings, estimator=estimator)
         start = Start(TOY.world(0), TASK.arrays, jax.random.key(0), name=0)
         (finished,) = potlp_jax.run_batch([start], "potlp", settings, slots=1, estimator=estimator)

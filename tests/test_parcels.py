@@ -11,7 +11,6 @@ from potlp_jax.environments.campus.delivery import Delivery, DeliveryConfig
 from potlp_jax.environments.campus.furnishing import PARCELS, Floor, FurnishConfig, Kind, furnish
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.ros.mapped_rooms import (
-    MANY_SLIVERS,
     MappedRooms,
     MappedRoomsConfig,
 )
@@ -116,8 +115,7 @@ def test_parcels_of_a_map_take_every_pair_of_rooms_and_are_lit(building):
 def test_trials_on_a_map_see_as_in_the_worlds_that_were_learned_from(building):
     same = MappedRooms(MappedRoomsConfig(building, resolution=DeliveryConfig().resolution, radius=0.0))
     learned_from = trial_config_for(make("parcels"))
-    room = {"decision": {"frontiers": {"max_subgoals": MANY_SLIVERS}}}
-    expected = with_settings(with_settings(learned_from, NARROW_DOORS), room)
+    expected = with_settings(learned_from, NARROW_DOORS)
     assert trial_config_for(same) == expected
     fine = MappedRooms(MappedRoomsConfig(building, resolution=DeliveryConfig().resolution / 2, radius=0.0))
     config = trial_config_for(fine)

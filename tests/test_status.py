@@ -14,10 +14,14 @@ import pytest
 from potlp_jax.environments.registry import make
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.move import Move
-from potlp_jax.planning.policies import Policy, decide
+from potlp_jax.planning.policies import Policy, decide, policy_function
 from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.situation import DecisionConfig
+from potlp_jax.sweep.rows import trial_row
 from potlp_jax.sweep.statistics import UNRELIABLE, Comparison, TrialResult
+from potlp_jax.sweep.store import Item, Store
+from potlp_jax.trials.batch import Start, run_batch
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import load_trial
 from potlp_jax.trials.rules import count_decision, first_tally
@@ -28,6 +32,7 @@ from potlp_jax.world.grid import BeliefMap, belief_from_numpy
 
 ROOT = Path(__file__).parents[1]
 BITS = [bit for bit in Status if bit]
+ALL = functools.reduce(Status.__or__, BITS)
 WORLD = make("toy").world(0)
 # Two things to find, so that plans have several steps.
 TASK = WORLD.task("F goal & F hazard")
@@ -96,7 +101,7 @@ def test_a_decision_sets_the_bits_that_its_situation_calls_for(expected, scene):
 
 
 def test_every_bit_has_a_situation_that_sets_it():
-    assert functools.reduce(Status.__or__, SCENES) == functools.reduce(Status.__or__, BITS)
+    assert functools.reduce(Status.__or__, SCENES) == ALL
 
 
 def test_a_bit_of_one_decision_stays_with_the_trial():
@@ -119,6 +124,27 @@ def test_every_bit_is_kept_in_the_record(tmp_path):
         assert json.loads((tmp_path / "trial.json").read_text())["status"] == [str(bit.name).lower()]
         read = load_trial(tmp_path / "trial.json")
         assert (read.status, {d.status for d in read.decisions}) == (bit, {bit})
+
+
+def flagging(situation, estimates, key, config, intention):
+    """The baseline's decisions with every bit set."""
+    move = policy_function(Policy.BASELINE)(situation, estimates, key, config, intention)
+    return dataclasses.replace(move, status=move.status | status_array(ALL))
+
+
+def test_every_bit_of_a_batch_reaches_the_row_in_the_store(tmp_path):
+    key, task = jax.random.key(0), WORLD.task("F goal")
+    (finished,) = run_batch([Start(WORLD, task.arrays, key)], flagging, TrialConfig())
+    assert finished.status == ALL
+    item = Item("toy", "F goal", "mine", 0)
+    store = Store(tmp_path / "results.sqlite")
+    try:
+        assert store.claim([item], 1) == [item]
+        store.finish([trial_row(item, finished, WORLD, key, TrialConfig(), {})])
+        (row,) = store.rows()
+    finally:
+        store.close()
+    assert row.status == ALL
 
 
 @pytest.mark.parametrize("bit", BITS, ids=lambda bit: bit.name)

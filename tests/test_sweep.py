@@ -11,7 +11,9 @@ import signal
 import subprocess
 import sys
 import time
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import cast
 
 import jax
 import numpy as np
@@ -24,10 +26,10 @@ from potlp_jax.cli.report import page_title
 from potlp_jax.codec import shipped_settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
-from potlp_jax.errors import ConfigurationError, StoreError
+from potlp_jax.errors import ConfigurationError, StoreError, SweepError
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.rows import path_text, read_path
-from potlp_jax.sweep.runner import RESULTS, Sweep, run_sweep
+from potlp_jax.sweep.runner import RESULTS, Sweep, _Workers, run_sweep
 from potlp_jax.sweep.specification import read_specification, specification_from_dict
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store, process_start
 from potlp_jax.task.task import Task
@@ -355,6 +357,20 @@ def test_bits_that_flip_in_the_file_end_in_one_line_or_change_nothing(tmp_path):
     assert refused > 3
 
 
+def test_rows_that_went_with_a_part_of_the_file_are_missed(tmp_path):
+    store = Store(tmp_path / RESULTS)
+    store.finish([_row(item) for item in ITEMS])
+    root = store._connection.execute("SELECT rootpage FROM sqlite_master WHERE name = 'trials'").fetchone()[0]
+    (size,) = store._connection.execute("PRAGMA page_size").fetchone()
+    store.close()
+    whole = bytearray((tmp_path / RESULTS).read_bytes())
+    # The number of rows on a page stands at its fourth and fifth byte.
+    whole[(root - 1) * size + 4] -= 3
+    (tmp_path / RESULTS).write_bytes(whole)
+    with pytest.raises(StoreError, match="is damaged"):
+        Store(tmp_path / RESULTS, read_only=True)
+
+
 def test_a_full_disk_is_named_and_loses_nothing(tmp_path):
     store = Store(tmp_path / RESULTS)
     store.finish([_row(ITEMS[0])])
@@ -440,6 +456,89 @@ def test_killed_after_its_first_trials_it_goes_on_in_two_workers(finished, comma
     assert 1 <= len(before) < 9
     assert subprocess.run([*command, "2"], env=environment).returncode == 0
     assert _rows(tmp_path / "out") == _rows(finished)
+
+
+def _workers_of(process):
+    """The workers of a running command, once there are two."""
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    while True:
+        assert process.poll() is None
+        found = [int(child) for child in children.read_text().split()]
+        workers = [pid for pid in found if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+        if len(workers) == 2:
+            return workers
+        time.sleep(0.05)
+
+
+needs_proc = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="processes are found in /proc")
+
+
+@needs_proc
+def test_after_sigterm_the_command_ends_with_its_workers_and_says_so(command):
+    process = subprocess.Popen([*command, "2"], stderr=subprocess.PIPE, text=True)
+    workers = _workers_of(process)
+    starts = [process_start(worker) for worker in workers]
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGTERM
+    assert "ended by SIGTERM; what is finished is kept" in errors
+    assert all(process_start(worker) != start for worker, start in zip(workers, starts, strict=True))
+
+
+@needs_proc
+def test_a_sweep_goes_on_when_a_worker_is_killed_and_says_so(finished, command, tmp_path):
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": os.environ["POTLP_TEST_CACHE"]}
+    process = subprocess.Popen([*command, "2"], env=environment, stderr=subprocess.PIPE, text=True)
+    os.kill(_workers_of(process)[0], signal.SIGKILL)
+    _, errors = process.communicate()
+    assert process.returncode == 0
+    assert "was killed by SIGKILL; another takes its place" in errors
+    assert _rows(tmp_path / "out") == _rows(finished)
+
+
+def test_where_no_worker_can_be_started_the_message_says_what_to_do(tmp_path, monkeypatch):
+    def start(self):
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr("multiprocessing.context.SpawnProcess.start", start)
+    with pytest.raises(SweepError, match=r"no worker could be started .*fewer --processes; what is finished is kept"):
+        run_sweep(_specification(), tmp_path, 2)
+
+
+class _Dead:
+    """A process that has ended."""
+
+    def __init__(self, code):
+        self.exitcode = code
+
+
+@pytest.mark.parametrize(
+    ("code", "told", "message"),
+    [
+        (1, "the task is impossible", "ended with an error: the task is impossible; what is finished is kept"),
+        (-9, None, "was killed by SIGKILL, and so did 1 before it with no trial finished"),
+        (3, None, "ended with code 3, and so did 1 before it"),
+    ],
+)
+def test_what_a_worker_died_of_is_said(code, told, message, tmp_path, monkeypatch):
+    monkeypatch.setattr("potlp_jax.sweep.runner.MOST_DEATHS", 2)
+    workers = _Workers(Sweep(_specification(), tmp_path), tmp_path, 2)
+    begun = []
+    monkeypatch.setattr(workers, "_start", begun.append)
+
+    def die():
+        ours, theirs = multiprocessing.Pipe(duplex=False)
+        if told is not None:
+            theirs.send(told)
+        theirs.close()
+        workers._running[1] = cast("BaseProcess", _Dead(code)), ours
+        workers._look_after(1)
+
+    if told is None:
+        die()
+        assert begun == [1]
+    with pytest.raises(SweepError, match=message):
+        die()
 
 
 def _potlp(*arguments):

@@ -67,6 +67,7 @@ class Kind:
         limit: seconds that a case may take.
         memory: bytes that a case may add to the address space of its process; None: as many as there are.
         weight: cases of this kind for one of another kind of its part; less than 1 for slow ones.
+        warm_up: cases that nobody counts, run first in each process, so that imports are not measured.
     """
 
     name: str
@@ -75,3 +76,4 @@ class Kind:
     limit: float = LIMIT
     memory: int | None = MEMORY
     weight: float = 1.0
+    warm_up: int = 5

@@ -26,9 +26,6 @@ _START = 300.0
 """Seconds that a process may take to import what it attacks, on a machine that does much else."""
 
 
-_WARM_UP = 5
-
-
 @dataclass(frozen=True)
 class Ending:
     """How a case ended: the message or traceback, and the seconds that it took."""
@@ -140,7 +137,7 @@ def _serve(connection: Connection, modules: tuple[str, ...], name: str, seed: in
     jax.random.key(0).block_until_ready()
     # Libraries in C write remarks about damaged input to the error stream; the table has no place for them.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-    for number in range(_WARM_UP):
+    for number in range(kind.warm_up):
         _empty(folder)
         judged(kind, seed, number, folder)
     if kind.memory is not None:

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Int32, PRNGKeyArray
 from potlp_jax.environments.base import Generator, host_generators
 from potlp_jax.errors import WorldError
 from potlp_jax.world.grid import World, make_world, pad_world
+from potlp_jax.world.settings import Settings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +54,8 @@ class Rooms(Generator):
     """Generator of floors of rooms."""
 
     name = "rooms"
+    # Floors of this size have more open doors at a time than the default keeps.
+    settings = Settings({"decision": {"frontiers": {"max_subgoals": 48}}})
 
     def __init__(self, config: RoomsConfig | None = None) -> None:
         self.config: RoomsConfig = RoomsConfig() if config is None else config

@@ -422,8 +422,8 @@ class _Workers:
         how = f"was killed by {_signal_name(-code)}" if code is not None and code < 0 else f"ended with code {code}"
         if self._deaths >= MOST_DEATHS:
             raise SweepError(
-                f"a worker of the sweep {how}, the {MOST_DEATHS}th in a row that has not finished a trial; if there is "
-                f"too little memory, give fewer --processes; {KEPT}"
+                f"a worker of the sweep {how}, and so did {MOST_DEATHS - 1} before it with no trial finished; if "
+                f"there is too little memory, give fewer --processes; {KEPT}"
             )
         logger.warning(f"a worker of the sweep {how}; another takes its place, and its trials begin again")
         self._start(place)

@@ -179,6 +179,10 @@ class Store:
             self._execute("INSERT INTO facts VALUES ('format', ?, '')", (FORMAT,))
 
     def _check_format(self) -> None:
+        # Checksums tell of rows that were changed; of rows that went with a damaged page SQLite's own check tells.
+        problems = [text for (text,) in self._execute("PRAGMA quick_check") if text != "ok"]
+        if problems:
+            raise StoreError(f"{self.file}: {_DAMAGED.format(one_line(problems[0]))}")
         if not self._execute("SELECT 1 FROM sqlite_master WHERE name = 'facts'"):
             raise StoreError(f"{self.file}: not a store of results; choose another folder")
         found = [value for (value,) in self._execute("SELECT value FROM facts WHERE name = 'format'")]
@@ -364,6 +368,9 @@ def _has_content(file: Path) -> bool:
         return False
 
 
+_DAMAGED = "is damaged, or not a store of results ({}): put back a copy of it, or choose another folder"
+
+
 def _explained(error: Exception) -> str:
     """What went wrong and what to do, of an error of SQLite or the system."""
     text = str(error)
@@ -376,7 +383,7 @@ def _explained(error: Exception) -> str:
         return f"another process has been writing for more than {PATIENCE:g} s {why}: wait for it, or end it"
     if (isinstance(error, sqlite3.OperationalError | OSError) and "I/O" in text) or "unable to open" in text:
         return f"cannot be read or written {why}: look after the disk, its room and the rights to the folder"
-    return f"is damaged, or not a store of results {why}: put back a copy of it, or choose another folder"
+    return _DAMAGED.format(one_line(error))
 
 
 def _row(entry: tuple[Any, ...]) -> Row:

@@ -9,7 +9,7 @@ from typing import Any
 
 from potlp_jax.sweep.results import Pair, compare_pairs
 from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, Table
-from potlp_jax.view.comparisons import loss_lines
+from potlp_jax.view.comparisons import flag_lines
 from potlp_jax.view.replay_page import embed_json, page_style, replay_script
 from potlp_jax.view.report_plots import cumulative, savings_by_world, scatter
 from potlp_jax.view.style import INK, PolicyStyle, policy_styles
@@ -100,7 +100,7 @@ def _section(number: int, cell: Cell, policies: Sequence[str], replays: list[str
     tables = [_table(comparison.satisfied, caption, styles)]
     if comparison.satisfied.dropped:
         tables.append(_table(comparison.charged, "all worlds, unsatisfied trials charged their budget", styles))
-    lines = [*_outcome_lines(comparison.outcomes), *loss_lines(comparison)]
+    lines = [*_outcome_lines(comparison.outcomes), *flag_lines(comparison)]
     plots = [
         (scatter(cell.pairs, policies), "Costs world by world; below the line is cheaper than the baseline."),
         (savings_by_world(cell.pairs, policies), "Savings against the baseline, worlds in order of savings."),

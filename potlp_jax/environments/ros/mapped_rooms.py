@@ -41,10 +41,6 @@ PERSON_RADIUS = 0.5
 LEAST_ROOM = 2.0
 """Square metres that the robot must be able to reach of a room."""
 
-MANY_SLIVERS = 64
-"""Subgoals that there is room for: where doors may be as narrow as a cell, slivers between clutter are frontiers too,
-and 32 nearest ones left out the only way on in a building of 27 rooms."""
-
 _HALLWAY = 0
 
 
@@ -142,8 +138,7 @@ class MappedRooms(Generator):
 
 def _settings(resolution: float) -> Settings:
     """Camera and replanning as in ``parcels``, in metres, space for all frontiers, and none too narrow."""
-    frontiers = {"max_subgoals": MANY_SLIVERS, **NARROW_DOORS["decision"]["frontiers"]}
-    return Settings({**NARROW_DOORS, "decision": {"frontiers": frontiers}, **scaled_to(resolution)})
+    return Settings({**NARROW_DOORS, **scaled_to(resolution)})
 
 
 def _floor(

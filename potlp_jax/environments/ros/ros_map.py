@@ -43,7 +43,7 @@ class RosMapConfig:
     radius: float = 0.1
 
 
-NARROW_DOORS: Settings = Settings({"decision": {"frontiers": {"min_size": 1}}, "panoramas": 128})
+NARROW_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 96, "min_size": 1}}, "panoramas": 128})
 """Settings of trials: after resampling, a door of a real building may be as narrow as one cell, and a frontier is to be
 dropped only where it is smaller than any passage (docs/model.md section 6). Slivers that stay open are remembered: up
 to 59 panoramas still showed a frontier at a time (docs/estimator.md, "Panoramas")."""
