@@ -63,7 +63,7 @@ def run_tests(folder: Path, tests: Sequence[str], only: str) -> tuple[int, str]:
     )
     if done.returncode == -signal.SIGXCPU:
         return done.returncode, "the time limit"
-    failed = re.search(r"^(?:FAILED|ERROR) tests/(\S+)", done.stdout, re.M)
+    failed = re.search(r"^(?:FAILED|ERROR) tests/(.+?)(?: - .*)?$", done.stdout, re.M)
     return done.returncode, failed[1] if failed else ""
 
 
