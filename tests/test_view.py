@@ -571,5 +571,5 @@ def test_comparison_tables():
     remarks = remark_lines(comparison)
     assert remarks[0].startswith("Costs and savings are of the 2 worlds")
     assert "oracle: 1 stuck" in remarks
-    assert "oracle: 1 trials with tree overflow, left out of costs and savings" in remarks
+    assert "oracle: trials with tree overflow: 1 (left out of costs and savings)" in remarks
     assert remarks[-1].startswith("2 worlds are few")
