@@ -26,7 +26,7 @@ from potlp_jax.trials.record import NEVER_SEEN, Outcome
 from potlp_jax.trials.run import run
 from potlp_jax.verify.audit import path_cost, problems_of, problems_of_path
 from potlp_jax.world.frontiers import FrontierConfig
-from potlp_jax.world.grid import world_digest
+from potlp_jax.world.grid import make_world, world_digest
 from potlp_jax.world.sensing import SensorConfig
 
 ENVIRONMENT = "potlp_jax.environments.rooms:Rooms.toy"
@@ -160,6 +160,23 @@ def test_cells_outside_of_the_map_are_found(trial):
     for cell in ((-1, 3), (3, 10**6)):
         path = (trial.path[0], cell, *trial.path[2:])
         assert "outside of the" in problems_of_path(WORLD, path, trial.cost, trial.outcome, FORMULA)[0]
+
+
+def test_a_path_that_violates_is_found_whatever_it_says_of_itself():
+    """A corridor with b on the way to a: told as it was, and told as a success."""
+    letters = np.array([[0, 0, 0, 0, 0], [0, 0, 2, 1, 0], [0, 0, 0, 0, 0]], np.int32)
+    occupied = np.ones((3, 5), bool)
+    occupied[1, 1:4] = False
+    world = make_world(occupied, letters, (1, 1), propositions=("a", "b"))
+    through = [(1, 1), (1, 2), (1, 3)]
+    formula = "!b U a"
+    assert problems_of_path(world, through, 2.0, Outcome.INFEASIBLE, formula) == ["violates the formula"]
+    told = problems_of_path(world, through, 2.0, Outcome.SATISFIED, formula)
+    assert told == ["outcome satisfied is not what the word says", "violates the formula"]
+    assert problems_of_path(world, through[:1], 0.0, Outcome.INFEASIBLE, formula) == []
+    # Who is put down where the task is lost already has violated nothing.
+    lost = make_world(occupied, letters, (1, 2), propositions=("a", "b"))
+    assert problems_of_path(lost, [(1, 2)], 0.0, Outcome.INFEASIBLE, formula) == []
 
 
 def test_a_path_that_goes_on_or_stops_short_is_found(trial):
