@@ -24,7 +24,7 @@ from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import NEVER_SEEN, Outcome
 from potlp_jax.trials.run import run
-from potlp_jax.verify.audit import path_cost, problems_of, problems_of_path
+from potlp_jax.verify.audit import path_cost, problems_of, problems_of_ending, problems_of_path
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import make_world, world_digest
 from potlp_jax.world.sensing import SensorConfig
@@ -214,6 +214,42 @@ CHANGES = {
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_change_of_the_record_is_found(trial, change):
     assert problems_of(dataclasses.replace(trial, **CHANGES[change](trial)), TASK, WORLD)
+
+
+@pytest.fixture(scope="module")
+def unsatisfied():
+    """Trials of which nothing is promised, by how they ended: there is no goal, or the budget is too short to know."""
+    world = dataclasses.replace(WORLD, letters=WORLD.letters * 0)
+    task = world.task("F c")
+    short = dataclasses.replace(CONFIG, budget_factor=0.1)
+    return {
+        Outcome.INFEASIBLE: (run_trial(world, task, "baseline", jax.random.key(0), CONFIG), task, world),
+        Outcome.BUDGET: (run_trial(world, task, "baseline", jax.random.key(0), short), task, world),
+    }
+
+
+@pytest.mark.parametrize("ended", [Outcome.INFEASIBLE, Outcome.BUDGET])
+@pytest.mark.parametrize("said", [Outcome.INFEASIBLE, Outcome.BUDGET, Outcome.STUCK, Outcome.UNFINISHED])
+def test_another_way_to_fail_is_found(unsatisfied, ended, said):
+    trial, task, world = unsatisfied[ended]
+    assert trial.outcome is ended
+    assert bool(problems_of(dataclasses.replace(trial, outcome=said), task, world)) == (said is not ended)
+
+
+@pytest.mark.parametrize(
+    ("outcome", "cost", "wrong"),
+    [
+        ("budget", 100.0, False),
+        ("budget", 99.0, True),
+        ("stuck", 99.0, False),
+        ("stuck", 101.0, True),
+        ("infeasible", 120.0, False),
+        ("unfinished", 10.0, True),
+        ("lost", 10.0, True),
+    ],
+)
+def test_an_end_is_judged_by_the_budget(outcome, cost, wrong):
+    assert bool(problems_of_ending(outcome, cost, 100.0)) == wrong
 
 
 # Sweeps.

@@ -11,7 +11,7 @@ from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.sweep.rows import read_path
 from potlp_jax.sweep.store import Row
 from potlp_jax.trials.rules import trial_key
-from potlp_jax.verify.audit import problems_of_path
+from potlp_jax.verify.audit import problems_of_ending, problems_of_path
 from potlp_jax.world.grid import World, world_digest
 
 
@@ -66,4 +66,5 @@ def problems_of_row(row: Row, world: World, seed: int = 0) -> list[str]:
         return [*found, f"its path cannot be read: {row.path[:40]!r}"]
     if row.steps != len(path) - 1:
         found.append(f"has {row.steps} steps, its path {len(path) - 1}")
+    found += problems_of_ending(row.outcome, row.cost, row.budget)
     return found + problems_of_path(world, path, row.cost, row.outcome, row.item.task)

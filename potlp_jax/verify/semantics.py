@@ -23,7 +23,6 @@ from collections.abc import Sequence
 from functools import cache
 
 from potlp_jax.errors import TaskError
-from potlp_jax.files import short
 
 Formula = tuple
 """Nested tuples: ("true",), ("false",), ("name", p), ("not", f), ("X", f), ("and", f, g), ("U", f, g), ..."""
@@ -217,7 +216,7 @@ def _normal_form(text: str) -> Formula:
     try:
         return _push_negation(_Parser(text).whole(), True)
     except RecursionError:
-        raise TaskError(f"formula {short(text)} is nested too deeply to be judged") from None
+        raise TaskError(f"formula {text[:80]!r} is nested too deeply to be judged") from None
 
 
 def _push_negation(f: Formula, positive: bool) -> Formula:
