@@ -338,6 +338,21 @@ def test_a_change_of_any_row_is_found(sweep, change):
         assert _audited([*rows[:number], ROW_CHANGES[change](row), *rows[number + 1 :]])
 
 
+@pytest.mark.parametrize("change", [{"task": "F a"}, {"policy": "oracle"}, {"task": "F(a & F c) | F b"}])
+def test_a_row_that_the_sweep_does_not_have_is_found(sweep, change, tmp_path):
+    """Its path is legal, and satisfies the other task too."""
+    _, specification, rows = sweep
+    assert _audited([_moved(rows[0], **change)]) == []
+    store = Store(tmp_path / RESULTS)
+    store.agree({"specification": specification.to_dict(), "estimator": None})
+    store.finish([_moved(rows[0], **change), *rows[1:]])
+    store.close()
+    result = CliRunner().invoke(app, ["audit", str(tmp_path), "--json"])
+    assert result.exit_code == 1, result.output
+    (problem,) = json.loads(result.stdout)["problems"]
+    assert "that the sweep does not have" in problem["problem"]
+
+
 def test_a_world_that_was_edited_after_the_sweep_is_found(sweep):
     """A map in a file may change: the rows are of what it was, though each path is still legal in what it is."""
     _, _, rows = sweep
