@@ -85,7 +85,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_as_marked(request: pytest.FixtureRequest) -> Iterator[None]:
-    """XLA's optimiser is on in modules marked ``optimised``, or in all by ``--optimised``; off in what collecting compiles.
+    """XLA's optimiser is on in modules marked ``optimised``, or in all by an option; off in what collecting compiles.
 
     Each module begins without compiled programs: some are of the other kind, and a worker's memory would grow to
     several gigabytes.
