@@ -98,8 +98,10 @@ def _section(number: int, cell: Cell, policies: Sequence[str], replays: list[str
     styles = policy_styles(policies)
     caption = f"{comparison.satisfied.pairs} worlds in which every policy satisfied the task"
     tables = [_table(comparison.satisfied, caption, styles)]
-    if comparison.satisfied.dropped:
-        tables.append(_table(comparison.charged, "all worlds, unsatisfied trials charged their budget", styles))
+    # Of the same worlds it would be the same table.
+    if comparison.charged.pairs > comparison.satisfied.pairs:
+        caption = f"{comparison.charged.pairs} worlds, unsatisfied trials charged their budget"
+        tables.append(_table(comparison.charged, caption, styles))
     lines = [*_outcome_lines(comparison.outcomes), *unreliable_lines(comparison), *flag_lines(comparison)]
     # What counts in no mean is in no picture either.
     drawn = reliable_pairs(cell.pairs)
