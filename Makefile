@@ -5,7 +5,7 @@ PYTHON ?= $(shell for name in python3.12 python3.11 python3.13 python3.14 python
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint site clean
+.PHONY: demo test numbers lint site clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" && $(PYTHON) -c '$(SUPPORTED)' \
@@ -22,6 +22,9 @@ demo: $(VENV)/installed  ## Fire-fighting task 2 in five worlds: a table, both p
 
 test: $(VENV)/installed  ## The whole suite
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+numbers: $(VENV)/installed  ## Tests that compare numbers and take long to optimise, compiled as users' programs are
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m numbers --optimised
 
 lint: $(VENV)/installed  ## Style, format and types
 	$(BIN)/ruff check .

@@ -1,6 +1,7 @@
 """Strict modes for every test, and how each module's programs are compiled.
 
-No silent rank promotion, no silent dtype promotion. Modules marked ``optimised`` are compiled as users' programs are.
+No silent rank promotion, no silent dtype promotion. Modules marked ``optimised`` are compiled as users' programs are;
+those marked ``numbers`` too by ``make numbers``, which is part of CI.
 """
 
 import atexit
@@ -69,7 +70,14 @@ def _unoptimised_options(*arguments, env_options_overrides=None, **options):
 compiler.get_compile_options = _unoptimised_options
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--optimised", action="store_true", help="compile every module with XLA's optimiser")
+
+
 def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line(
+        "markers", "numbers: the module compares numbers and takes minutes to optimise; `make numbers` does"
+    )
     config.addinivalue_line(
         "markers", "optimised: the module compares numbers, so it and the processes it starts run with XLA's optimiser"
     )
@@ -77,14 +85,14 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_as_marked(request: pytest.FixtureRequest) -> Iterator[None]:
-    """XLA's optimiser is on in modules marked ``optimised``, and off in others and in what collecting them compiles.
+    """XLA's optimiser is on in modules marked ``optimised``, or in all by an option; off in what collecting compiles.
 
     Each module begins without compiled programs: some are of the other kind, and a worker's memory would grow to
     several gigabytes.
     """
     jax.clear_caches()
     with pytest.MonkeyPatch.context() as patch:
-        if request.node.get_closest_marker("optimised"):
+        if request.node.get_closest_marker("optimised") or request.config.getoption("optimised"):
             patch.setattr(compiler, "get_compile_options", _compile_options)
         else:
             flags = " ".join(f"--{name}={str(value).lower()}" for name, value in _UNOPTIMISED.items())

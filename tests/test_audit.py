@@ -24,9 +24,9 @@ from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import NEVER_SEEN, Outcome
 from potlp_jax.trials.run import run
-from potlp_jax.verify.audit import path_cost, problems_of, problems_of_path
+from potlp_jax.verify.audit import path_cost, problems_of, problems_of_ending, problems_of_path
 from potlp_jax.world.frontiers import FrontierConfig
-from potlp_jax.world.grid import world_digest
+from potlp_jax.world.grid import make_world, world_digest
 from potlp_jax.world.sensing import SensorConfig
 
 ENVIRONMENT = "potlp_jax.environments.rooms:Rooms.toy"
@@ -162,6 +162,23 @@ def test_cells_outside_of_the_map_are_found(trial):
         assert "outside of the" in problems_of_path(WORLD, path, trial.cost, trial.outcome, FORMULA)[0]
 
 
+def test_a_path_that_violates_is_found_whatever_it_says_of_itself():
+    """A corridor with b on the way to a: told as it was, and told as a success."""
+    letters = np.array([[0, 0, 0, 0, 0], [0, 0, 2, 1, 0], [0, 0, 0, 0, 0]], np.int32)
+    occupied = np.ones((3, 5), bool)
+    occupied[1, 1:4] = False
+    world = make_world(occupied, letters, (1, 1), propositions=("a", "b"))
+    through = [(1, 1), (1, 2), (1, 3)]
+    formula = "!b U a"
+    assert problems_of_path(world, through, 2.0, Outcome.INFEASIBLE, formula) == ["violates the formula"]
+    told = problems_of_path(world, through, 2.0, Outcome.SATISFIED, formula)
+    assert told == ["outcome satisfied is not what the word says", "violates the formula"]
+    assert problems_of_path(world, through[:1], 0.0, Outcome.INFEASIBLE, formula) == []
+    # Who is put down where the task is lost already has violated nothing.
+    lost = make_world(occupied, letters, (1, 2), propositions=("a", "b"))
+    assert problems_of_path(lost, [(1, 2)], 0.0, Outcome.INFEASIBLE, formula) == []
+
+
 def test_a_path_that_goes_on_or_stops_short_is_found(trial):
     back = _with_path(trial, (*trial.path, trial.path[-2]))
     assert "goes on after the task was satisfied" in problems_of(back, TASK, WORLD)
@@ -197,6 +214,42 @@ CHANGES = {
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_change_of_the_record_is_found(trial, change):
     assert problems_of(dataclasses.replace(trial, **CHANGES[change](trial)), TASK, WORLD)
+
+
+@pytest.fixture(scope="module")
+def unsatisfied():
+    """Trials of which nothing is promised, by how they ended: there is no goal, or the budget is too short to know."""
+    world = dataclasses.replace(WORLD, letters=WORLD.letters * 0)
+    task = world.task("F c")
+    short = dataclasses.replace(CONFIG, budget_factor=0.1)
+    return {
+        Outcome.INFEASIBLE: (run_trial(world, task, "baseline", jax.random.key(0), CONFIG), task, world),
+        Outcome.BUDGET: (run_trial(world, task, "baseline", jax.random.key(0), short), task, world),
+    }
+
+
+@pytest.mark.parametrize("ended", [Outcome.INFEASIBLE, Outcome.BUDGET])
+@pytest.mark.parametrize("said", [Outcome.INFEASIBLE, Outcome.BUDGET, Outcome.STUCK, Outcome.UNFINISHED])
+def test_another_way_to_fail_is_found(unsatisfied, ended, said):
+    trial, task, world = unsatisfied[ended]
+    assert trial.outcome is ended
+    assert bool(problems_of(dataclasses.replace(trial, outcome=said), task, world)) == (said is not ended)
+
+
+@pytest.mark.parametrize(
+    ("outcome", "cost", "wrong"),
+    [
+        ("budget", 100.0, False),
+        ("budget", 99.0, True),
+        ("stuck", 99.0, False),
+        ("stuck", 101.0, True),
+        ("infeasible", 120.0, False),
+        ("unfinished", 10.0, True),
+        ("lost", 10.0, True),
+    ],
+)
+def test_an_end_is_judged_by_the_budget(outcome, cost, wrong):
+    assert bool(problems_of_ending(outcome, cost, 100.0)) == wrong
 
 
 # Sweeps.
@@ -283,6 +336,21 @@ def test_a_change_of_any_row_is_found(sweep, change):
     assert _audited(rows) == []
     for number, row in enumerate(rows):
         assert _audited([*rows[:number], ROW_CHANGES[change](row), *rows[number + 1 :]])
+
+
+@pytest.mark.parametrize("change", [{"task": "F a"}, {"policy": "oracle"}, {"task": "F(a & F c) | F b"}])
+def test_a_row_that_the_sweep_does_not_have_is_found(sweep, change, tmp_path):
+    """Its path is legal, and satisfies the other task too."""
+    _, specification, rows = sweep
+    assert _audited([_moved(rows[0], **change)]) == []
+    store = Store(tmp_path / RESULTS)
+    store.agree({"specification": specification.to_dict(), "estimator": None})
+    store.finish([_moved(rows[0], **change), *rows[1:]])
+    store.close()
+    result = CliRunner().invoke(app, ["audit", str(tmp_path), "--json"])
+    assert result.exit_code == 1, result.output
+    (problem,) = json.loads(result.stdout)["problems"]
+    assert "that the sweep does not have" in problem["problem"]
 
 
 def test_a_world_that_was_edited_after_the_sweep_is_found(sweep):

@@ -21,6 +21,8 @@ from potlp_jax.world.grid import (
     world_to_dict,
 )
 
+pytestmark = pytest.mark.numbers
+
 NAMES = tuple(f"p{bit}" for bit in range(16))
 
 

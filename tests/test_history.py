@@ -14,6 +14,8 @@ from potlp_jax.planning.history import action_terms, initial_history, pack_bits,
 from tests.reference.planning import FINISH, ReferenceProblem
 from tests.reference.problems import FORMULAS, SIZES, padded_problem, problem_of, random_fields, task_of
 
+pytestmark = pytest.mark.numbers
+
 SUBGOALS = 3
 terms_jit, step_jit = jax.jit(action_terms), jax.jit(step)
 
@@ -84,13 +86,15 @@ def check_terms(terms, history, reference, rollouts, position, events, actions):
         np.testing.assert_allclose(terms.distance[index], reference.distance(events, action), rtol=1e-5)
 
 
-@pytest.mark.parametrize("formula", ["F a & F b & F c", "F a & F b & F c & F d"])
-def test_more_conditions_than_brute_force_can_take(formula):
-    """19 and 65 conditions, in one and in three words: bit masks in words against Python integers."""
+@pytest.mark.parametrize(
+    ("formula", "words"), [("F a & F b & F c", 1), ("F a & F b & F(c | d)", 2), ("F a & F b & F c & F d", 3)]
+)
+def test_more_conditions_than_brute_force_can_take(formula, words):
+    """19, 37 (some of several cubes) and 65 conditions: bit masks in words against Python integers."""
     task, rng = task_of(formula), np.random.default_rng(0)
     problem = problem_of(task, random_fields(task, 2, 0, unreachable=0.0))
     conditions = problem.task.condition_mask.shape[0]
-    assert (conditions > 64) == (formula.count("F") == 4)
+    assert initial_history(problem).holds.shape[-1] == words
     rollouts = Rollouts(problem)
     for _ in range(3):
         history, position = initial_history(problem), rollouts.root()

@@ -8,11 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from potlp_jax.cli import app
+from potlp_jax.environments.registry import make
 from potlp_jax.errors import ProblemError
-from potlp_jax.planning.problem import PlanningProblem, screen
+from potlp_jax.planning.estimates import Estimates
+from potlp_jax.planning.problem import PlanningProblem, enumerate_actions, screen
 from potlp_jax.planning.search.api import plan_actions, search
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
+from potlp_jax.trials.batch import Start, run_batch
+from potlp_jax.trials.loop import run_trial
 from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL, Status
 from tests.reference.problems import random_problem
 
@@ -87,6 +93,12 @@ def test_an_invalid_problem_has_no_action_in_either_search(name, index, value, c
     assert float(found.value) == np.inf
     assert bool(jnp.all(jnp.isinf(found.q_values)))
     assert not np.any(found.visits)
+
+
+@pytest.mark.parametrize(("name", "index", "value"), WRONG)
+def test_an_invalid_problem_enumerates_no_action(name, index, value):
+    assert bool(jnp.any(enumerate_actions(valid_problem())))
+    assert not bool(jnp.any(enumerate_actions(with_value(valid_problem(), name, index, value))))
 
 
 @pytest.mark.parametrize(("name", "index", "value"), WRONG)
@@ -169,3 +181,33 @@ def test_shapes_of_a_batch_are_checked_with_its_axis():
         jax.eval_shape(lambda keys: search(wrong, keys), keys)
     with pytest.raises(ProblemError, match=r"subgoal_mask has shape \(2, 3\), expected \(3, 'S'\)"):
         jax.eval_shape(lambda problems: search(problems, jax.vmap(jax.random.key)(jnp.arange(3))), problems)
+
+
+def answering_nan(belief, subgoals, task):
+    """An estimator whose network is broken."""
+    nothing = jnp.full((subgoals.mask.shape[0], task.class_mask.shape[0]), jnp.nan)
+    return Estimates(success_probability=nothing, success_cost=nothing, failure_cost=nothing)
+
+
+def test_a_trial_of_a_broken_network_is_flagged_and_its_decisions_say_why(tmp_path):
+    world = make("toy").world(0)
+    task, key = world.task("!hazard U goal"), jax.random.key(0)
+    estimator = jax.tree_util.Partial(answering_nan)
+    trial = run_trial(world, task, "potlp", key, estimator=estimator)
+    (row,) = run_batch([Start(world, task.arrays, key)], "potlp", estimator=estimator)
+    assert trial.status & row.status & Status.INVALID
+    assert (row.outcome, row.status, row.fallbacks) == (
+        trial.outcome,
+        trial.status,
+        sum(d.fallback for d in trial.decisions),
+    )
+    (number, *_) = [d.index for d in trial.decisions if d.status & Status.INVALID]
+    trial.save(tmp_path / "trial.json")
+    explained = CliRunner().invoke(app, ["explain", f"{tmp_path}:{number}"])
+    assert explained.exit_code == 0
+    assert "not allowed" in " ".join(explained.stdout.split())
+    assert "does not search" not in explained.stdout
+    drawn = CliRunner().invoke(app, ["explain", f"{tmp_path}:{number}", "--out", str(tmp_path / "tree.png")])
+    assert drawn.exit_code == 2
+    assert "not allowed" in " ".join(drawn.stderr.split())
+    assert not (tmp_path / "tree.png").exists()

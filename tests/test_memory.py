@@ -113,3 +113,7 @@ def test_a_full_memory_is_flagged():
     order = np.asarray(subgoals.cells)[:3, 1]
     found = np.asarray(observation_of_subgoals(memory, subgoals))[:3]
     assert {int(c): int(n) for c, n in zip(order, found, strict=True)} == {1: 2, 6: 1, 11: 2}
+    # Once more from the last niche, in the place of what was seen there: nothing more is lost, and the bit stays.
+    memory = remember_jit(memory, jnp.zeros(FEATURES), belief, jnp.array([2, niches[-1]]))
+    assert sorted(np.asarray(memory.observation).tolist()) == [1, 3]
+    assert int(memory.status) == Status.VIEW_OVERFLOW

@@ -2,12 +2,11 @@
 
 import collections
 import dataclasses
-import json
 
 import pytest
 
 from eval.mutants import __main__ as program
-from eval.mutants.__main__ import judge, page, stale
+from eval.mutants.__main__ import judge, page, stale, write
 from eval.mutants.core import MUTANTS, Mutant
 
 # 1 + 1 made wrong; what is imported stands beside the test.
@@ -66,9 +65,11 @@ def test_the_page_counts_what_is_caught(tmp_path):
         {"part": "a part", "fault": "one", "file": "potlp_jax/a.py", "verdict": "caught", "by": "test_a.py::test_b"},
         {"part": "a part", "fault": "two", "file": "potlp_jax/a.py", "verdict": "survived", "by": ""},
     ]
-    (tmp_path / "mutants.json").write_text(json.dumps({"provenance": {"commit": "1" * 40}, "rows": rows}))
+    rows = [row | {"commit": number * 40} for row, number in zip(rows, "21", strict=True)]
+    write(rows, tmp_path / "mutants.json")
     text = page(rows, tmp_path / "mutants.json")
     assert "1 of 2 faults are noticed." in text
     assert "| a part | one | `a.py` | `test_a.py::test_b` |" in text
     assert "| a part | two | `a.py` | **survived** |" in text
-    assert "commit: `1111111`" in text
+    # Rows that were known before are of the commit at which they were judged.
+    assert "commit: `1111111`, `2222222`;" in text

@@ -22,6 +22,7 @@ from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import Outcome, load_trial
 from potlp_jax.trials.replay import replay_decision
+from potlp_jax.verify.audit import problems_of
 from potlp_jax.view.replay_page import replay_page
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.sensing import SensorConfig
@@ -85,6 +86,8 @@ def test_a_search_ends_as_the_baseline_does(formula, policy, config):
     assert trial.outcome is reference.outcome is FORMULAS[formula]
     assert trial.cost == reference.cost
     assert trial.path == reference.path
+    # The auditor reads the same formulas by a parser of its own.
+    assert problems_of(trial, task, WORLD) == []
 
 
 def test_a_batch_beside_a_task_that_has_classes():

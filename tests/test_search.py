@@ -33,6 +33,8 @@ from tests.reference.problems import (
     task_of,
 )
 
+pytestmark = pytest.mark.numbers
+
 SUBGOALS = 2
 QUICK = BestFirstConfig(simulations=64, tree_capacity=65)
 tree_jit = jax.jit(search_tree, static_argnames="config")

@@ -26,7 +26,7 @@ from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import load_trial
 from potlp_jax.trials.rules import count_decision, first_tally
 from potlp_jax.types import Status, status_array
-from potlp_jax.view.comparisons import flag_lines
+from potlp_jax.view.comparisons import flag_lines, unreliable_lines
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy
 
@@ -157,6 +157,8 @@ def test_every_bit_is_in_the_report_and_wrong_trials_in_no_mean(bit):
     wrong = bit in UNRELIABLE
     assert comparison.flagged["potlp"] == {str(bit.name).lower(): 1}
     assert comparison.satisfied.pairs == (1 if wrong else 2)
+    assert comparison.charged.pairs == comparison.satisfied.pairs
+    assert len(unreliable_lines(comparison)) == wrong
     (line,) = flag_lines(comparison)
     assert str(bit.name).lower().replace("_", " ") in line
     assert ("left out of costs and savings" in line) == wrong

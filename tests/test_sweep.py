@@ -615,6 +615,17 @@ def test_where_the_loss_is():
     assert "planner 2.0 (10.0 %" in page
 
 
+def test_an_invalid_trial_is_in_no_table_and_no_plot_of_a_report():
+    policies = ["known-map", "baseline", "potlp"]
+    rows = [{policy: _row(Item("toy", "F goal", policy, world)) for policy in policies} for world in range(3)]
+    rows[0]["potlp"] = dataclasses.replace(rows[0]["potlp"], status=int(Status.INVALID))
+    page = report_page("a", [], policies, [Cell("toy", "F goal", rows, [])])
+    assert "potlp (2 worlds)" in page
+    assert page.count('<caption class="note">') == 1
+    assert '<caption class="note">2 worlds in which every policy satisfied the task' in page
+    assert "left out of all tables: 1." in page
+
+
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed to look at the page with")
 def test_a_browser_opens_a_replay_and_closes_it(finished, tmp_path):
     page = tmp_path / "report.html"

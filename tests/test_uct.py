@@ -18,6 +18,8 @@ from potlp_jax.types import NO_ACTION, Status
 from tests.reference.planning import ReferenceProblem, literal_pouct
 from tests.reference.problems import FORMULAS, SIZES, padded_problem, plan_many, problem_of, random_fields, task_of
 
+pytestmark = pytest.mark.numbers
+
 SUBGOALS = 2
 QUICK = UctConfig(simulations=300)
 tree_jit = jax.jit(search_tree, static_argnames="config")

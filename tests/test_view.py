@@ -21,6 +21,7 @@ from potlp_jax.sweep.store import Item, Row
 from potlp_jax.task.task import Task
 from potlp_jax.task.words import transition_words
 from potlp_jax.trials.record import NEVER_SEEN, ActionRecord, Decision, Outcome, Trial
+from potlp_jax.types import Status
 from potlp_jax.view.animation import frame_steps, save_animation
 from potlp_jax.view.automata import draw_automaton, save_automaton, to_dot, to_mermaid
 from potlp_jax.view.comparisons import comparison_table, draw_scatter, remark_lines
@@ -30,8 +31,10 @@ from potlp_jax.view.decisions import (
     action_table,
     decision_to_dict,
     describe_decision,
+    describe_move,
     rank_actions,
     task_of,
+    why_no_actions,
 )
 from potlp_jax.view.labels import place_labels
 from potlp_jax.view.layers import cell_image
@@ -433,6 +436,18 @@ def test_action_table_marks_the_choice(trial):
     assert ["finish", "-", "-", "0.250", "12.5", "7.0", "10.0", "55.0", "40"] in lines
 
 
+def test_a_decision_without_actions_says_why(trial):
+    empty = dataclasses.replace(trial.decisions[0], actions=(), choice=None, preferred=None, kind="fallback")
+    invalid = dataclasses.replace(empty, status=int(Status.INVALID | Status.FALLBACK))
+    assert "was not allowed" in why_no_actions(trial, invalid)
+    assert "the inputs were invalid, nothing was planned: go to the nearest" in describe_move(trial, invalid)
+    dead_end = dataclasses.replace(empty, status=int(Status.DEAD_END | Status.FALLBACK))
+    assert "no action was available" in why_no_actions(trial, dead_end)
+    assert describe_move(trial, dead_end).startswith("no action is available: go to the nearest")
+    direct = dataclasses.replace(empty, status=0, kind="frontier")
+    assert why_no_actions(trial, direct) == f"policy {trial.policy} does not search: it weighed no actions"
+
+
 def test_decision_as_json_is_ranked_and_finite(trial):
     actions = (_action(0, float("inf")), _action(1, 9.0), _action(2, 3.0))
     decision = dataclasses.replace(trial.decisions[0], actions=actions, choice=2)
@@ -556,9 +571,9 @@ def test_comparison_tables():
 
     comparison = Comparison.from_results(
         {
-            "known-map": rows(10.0, 10.0, 10.0),
-            "baseline": rows(20.0, 20.0, 20.0),
-            "oracle": [*rows(12.0, 12.0), *rows(50.0, outcome="stuck", status=2)],
+            "known-map": rows(10.0, 10.0, 10.0, 10.0),
+            "baseline": rows(20.0, 20.0, 20.0, 20.0),
+            "oracle": [*rows(12.0, 12.0), *rows(50.0, outcome="stuck"), *rows(30.0, status=2)],
         },
         resamples=50,
     )
@@ -566,10 +581,12 @@ def test_comparison_tables():
     console.print(comparison_table(comparison))
     lines = [line.split() for line in console.export_text().splitlines()]
     # The stuck trial is charged its budget of 100: (60 - 124) / (60 - 30) of what could be saved.
-    figures = ["2", "of", "3", "12.0", "80.0%", "80.0", "..", "80.0%", "40.0%", "40.0", "±", "0.0%", "-213.3%"]
+    # The one whose tree was full counts nowhere.
+    figures = ["3", "of", "4", "12.0", "80.0%", "80.0", "..", "80.0%", "40.0%", "40.0", "±", "0.0%", "-213.3%"]
     assert ["oracle", *figures] in lines
     remarks = remark_lines(comparison)
     assert remarks[0].startswith("Costs and savings are of the 2 worlds")
     assert "oracle: 1 stuck" in remarks
+    assert "Worlds with a trial that counts in no mean, left out of all tables: 1." in remarks
     assert "oracle: trials with tree overflow: 1 (left out of costs and savings)" in remarks
     assert remarks[-1].startswith("2 worlds are few")

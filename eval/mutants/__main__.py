@@ -28,7 +28,7 @@ from typing import Any
 
 from eval.mutants.core import MUTANTS, Mutant
 from eval.provenance import lines_of
-from potlp_jax.sweep.rows import provenance
+from potlp_jax.sweep.rows import provenance, source_commit
 
 ROOT = Path(__file__).parents[2]
 LIMIT: int = 600
@@ -63,7 +63,7 @@ def run_tests(folder: Path, tests: Sequence[str], only: str) -> tuple[int, str]:
     )
     if done.returncode == -signal.SIGXCPU:
         return done.returncode, "the time limit"
-    failed = re.search(r"^(?:FAILED|ERROR) tests/(\S+)", done.stdout, re.M)
+    failed = re.search(r"^(?:FAILED|ERROR) tests/(.+?)(?: - .*)?$", done.stdout, re.M)
     return done.returncode, failed[1] if failed else ""
 
 
@@ -104,13 +104,18 @@ def run(mutants: Sequence[Mutant], results: Path) -> list[dict[str, Any]]:
             known = identity(mutant)
             if known not in rows:
                 about = {"identity": known, "part": mutant.part, "fault": mutant.says, "file": mutant.file}
-                rows[known] = about | judge(mutant, folder)
+                rows[known] = about | judge(mutant, folder) | {"commit": source_commit()}
                 # After every mutant: all of them take the better part of an hour.
-                ours = [rows[key] for key in map(identity, MUTANTS) if key in rows]
-                results.write_text(json.dumps({"provenance": provenance(), "rows": ours}, indent=1) + "\n")
+                write([rows[key] for key in map(identity, MUTANTS) if key in rows], results)
             row = rows[known]
             print(f"{number}/{len(mutants)} {row['verdict']} ({row['seconds']} s): {mutant.says}", flush=True)
     return [rows[identity(mutant)] for mutant in mutants]
+
+
+def write(rows: Sequence[dict[str, Any]], results: Path) -> None:
+    """The file of results: the rows, and the commits at which they were judged."""
+    commits = sorted({row["commit"] for row in rows})
+    results.write_text(json.dumps({"provenance": provenance(), "commits": commits, "rows": rows}, indent=1) + "\n")
 
 
 PAGE: str = """# Mutation check of the core

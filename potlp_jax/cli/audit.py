@@ -1,5 +1,6 @@
 """``potlp audit``: trials judged against worlds that are made anew."""
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
@@ -49,14 +50,15 @@ def audit(
 def _sweep(folder: Path) -> tuple[int, list[tuple[str, str]]]:
     """How many trials a sweep has, and what is wrong with which."""
     from potlp_jax.cli.inputs import open_store
-    from potlp_jax.sweep.audit import audit_rows
+    from potlp_jax.sweep.audit import audit_items, audit_rows
     from potlp_jax.sweep.specification import specification_from_store
 
     with open_store(folder) as store:
         specification, rows = specification_from_store(store.facts()["specification"]), store.rows()
 
     def judged() -> Iterator[tuple[str, str]]:
-        for row, problem in audit_rows(rows, specification.split, specification.seed):
+        judgements = audit_rows(rows, specification.split, specification.seed)
+        for row, problem in itertools.chain(audit_items(rows, specification), judgements):
             item = row.item
             yield f"{item.environment}, {item.task}, {item.policy}, world {item.world}", problem
 

@@ -53,7 +53,7 @@ def explain_decision(
     json: Json = False,
 ) -> None:
     """Explain one decision: the actions that were weighed, their estimates and expected costs."""
-    from potlp_jax.view.decisions import action_table, decision_to_dict, describe_decision
+    from potlp_jax.view.decisions import action_table, decision_to_dict, describe_decision, why_no_actions
 
     trial, found = _read_decision(decision)
     files = [] if out is None else _draw(trial, found, out, depth=depth, estimator=estimator)
@@ -65,7 +65,7 @@ def explain_decision(
         output.print(action_table(trial, found))
     else:
         output.print(describe_decision(trial, found))
-        output.print(f"policy {trial.policy} does not search: it weighed no actions")
+        output.print(why_no_actions(trial, found))
     for file in files:
         output.print(f"wrote {file}")
 
@@ -95,13 +95,13 @@ def _draw(trial: "Trial", decision: "Decision", out: Path, *, depth: int, estima
     from potlp_jax.cli.inputs import read_estimator
     from potlp_jax.planning.search.inspect import tree_top
     from potlp_jax.trials.replay import panorama_at, replay_decision
-    from potlp_jax.view.decisions import describe_decision, task_of
+    from potlp_jax.view.decisions import describe_decision, task_of, why_no_actions
     from potlp_jax.view.panoramas import draw_panoramas
     from potlp_jax.view.style import save_figure
     from potlp_jax.view.trees import draw_tree
 
     if not decision.actions:
-        fail(f"decision {decision.index} of policy {trial.policy} did not search: there is no tree to draw")
+        fail(f"decision {decision.index}: {why_no_actions(trial, decision)}; there is no tree to draw")
     # A record keeps the actions of a decision but not the tree. Searching again, with its key where the search samples,
     # grows the same tree.
     problem, plan, tree = replay_decision(trial, decision.index, read_estimator(estimator))

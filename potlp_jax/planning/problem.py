@@ -163,8 +163,10 @@ def enumerate_actions(problem: PlanningProblem) -> Bool[Array, "S E"]:
     """The paper's A(b_t) without finish: actions that are available at the root (section III-B).
 
     True where subgoal and edge are real, the subgoal can be reached in state z' through known space, and P_S of the
-    edge's condition is not 0. All False where the task is already satisfied.
+    edge's condition is not 0. All False where the task is already satisfied, and where the problem holds a value that
+    is not allowed (``screen``).
     """
+    problem, _ = screen(problem)
     # The conditions of `history.terms_of_all` at a history in which nothing is known.
     task = problem.task
     robot, state = problem.subgoal_count, problem.dfa_state

@@ -9,9 +9,10 @@ from potlp_jax.environments.base import Generator
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.sweep.rows import read_path
+from potlp_jax.sweep.specification import Cell, Specification
 from potlp_jax.sweep.store import Row
 from potlp_jax.trials.rules import trial_key
-from potlp_jax.verify.audit import problems_of_path
+from potlp_jax.verify.audit import problems_of_ending, problems_of_path
 from potlp_jax.world.grid import World, world_digest
 
 
@@ -43,6 +44,24 @@ def audit_rows(
         yield from ((row, problem) for problem in problems_of_row(row, world, seed))
 
 
+def audit_items(rows: Sequence[Row], specification: Specification) -> Iterator[tuple[Row, str]]:
+    """The rows that a sweep never asked for, each with one sentence.
+
+    Args:
+        rows: of the store, in any order.
+        specification: of the sweep.
+
+    Returns:
+        Rows of another environment, task or policy, or of a world before the first.
+    """
+    for row in rows:
+        item = row.item
+        # A path may satisfy another task as well: that it was not asked for is all that is wrong then.
+        asked = Cell(item.environment, item.task) in specification.cells and item.policy in specification.policies
+        if not asked or item.world < specification.first_world:
+            yield row, "is of an environment, a task, a policy or a world that the sweep does not have"
+
+
 def problems_of_row(row: Row, world: World, seed: int = 0) -> list[str]:
     """What is wrong with one trial; an empty list if nothing is.
 
@@ -66,4 +85,5 @@ def problems_of_row(row: Row, world: World, seed: int = 0) -> list[str]:
         return [*found, f"its path cannot be read: {row.path[:40]!r}"]
     if row.steps != len(path) - 1:
         found.append(f"has {row.steps} steps, its path {len(path) - 1}")
+    found += problems_of_ending(row.outcome, row.cost, row.budget)
     return found + problems_of_path(world, path, row.cost, row.outcome, row.item.task)

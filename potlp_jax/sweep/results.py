@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
-from potlp_jax.sweep.statistics import Comparison, TrialResult
+from potlp_jax.sweep.statistics import UNRELIABLE, Comparison, TrialResult
 from potlp_jax.sweep.store import Row, Store
 
 Pair = Mapping[str, Row]
@@ -106,6 +106,11 @@ def compare_pairs(
     """
     results = {policy: [_result(pair[policy]) for pair in pairs] for policy in policies}
     return Comparison.from_results(results, clusters=clusters)
+
+
+def reliable_pairs(pairs: Sequence[Pair]) -> list[Pair]:
+    """The pairs that figures may be made of: no trial of theirs has an ``UNRELIABLE`` bit."""
+    return [pair for pair in pairs if not any(row.status & UNRELIABLE for row in pair.values())]
 
 
 def _result(row: Row) -> TrialResult:

@@ -93,8 +93,8 @@ class Comparison:
     """The paired comparison.
 
     ``satisfied`` has the worlds in which every policy ended satisfied, without an ``UNRELIABLE`` bit;
-    ``charged`` has all worlds, with a trial that did not end satisfied charged its budget. ``outcomes`` counts the
-    ends of trials per policy, ``flagged`` the trials per policy and status bit, by its name.
+    ``charged`` has all worlds without such a bit, with a trial that did not end satisfied charged its budget.
+    ``outcomes`` counts the ends of trials per policy, ``flagged`` the trials per policy and status bit, by its name.
     """
 
     worlds: int
@@ -139,7 +139,8 @@ class Comparison:
         unreliable = [
             np.array([trial.status & UNRELIABLE != 0 for trial in trials], bool) for trials in results.values()
         ]
-        kept = np.all(list(ended.values()), axis=0) & ~np.any(unreliable, axis=0)
+        reliable = ~np.any(unreliable, axis=0)
+        kept = np.all(list(ended.values()), axis=0) & reliable
         # Giving up must not look cheap, so that a trial that stopped early is charged all that it might have spent.
         charged = {policy: np.where(ended[policy], costs[policy], budgets[policy]) for policy in results}
         return cls(
@@ -147,7 +148,9 @@ class Comparison:
             satisfied=_table(
                 {policy: values[kept] for policy, values in costs.items()}, bootstrapped.of(kept), len(kept)
             ),
-            charged=_table(charged, bootstrapped, len(kept)),
+            charged=_table(
+                {policy: values[reliable] for policy, values in charged.items()}, bootstrapped.of(reliable), len(kept)
+            ),
             outcomes={policy: _count([trial.outcome for trial in trials]) for policy, trials in results.items()},
             flagged={
                 policy: _count([name for trial in trials for name in status_names(trial.status)])

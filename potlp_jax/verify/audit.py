@@ -32,6 +32,7 @@ Cells = list[list[bool]]
 
 # Costs are sums of float64 on both sides, in another order: only rounding may differ.
 _TOLERANCE = 1e-9
+_SINGLE = 1e-5
 
 
 def problems_of(trial: Trial, task: Task, world: World) -> list[str]:
@@ -62,7 +63,7 @@ def problems_of(trial: Trial, task: Task, world: World) -> list[str]:
         found.append("the states are not those of the word")
     elif any(task.dfa.accepting[state] for state in trial.states[:-1]):
         found.append("goes on after the task was satisfied")
-    found += _decision_differences(trial) + _entered_before_observed(trial)
+    found += _decision_differences(trial) + _entered_before_observed(trial) + _ending_differences(trial, task)
     # Ends that are nobody's fault - the task cannot be done here, or a branch was a mistake that could not be known -
     # are no problem. Where nothing can go wrong, not ending satisfied is a fault of the planner.
     if trial.outcome is not Outcome.SATISFIED and satisfaction_is_promised(trial, task):
@@ -158,6 +159,46 @@ def _states_of(task: Task, word: Sequence[int]) -> list[int]:
         state = int(task.dfa.transitions[state, letter])
         states.append(state)
     return states
+
+
+def _ending_differences(trial: Trial, task: Task) -> list[str]:
+    """What speaks against the way in which the trial is said to have ended without being satisfied."""
+    if trial.outcome is Outcome.SATISFIED:
+        return []
+    found = problems_of_ending(trial.outcome, trial.cost, _budget(trial))
+    # Infeasible: the policy knew no move, or the start is in a trap; and nothing else.
+    knew_none = bool(trial.decisions) and trial.decisions[-1].kind == "none"
+    if (knew_none or bool(task.dfa.trap[trial.states[-1]])) != (trial.outcome is Outcome.INFEASIBLE):
+        found.append(f"ended {trial.outcome}, which is not what its last decision says")
+    return found
+
+
+def _budget(trial: Trial) -> float:
+    """The cost at which the trial was to be given up, by its own settings."""
+    return float(trial.config["budget_factor"]) * int(np.sum(trial.world.extent)) * float(trial.world.resolution)
+
+
+def problems_of_ending(outcome: str, cost: float, budget: float) -> list[str]:
+    """What speaks against the end of a trial in simulation, by its cost alone; an empty list if nothing does.
+
+    Args:
+        outcome: how it is said to have ended.
+        cost: what it travelled.
+        budget: the cost at which it was to be given up.
+
+    Returns:
+        One sentence at most.
+    """
+    # A world does not end before the task is decided, as a robot's log may.
+    if outcome not in set(Outcome) - {Outcome.UNFINISHED}:
+        return [f"{outcome!r} is no way for a trial in simulation to end"]
+    # The planner counts in single precision.
+    spent = cost >= budget * (1.0 - _SINGLE)
+    if outcome == Outcome.BUDGET and not spent:
+        return [f"ended {outcome} at the cost {cost}, the budget is {budget}"]
+    if outcome == Outcome.STUCK and cost > budget * (1.0 + _SINGLE):
+        return [f"ended {outcome} at the cost {cost}, beyond the budget {budget}"]
+    return []
 
 
 def _decision_differences(trial: Trial) -> list[str]:

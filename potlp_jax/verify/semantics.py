@@ -4,7 +4,9 @@
 * ``word_satisfies`` and ``word_violates`` tell whether a finite word decides a co-safe formula, whatever follows.
 
 Syntax: ``! & | -> <-> xor ^ X F G U R V W M true false 1 0 [] <>``, also ``&& || => <=>``, names, "quoted names" and
-parentheses. ``U R V W M`` and ``->`` associate to the right and bind as in Spot: from weak to strong
+parentheses; ``X[n]``, ``F[n:m]``, ``G[n:m]`` and, without an end, ``F[n:]`` and ``G[n:]`` (also ``..`` or ``,`` for the
+colon, ``$`` for no end, and ``!``, which changes nothing on infinite words). ``U R V W M`` and ``->`` associate to the
+right and bind as in Spot: from weak to strong
 ``-> <->``, ``xor``, ``|``, ``&``, ``U R W M``, ``X F G !``.
 
 A letter is an integer whose bit i is set where ``propositions[i]`` is true.
@@ -26,7 +28,12 @@ Formula = tuple
 """Nested tuples: ("true",), ("false",), ("name", p), ("not", f), ("X", f), ("and", f, g), ("U", f, g), ..."""
 
 # Longer operators stand before their own beginnings, such as "<->" before "<>".
-_TOKEN = re.compile(r'\s*("(?:[^"\\]|\\.)*"|<->|<=>|->|=>|\[\]|<>|&&|\|\||[!&|^()01]|[A-Za-z_][A-Za-z0-9_.]*)')
+_TOKEN = re.compile(
+    r'\s*("(?:[^"\\]|\\.)*"|<->|<=>|->|=>|\[\]|\[[^][]+\]|<>|&&|\|\||[!&|^()01]|[A-Za-z_][A-Za-z0-9_.]*)'
+)
+# How often in "X[3]", from when to when in "F[2:5]"; "!" and "$" as in Spot.
+_COUNT = re.compile(r"\[\s*(\d*)\s*!?\s*\]")
+_BOUNDS = re.compile(r"\[\s*(\d*)\s*(?::|\.\.|,|to)\s*(\d*|\$)\s*!?\s*\]")
 # Spot reads all of these spellings, and tasks are written for Spot.
 _ALIASES = {"&&": "&", "||": "|", "=>": "->", "<=>": "<->", "[]": "G", "<>": "F", "^": "xor", "V": "R"}
 _CONSTANTS = {"1": ("true",), "true": ("true",), "0": ("false",), "false": ("false",)}
@@ -156,7 +163,7 @@ class _Parser:
         if self.take("!"):
             return ("not", self.unary())
         if operator := self.take("X", "F", "G"):
-            return (operator, self.unary())
+            return self.bounded(operator) if self.tokens[0].startswith("[") else (operator, self.unary())
         if self.take("("):
             inner = self.formula()
             if not self.take(")"):
@@ -169,6 +176,32 @@ class _Parser:
             return _CONSTANTS[token]
         return ("name", re.sub(r"\\(.)", r"\1", token[1:-1]) if token.startswith('"') else token)
 
+    def bounded(self, operator: str) -> Formula:
+        """``X[n] f``: n letters later; ``F[n:m] f`` and ``G[n:m] f``: at one, or at all, of n to m letters later."""
+        text = self.tokens.pop(0)
+        match = (_COUNT if operator == "X" else _BOUNDS).fullmatch(text)
+        if match is None:
+            raise TaskError(f"formula {self.text!r}: cannot read {text!r} after {operator}")
+        inner = self.unary()
+        if operator == "X":
+            # X[!] alone is X.
+            return _later(inner, int(match[1] or 1))
+        first, last = int(match[1] or 0), match[2]
+        if last in ("", "$"):
+            return _later((operator, inner), first)
+        # In either order, as in Spot.
+        first, end = sorted((first, int(last)))
+        joined = inner
+        for _ in range(end - first):
+            joined = ("or" if operator == "F" else "and", inner, ("X", joined))
+        return _later(joined, first)
+
+
+def _later(f: Formula, count: int) -> Formula:
+    for _ in range(count):
+        f = ("X", f)
+    return f
+
 
 def _split_operators(token: str) -> list[str]:
     """``XFa`` is X F a, as in Spot; names such as F1 or X2 are names."""
@@ -180,7 +213,10 @@ def _split_operators(token: str) -> list[str]:
 
 def _normal_form(text: str) -> Formula:
     """Parsed, and rewritten to true, false, literals, and, or, X, U, R."""
-    return _push_negation(_Parser(text).whole(), True)
+    try:
+        return _push_negation(_Parser(text).whole(), True)
+    except RecursionError:
+        raise TaskError(f"formula {text[:80]!r} is nested too deeply to be judged") from None
 
 
 def _push_negation(f: Formula, positive: bool) -> Formula:

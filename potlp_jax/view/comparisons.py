@@ -10,7 +10,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from potlp_jax.sweep.results import Pair
+from potlp_jax.sweep.results import Pair, reliable_pairs
 from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, SATISFIED, UNRELIABLE, Comparison, PolicyRow
 from potlp_jax.types import status_of
 from potlp_jax.view.style import FAINT, INK, PolicyStyle, new_figure, policy_styles
@@ -24,6 +24,7 @@ def comparison_table(comparison: Comparison) -> RichTable:
 
     Costs and savings are those of the worlds in which every policy satisfied the task. Where that leaves worlds out,
     a last column has the share of attainable savings over all worlds, with unsatisfied trials charged their budget.
+    Worlds with an unreliable trial (``UNRELIABLE``) are in neither.
     """
     satisfied, charged = comparison.satisfied, comparison.charged
     # Where the known map costs as much as the baseline, the share of attainable savings is 0 / 0.
@@ -88,6 +89,7 @@ def remark_lines(comparison: Comparison) -> list[str]:
             f"Costs and savings are of the {satisfied.pairs} worlds in which every policy satisfied the task "
             f"({satisfied.dropped} left out); 'all worlds' charges an unsatisfied trial its budget."
         )
+    lines += unreliable_lines(comparison)
     for policy, counts in comparison.outcomes.items():
         # Trials that ended satisfied have a column of the table.
         others = [f"{count} {name}" for name, count in counts.items() if name != SATISFIED]
@@ -97,6 +99,12 @@ def remark_lines(comparison: Comparison) -> list[str]:
     if 0 < satisfied.pairs < FEW_WORLDS:
         lines.append(f"{satisfied.pairs} worlds are few: the interval says how far the share may be off.")
     return lines
+
+
+def unreliable_lines(comparison: Comparison) -> list[str]:
+    """One line if worlds were left out of every table, because a trial there is flagged with an ``UNRELIABLE`` bit."""
+    dropped = comparison.charged.dropped
+    return [f"Worlds with a trial that counts in no mean, left out of all tables: {dropped}."] if dropped else []
 
 
 def flag_lines(comparison: Comparison) -> list[str]:
@@ -114,7 +122,7 @@ def _flag_words(name: str, count: int) -> str:
 
 
 def draw_scatter(pairs: Sequence[Pair], policies: Sequence[str], title: str) -> Figure:
-    """The picture of ``scatter_costs`` with a title.
+    """The picture of ``scatter_costs`` with a title, of the pairs that count in means.
 
     Args:
         pairs: rows of all policies, by world.
@@ -125,7 +133,7 @@ def draw_scatter(pairs: Sequence[Pair], policies: Sequence[str], title: str) -> 
         The figure.
     """
     figure = new_figure(6.4, 6.9)
-    scatter_costs(figure.add_axes((0.12, 0.1, 0.84, 0.78)), pairs, policies)
+    scatter_costs(figure.add_axes((0.12, 0.1, 0.84, 0.78)), reliable_pairs(pairs), policies)
     figure.text(0.5, 0.975, textwrap.fill(title, 88), ha="center", va="top", size=8.5, color=INK)
     return figure
 

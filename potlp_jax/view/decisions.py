@@ -14,7 +14,7 @@ from potlp_jax.codec import finite_or_null
 from potlp_jax.task.task import Task
 from potlp_jax.task.words import state_words, transition_words
 from potlp_jax.trials.record import ActionRecord, Decision, Trial
-from potlp_jax.types import status_names
+from potlp_jax.types import Status, status_names
 
 FIGURES: Mapping[str, str] = MappingProxyType(
     {
@@ -38,6 +38,10 @@ KINDS: Mapping[str, str] = MappingProxyType(
     }
 )
 """What a decision is for where it is no attempt beyond a subgoal, by ``Decision.kind``."""
+
+
+# Of an invalid decision it cannot be said that no action is available: none was looked for.
+_INVALID_KINDS: Mapping[str, str] = MappingProxyType({**KINDS, "fallback": KINDS["frontier"]})
 
 
 @lru_cache(maxsize=8)
@@ -69,6 +73,15 @@ def action_name(action: ActionRecord, task: Task) -> str:
     assert action.from_state is not None
     assert action.to_state is not None
     return f"s{action.subgoal}: {transition_words(task, action.from_state, action.to_state, brief=True)}"
+
+
+def why_no_actions(trial: Trial, decision: Decision) -> str:
+    """Why a decision weighed no actions, one sentence."""
+    if decision.status & Status.INVALID:
+        return "an input of this decision was not allowed, such as an estimate that is NaN: no actions were weighed"
+    if decision.status & (Status.DEAD_END | Status.ACCEPTING_ROOT):
+        return "the policy searched, and no action was available"
+    return f"policy {trial.policy} does not search: it weighed no actions"
 
 
 def action_table(trial: Trial, decision: Decision) -> Table:
@@ -130,7 +143,12 @@ def describe_move(trial: Trial, decision: Decision) -> str:
     """What was decided: the attempt and where it is made, or why the robot went elsewhere."""
     target = "" if decision.target is None else f" at {decision.target[0]},{decision.target[1]}"
     chosen = chosen_action(decision)
-    if chosen is None or chosen.subgoal is None:
+    if decision.status & Status.INVALID:
+        # Whatever the robot did, no action was weighed.
+        move = (
+            f"the inputs were invalid, nothing was planned: {_INVALID_KINDS.get(decision.kind, decision.kind)}{target}"
+        )
+    elif chosen is None or chosen.subgoal is None:
         move = KINDS.get(decision.kind, decision.kind) + target
     else:
         # The cell stands after the subgoal's number: "s2 at 11,30: find alarm".

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any
 
-from potlp_jax.sweep.results import Pair, compare_pairs
+from potlp_jax.sweep.results import Pair, compare_pairs, reliable_pairs
 from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, Table
-from potlp_jax.view.comparisons import flag_lines
+from potlp_jax.view.comparisons import flag_lines, unreliable_lines
 from potlp_jax.view.replay_page import embed_json, page_style, replay_script
 from potlp_jax.view.report_plots import cumulative, savings_by_world, scatter
 from potlp_jax.view.style import INK, PolicyStyle, policy_styles
@@ -98,13 +98,17 @@ def _section(number: int, cell: Cell, policies: Sequence[str], replays: list[str
     styles = policy_styles(policies)
     caption = f"{comparison.satisfied.pairs} worlds in which every policy satisfied the task"
     tables = [_table(comparison.satisfied, caption, styles)]
-    if comparison.satisfied.dropped:
-        tables.append(_table(comparison.charged, "all worlds, unsatisfied trials charged their budget", styles))
-    lines = [*_outcome_lines(comparison.outcomes), *flag_lines(comparison)]
+    # Of the same worlds it would be the same table.
+    if comparison.charged.pairs > comparison.satisfied.pairs:
+        caption = f"{comparison.charged.pairs} worlds, unsatisfied trials charged their budget"
+        tables.append(_table(comparison.charged, caption, styles))
+    lines = [*_outcome_lines(comparison.outcomes), *unreliable_lines(comparison), *flag_lines(comparison)]
+    # What counts in no mean is in no picture either.
+    drawn = reliable_pairs(cell.pairs)
     plots = [
-        (scatter(cell.pairs, policies), "Costs world by world; below the line is cheaper than the baseline."),
-        (savings_by_world(cell.pairs, policies), "Savings against the baseline, worlds in order of savings."),
-        (cumulative(cell.pairs, policies), "Costs summed over the worlds."),
+        (scatter(drawn, policies), "Costs world by world; below the line is cheaper than the baseline."),
+        (savings_by_world(drawn, policies), "Savings against the baseline, worlds in order of savings."),
+        (cumulative(drawn, policies), "Costs summed over the worlds."),
     ]
     figures = "".join(f"<figure>{svg}<figcaption>{caption}</figcaption></figure>" for svg, caption in plots)
     return f"""<section id="cell{number}">{heading}
