@@ -55,7 +55,7 @@ PARTS: Mapping[str, Part] = MappingProxyType(
         "formulas": Part(
             "Formulas",
             ("eval.faults.formulas",),
-            "Formulas: damaged ones, random ones, and ones that grow.",
+            "Formulas at random, and such that grow: chains, many parts, ranges, repeated signs.",
         ),
         "kills": Part(
             "Kills",
