@@ -6,6 +6,7 @@ import sqlite3
 import struct
 import zipfile
 import zlib
+from pathlib import Path
 from fractions import Fraction
 
 import cv2
@@ -553,14 +554,25 @@ def test_words_of_the_command_line_end_well(tmp_path):
         assert Verdict(verdict) in GOOD, text
 
 
-def test_waiting_for_a_core_is_no_time_of_a_case(monkeypatch, tmp_path):
-    (tmp_path / "7").mkdir()
-    (tmp_path / "7" / "schedstat").write_text("1 2000000000 3")
+def test_waiting_for_a_core_is_no_time_of_a_case(monkeypatch):
+    """Of the process and of one that it began, which ends in between."""
+    waits = {1: {"1": 2.0, "5": 0.0}, 2: {"2": 1.0}}
+    now = [100.0]
+    monkeypatch.setattr("eval.faults.worker.os.getpid", lambda: 1)
+    monkeypatch.setattr("eval.faults.worker.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("eval.faults.worker._waits_of", lambda process: dict(waits[process]))
+    monkeypatch.setattr("eval.faults.worker._children", lambda process: [child for child in waits if child != process])
     clock = _Clock(None)
-    clock._tasks = tmp_path
-    clock._began, clock._waited = 100.0, clock._waits()
-    monkeypatch.setattr("eval.faults.worker.time.monotonic", lambda: 110.0)
-    (tmp_path / "7" / "schedstat").write_text("1 8000000000 3")
-    assert clock.seconds() == pytest.approx(4.0)
-    clock._tasks = tmp_path / "gone"
-    assert clock.seconds() == pytest.approx(10.0)
+    now[0] = 110.0
+    waits[1]["1"], waits[1]["5"], waits[2]["2"] = 5.0, 1.0, 3.5
+    assert clock.seconds() == pytest.approx(10.0 - 3.0 - 2.5)
+    del waits[2]
+    now[0] = 112.0
+    assert clock.seconds() == pytest.approx(12.0 - 3.0 - 2.5)
+
+
+def test_what_processes_wait_for_is_read_from_the_system():
+    waits = _Clock(None)._waits()
+    # Nothing where the system does not tell.
+    assert all(wait >= 0.0 for threads in waits.values() for wait in threads.values())
+    assert not Path("/proc/self/schedstat").exists() or waits[os.getpid()]

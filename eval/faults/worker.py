@@ -25,6 +25,9 @@ from potlp_jax.files import one_line
 _START = 300.0
 """Seconds that a process may take to import what it attacks, on a machine that does much else."""
 
+_LOOK = 0.2
+"""Seconds between looks at what the processes of a case have waited for a core, which is known while they live."""
+
 
 @dataclass(frozen=True)
 class Ending:
@@ -44,23 +47,47 @@ def all_kinds(modules: tuple[str, ...]) -> dict[str, Kind]:
 
 
 class _Clock:
-    """Seconds of a process without those in which it waited for a core, while the machine did something else."""
+    """Seconds of a process without those in which it, or a process that it began, waited for a core.
+
+    While one works the other waits for its answer, so what they waited adds up. To be read now and then: what a process
+    waited is known as long as it lives.
+    """
 
     def __init__(self, process: BaseProcess | None) -> None:
-        self._tasks = Path(f"/proc/{process.pid}/task" if process is not None else "/proc/self/task")
-        self._began, self._waited = time.monotonic(), self._waits()
+        self._process = os.getpid() if process is None else process.pid
+        self._began, self._before = time.monotonic(), self._waits()
+        self._longest: dict[int, float] = {}
 
     def seconds(self) -> float:
-        """Since this was made. Of several threads, the one counts that waited longest."""
-        waits = [wait - self._waited.get(thread, 0.0) for thread, wait in self._waits().items()]
-        return time.monotonic() - self._began - max(waits, default=0.0)
+        """Since this was made. Of several threads of a process, the one counts that waited longest."""
+        for process, threads in self._waits().items():
+            before = self._before.get(process, {})
+            waited = max((wait - before.get(thread, 0.0) for thread, wait in threads.items()), default=0.0)
+            self._longest[process] = max(self._longest.get(process, 0.0), waited)
+        return time.monotonic() - self._began - sum(self._longest.values())
 
-    def _waits(self) -> dict[str, float]:
-        """Seconds of waiting by thread; none where the system does not tell, or the process is gone."""
-        try:
-            return {task.name: int((task / "schedstat").read_text().split()[1]) / 1e9 for task in self._tasks.iterdir()}
-        except (OSError, IndexError):
+    def _waits(self) -> dict[int, dict[str, float]]:
+        """Seconds of waiting by process and thread; none where the system does not tell."""
+        if self._process is None:
             return {}
+        return {process: _waits_of(process) for process in (self._process, *_children(self._process))}
+
+
+def _waits_of(process: int) -> dict[str, float]:
+    found = {}
+    # Threads end while they are read.
+    with contextlib.suppress(OSError, IndexError):
+        for task in Path(f"/proc/{process}/task").iterdir():
+            found[task.name] = int((task / "schedstat").read_text().split()[1]) / 1e9
+    return found
+
+
+def _children(process: int) -> list[int]:
+    found = []
+    with contextlib.suppress(OSError):
+        for task in Path(f"/proc/{process}/task").iterdir():
+            found += [int(child) for child in (task / "children").read_text().split()]
+    return found
 
 
 class Worker:
@@ -95,7 +122,7 @@ class Worker:
         connection.send(number)
         try:
             while (left := self._kind.limit - clock.seconds()) > 0:
-                if connection.poll(left):
+                if connection.poll(min(left, _LOOK)):
                     verdict, text = connection.recv()
                     return Ending(Verdict(verdict), text, clock.seconds())
         except EOFError:
