@@ -6,8 +6,8 @@ import sqlite3
 import struct
 import zipfile
 import zlib
-from pathlib import Path
 from fractions import Fraction
+from pathlib import Path
 
 import cv2
 import numpy as np
