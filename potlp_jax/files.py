@@ -53,6 +53,10 @@ DEEPEST: int = 50
 MOST_VALUES: int = 200_000
 """Values of a YAML file with its aliases written out: ten lines of aliases of aliases can stand for billions."""
 
+# OpenCV 4 has its switch at the top, OpenCV 5 in a module of its own.
+_OPENCV_LOG: Any = getattr(cv2.utils, "logging", cv2)
+_SILENT = 0
+
 # No setting has a longer name, and messages quote names whole.
 _LONGEST_NAME = 100
 _LONGEST_INTEGER = 63
@@ -341,11 +345,12 @@ def decode_image(contents: bytes, flags: int, whole: bool = False) -> Shaped[np.
 
 def _decoded(contents: bytes, flags: int) -> np.ndarray | None:
     # OpenCV writes its own lines about damage to the error stream, beside the one that the reader's error is.
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    level = _OPENCV_LOG.getLogLevel()
+    _OPENCV_LOG.setLogLevel(_SILENT)
     try:
         return cv2.imdecode(np.frombuffer(contents, np.uint8), flags)
     finally:
-        cv2.utils.logging.setLogLevel(level)
+        _OPENCV_LOG.setLogLevel(level)
 
 
 def image_size(contents: bytes) -> tuple[int, int]:
