@@ -2,7 +2,7 @@
 
 Pairs of subgoals that one panorama shows, asked for the same outcome class, by their distance from each other: how
 often both succeed and any does, beside what independent chances and their sum say. The
-``exclusive_within`` of an estimator, and ``learning.estimator.SURE``, come from here.
+``exclusive_within`` of an estimator, and ``learning.exclusion.SURE``, come from here.
 
     python -m eval.exclusion potlp_jax/learning/data/firefighting.npz data/validation data/calibration
 """

@@ -75,7 +75,7 @@ class NetworkConfig:
             (standard deviations over the training data).
         step: the least R_S, one step of the grid, in the unit of cost.
         pixel_mean, pixel_scale: pixels in [0, 1] enter as ``(pixel - pixel_mean) / pixel_scale``.
-        exclusive_within: subgoals so many cells apart exclude each other (``learning.estimator.exclusive_chances``); a
+        exclusive_within: subgoals so many cells apart exclude each other (``learning.exclusion.exclusive_chances``); a
             property of the buildings, which ``eval.exclusion`` measures. 0: attempts are independent, as in Eq. 3.
     """
 
