@@ -1,8 +1,8 @@
 """Files that are read: every reader of the library begins here, so that a bad file ends in one clear line, and soon.
 
-A reader asks for the contents (`read_bytes`, `read_text`, `read_json`, `read_yaml`, `read_npz`, `decode_image`), or,
-where another library opens the file itself, for `require_file`; and it parses within `reading`. Both raise the
-reader's own kind of `PotlpError`. What they see to:
+A reader asks for the contents (`read_bytes`, `read_text`, `read_json`, `read_yaml`, `read_npz`, and `images` for
+pixels), or, where another library opens the file itself, for `require_file`; and it parses within `reading`. Both raise
+the reader's own kind of `PotlpError`. What they see to:
 
 - only regular files are opened: a FIFO would wait for ever, and /dev/zero has no end;
 - sizes are checked before anything is read, unpacked or decoded, against limits that the message names;
@@ -13,17 +13,13 @@ import contextlib
 import io
 import json
 import stat
-import warnings
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import yaml
-from jaxtyping import Shaped
-from PIL import Image, UnidentifiedImageError
 
 from potlp_jax.errors import PotlpError
 
@@ -38,12 +34,6 @@ MOST_YAML: int = MIB // 2
 MOST_RECORD: int = 256 * MIB
 """Bytes of a JSON file that the library wrote: a trial of 1,000 decisions has some 10 MiB."""
 
-MOST_IMAGE: int = 256 * MIB
-"""Bytes of an image file."""
-
-MOST_PIXELS: int = 1 << 25
-"""Pixels of an image: 5,792 squared, nearly 300 m of building at 0.05 m a pixel. Reading takes some 40 bytes each."""
-
 MOST_ARRAYS: int = 1024 * MIB
 """Bytes that the arrays of an .npz file may have when they are unpacked."""
 
@@ -53,18 +43,12 @@ DEEPEST: int = 50
 MOST_VALUES: int = 200_000
 """Values of a YAML file with its aliases written out: ten lines of aliases of aliases can stand for billions."""
 
-# OpenCV 4 has its switch at the top, OpenCV 5 in a module of its own.
-_OPENCV_LOG: Any = getattr(cv2.utils, "logging", cv2)
-_SILENT = 0
-
 # No setting has a longer name, and messages quote names whole.
 _LONGEST_NAME = 100
 _LONGEST_INTEGER = 63
 _LONGEST_REASON = 200
 """Characters of another library's message that are passed on."""
 
-# What map savers and cameras write. Formats that run programs or fetch other files (EPS) are not among them.
-_IMAGE_FORMATS = ("PNG", "BMP", "JPEG", "TIFF", "WEBP", "PPM")
 _LIBYAML = yaml.__with_libyaml__
 
 
@@ -312,68 +296,6 @@ def _array(contents: bytes) -> np.ndarray:
         raise ValueError(f"an array of shape {shape} and type {dtype} does not have {found} bytes")
     array = np.frombuffer(contents, dtype, count, stream.tell())
     return array.reshape(shape, order="F" if fortran else "C")
-
-
-def decode_image(contents: bytes, flags: int, whole: bool = False) -> Shaped[np.ndarray, "H W *C"]:
-    """Pixels of an encoded image, as OpenCV orders its channels.
-
-    Args:
-        contents: a file of one of the usual formats.
-        flags: of ``cv2.imdecode``.
-        whole: refuse what is cut short in any format, at the price of decoding twice.
-
-    Returns:
-        The pixels.
-
-    Raises:
-        ValueError: it has more than `MOST_PIXELS`, as its header says before anything is decoded; or it is damaged. PNG
-            has checksums: none of its damage goes unnoticed. So do other errors of Pillow.
-    """
-    # OpenCV passes over the checksums of PNG, and shows grey for what is missing of a JPEG; Pillow does neither.
-    with _header(contents) as image:
-        width, height = image.size
-        if image.format == "PNG":
-            image.verify()
-        elif whole:
-            image.load()
-    pixels = _decoded(contents, flags)
-    # Either of the two libraries may reject what the other reads.
-    if pixels is None or pixels.shape[:2] not in ((height, width), (width, height)):
-        raise ValueError("its pixels cannot be decoded")
-    return pixels
-
-
-def _decoded(contents: bytes, flags: int) -> np.ndarray | None:
-    # OpenCV writes its own lines about damage to the error stream, beside the one that the reader's error is.
-    level = _OPENCV_LOG.getLogLevel()
-    _OPENCV_LOG.setLogLevel(_SILENT)
-    try:
-        return cv2.imdecode(np.frombuffer(contents, np.uint8), flags)
-    finally:
-        _OPENCV_LOG.setLogLevel(level)
-
-
-def image_size(contents: bytes) -> tuple[int, int]:
-    """Width and height of an encoded image, by its header. Raises ValueError, and whatever Pillow raises."""
-    with _header(contents) as image:
-        return image.size
-
-
-def _header(contents: bytes) -> Image.Image:
-    """An image of which only the header is read. Raises ValueError."""
-    with warnings.catch_warnings():
-        # Pillow has a limit on pixels of its own, far above this one, and speaks of attacks.
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        try:
-            image = Image.open(io.BytesIO(contents), formats=_IMAGE_FORMATS)
-        except UnidentifiedImageError as error:
-            raise ValueError("it does not begin as any image does") from error
-        except Image.DecompressionBombError as error:
-            raise ValueError(f"it has more than the {MOST_PIXELS:,} pixels that are read at most") from error
-    width, height = image.size
-    if width * height > MOST_PIXELS:
-        raise ValueError(f"it has {width:,} x {height:,} pixels; at most {MOST_PIXELS:,} are read")
-    return image
 
 
 def require_mapping(path: Path | str, value: Any, error: type[PotlpError], what: str) -> dict[str, Any]:

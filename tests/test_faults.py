@@ -37,8 +37,6 @@ from potlp_jax.environments.ros.map_files import load_map, load_settings, parse_
 from potlp_jax.environments.ros.places import load_places
 from potlp_jax.errors import CheckpointError, ConfigurationError, LogError, MapError, PotlpError, TaskError
 from potlp_jax.files import (
-    MOST_PIXELS,
-    decode_image,
     one_line,
     parse_yaml,
     read_bytes,
@@ -50,6 +48,7 @@ from potlp_jax.files import (
     require_mapping,
     short,
 )
+from potlp_jax.images import MOST_PIXELS, decode_image
 from potlp_jax.logs.bag import open_bag
 from potlp_jax.logs.log import Log
 from potlp_jax.task.task import Task

@@ -12,6 +12,7 @@ ORDER = (
     "errors",
     "precision",
     "files",
+    "images",
     "plugins",
     "codec",
     "cache",

@@ -24,7 +24,8 @@ from jaxtyping import Float32, Int8, Int32, UInt8
 
 from potlp_jax.codec import config_from_dict, differences, json_copy
 from potlp_jax.errors import ConfigurationError, DatasetError
-from potlp_jax.files import decode_image, one_line, reading, require_file, short
+from potlp_jax.files import one_line, reading, require_file, short
+from potlp_jax.images import decode_image
 from potlp_jax.learning.domain import Domain
 from potlp_jax.world.camera import CameraConfig
 

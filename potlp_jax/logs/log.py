@@ -20,7 +20,8 @@ from rosbags.typesys.store import Typestore
 
 from potlp_jax.environments.ros.map_files import LARGEST_NUMBER, LARGEST_PIXEL, OCCUPIED, SMALLEST_PIXEL, GridFrame
 from potlp_jax.errors import LogError
-from potlp_jax.files import decode_image, image_size, reading, short
+from potlp_jax.files import reading, short
+from potlp_jax.images import decode_image, image_size
 from potlp_jax.logs.bag import RawMessage, open_bag
 from potlp_jax.logs.transforms import Edge, Quaternion, Transforms, yaw_of
 

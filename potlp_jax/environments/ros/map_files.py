@@ -37,7 +37,7 @@ import numpy as np
 import yaml
 from jaxtyping import Bool, Float64, Int8, Int64, Shaped
 
-from potlp_jax import files
+from potlp_jax import files, images
 from potlp_jax.errors import MapError, MapWarning
 from potlp_jax.files import short
 
@@ -338,13 +338,13 @@ def _warn(file: Path, field: str, message: str) -> None:
 
 def _read_image(file: Path) -> tuple[Shaped[np.ndarray, "H W C"], int]:
     """Pixels, and the value that stands for white."""
-    content = files.read_bytes(file, MapError, files.MOST_IMAGE)
+    content = files.read_bytes(file, MapError, images.MOST_IMAGE)
     # Magic numbers of the two kinds of PGM.
     if content[:2] in (b"P2", b"P5"):
         with files.reading(file, MapError, "a PGM image"):
             return _read_pgm(file, content)
     with files.reading(file, MapError, "an image (PGM, PNG or BMP)"):
-        pixels = files.decode_image(content, cv2.IMREAD_UNCHANGED, whole=True)
+        pixels = images.decode_image(content, cv2.IMREAD_UNCHANGED, whole=True)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise MapError(file, "", f"has pixels of type {pixels.dtype}; needed are 8 or 16 bits a channel")
     return pixels.reshape(*pixels.shape[:2], -1), int(np.iinfo(pixels.dtype).max)
@@ -359,8 +359,8 @@ def _read_pgm(file: Path, content: bytes) -> tuple[Int64[np.ndarray, "H W 1"], i
     width, height, white = (int(text) for text in re.sub(rb"#[^\n]*\n", b" ", header[0])[2:].split())
     if width == 0 or height == 0 or not 0 < white < 2**16:
         raise MapError(file, "", f"has an invalid PGM header: {width} x {height} pixels, maximum {white}")
-    if width * height > files.MOST_PIXELS:
-        raise MapError(file, "", f"has {width:,} x {height:,} pixels; at most {files.MOST_PIXELS:,} are read")
+    if width * height > images.MOST_PIXELS:
+        raise MapError(file, "", f"has {width:,} x {height:,} pixels; at most {images.MOST_PIXELS:,} are read")
     body = content[header.end() :]
     values = _ascii_values(file, body) if content[:2] == b"P2" else _binary_values(body, white)
     # A file with more is accepted, as by every reader; one with less has lost a part of the building.
