@@ -18,7 +18,7 @@ side, entries                  lines of one side of a square, or pixels of a dis
 Task
 Z                              states of the task automaton (DFA)
 L                              letters, ``2 ** P``; bit ``i`` of a letter is proposition ``i``
-P                              propositions
+P, P1                          propositions
 E                              edges (z', z'') of the automaton that a high-level action can attempt
 C                              outcome classes (stay, cube): what an estimator is asked for
 M                              conditions: the C classes first, then the conditions that several cubes make up
@@ -50,6 +50,7 @@ bands, columns_out             bands of rows of a panorama; columns of a result 
 patch_rows, patch_columns      rows and columns of the patch around a subgoal
 packed, pixels                 bands as channels; values of a patch in one vector
 k                              samples chosen from more
+U, layers                      units of a layer; layers whose units phi scales and shifts
 =============================  ======================================================================================
 
 Costs are ``float32`` in the unit of ``World.resolution`` (cells where it is 1). Unreachable is ``inf``.

@@ -154,8 +154,9 @@ def test_scales_are_those_of_the_labels_that_count():
 
 def test_a_fovea_looks_through_the_data_sets_camera():
     samples = synthetic(6, 8, 2)
+    bare = dataclasses.replace(samples, metadata=dataclasses.replace(samples.metadata, camera={"width": 128}))
     with pytest.raises(TrainingError, match="horizon, far, fold"):
-        network_config(samples, SHAPE, fovea=3)
+        network_config(bare, SHAPE, fovea=3)
     camera = {"horizon": 20.0, "far": 40.0, "fold": 8.0}
     seen = dataclasses.replace(samples, metadata=dataclasses.replace(samples.metadata, camera=camera))
     config = network_config(seen, SHAPE, fovea=3)
@@ -392,6 +393,7 @@ def test_resuming_with_other_options_or_data_names_the_difference(tmp_path):
 def test_the_command_writes_an_estimator_and_resumes(tmp_path):
     from potlp_jax.learning.dataset import write_shard
 
+    recorded = dataclasses.replace(METADATA, camera={**METADATA.camera, "horizon": 24.0, "fold": 8.0})
     for name, seed in (("training", 12), ("validation", 13)):
         samples = synthetic(4, 5, seed)
         views = {key: [0] * 4 for key in ("world", "step", "row", "column")}
@@ -402,8 +404,7 @@ def test_the_command_writes_an_estimator_and_resumes(tmp_path):
         columns |= {key: [0] * 20 for key in ("outcome_class", "row", "column")}
         columns |= {"view": samples.view_of.tolist(), "task": ["F red"] * 20}
         columns |= {"success_probability": samples.success.tolist()}
-        camera = {"horizon": 24.0, "far": 50.0, "fold": 8.0}
-        write_shard(tmp_path / name, 0, views, columns, dataclasses.replace(METADATA, camera=camera))
+        write_shard(tmp_path / name, 0, views, columns, recorded)
     command = [sys.executable, "-c", "from potlp_jax.cli import main; main()", "fit", str(tmp_path / "training")]
     command += ["--validation", str(tmp_path / "validation"), "--out", str(tmp_path / "out"), "--epochs", "2"]
     command += ["--set", "training.views_per_batch=2", "--set", "training.samples_per_view=2"]
@@ -417,7 +418,7 @@ def test_the_command_writes_an_estimator_and_resumes(tmp_path):
         assert "ended by planned" in done.stdout
     params, config, domain, metadata = load_estimator(tmp_path / "out" / "estimator.npz")
     assert config.propositions == ("red", "green")
-    assert domain == METADATA.domain
+    assert domain == recorded.domain
     assert (config.fovea, config.horizon, config.second_widths) == (3, 24.0, (3, 4, 5, 6, 7, 8, 9, 9))
     assert metadata["figures"]["step"] == metadata["best_step"]
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(params))

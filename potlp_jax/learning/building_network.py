@@ -132,7 +132,7 @@ class EncodedMap:
     close: Float32[Array, "*B h w F"]
     scales: tuple[Array, ...]
     whole: Float32[Array, "*B G"]
-    squares: Float32[Array, "*B rows columns P_plus_1"]
+    squares: Float32[Array, "*B rows columns P1"]
 
 
 def map_channels(belief: BeliefMap, painting: Painting) -> Float32[Array, "H W K"]:
@@ -337,7 +337,7 @@ class BuildingNetwork:
 
     def modulation(
         self, params: Params, phi_stay: Int8[Array, "*B P"], phi_go: Int8[Array, "*B P"]
-    ) -> Float32[Array, "*B layers two U"]:
+    ) -> Float32[Array, "*B layers 2 U"]:
         """What a class does to the head's units; the same for all subgoals.
 
         Raises:
@@ -353,7 +353,7 @@ class BuildingNetwork:
         return self._apply(params, "modulate", phi)
 
     def answer(
-        self, params: Params, places: Float32[Array, "*P U"], modulation: Float32[Array, "*M layers two U"]
+        self, params: Params, places: Float32[Array, "*P U"], modulation: Float32[Array, "*M layers 2 U"]
     ) -> Answers:
         """The second stage; equally many leading dimensions, which are broadcast against each other."""
         logit, success, failure = jnp.moveaxis(self._apply(params, "answer", places, modulation), -1, 0)
