@@ -25,8 +25,6 @@ from potlp_jax.world.grid import pad_world
 from potlp_jax.world.sensing import SensorConfig
 from tests.reference.domains import domain_of
 
-pytestmark = pytest.mark.numbers
-
 TOY = make("toy")
 TASKS = [Task.from_formula(text, propositions=TOY.propositions) for text in TOY.tasks.values()]
 SIZES = TASKS[0].sizes.union(TASKS[-1].sizes)

@@ -12,8 +12,6 @@ from potlp_jax.trials.record import load_trial
 from potlp_jax.view.animation import save_animation
 from tests.reference.browser import BROWSER, dump_page
 
-pytestmark = pytest.mark.numbers
-
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):

@@ -16,8 +16,6 @@ from potlp_jax.world.grid import BeliefMap, belief_from_numpy, make_world, pad_w
 from potlp_jax.world.sensing import SensorConfig, observe
 from tests.reference import frontiers as reference
 
-pytestmark = pytest.mark.numbers
-
 find = jax.jit(find_subgoals, static_argnums=3)
 
 

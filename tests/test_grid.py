@@ -21,8 +21,6 @@ from potlp_jax.world.grid import (
     world_to_dict,
 )
 
-pytestmark = pytest.mark.numbers
-
 NAMES = tuple(f"p{bit}" for bit in range(16))
 
 

@@ -14,8 +14,6 @@ from potlp_jax.planning.history import action_terms, initial_history, pack_bits,
 from tests.reference.planning import FINISH, ReferenceProblem
 from tests.reference.problems import FORMULAS, SIZES, padded_problem, problem_of, random_fields, task_of
 
-pytestmark = pytest.mark.numbers
-
 SUBGOALS = 3
 terms_jit, step_jit = jax.jit(action_terms), jax.jit(step)
 

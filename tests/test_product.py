@@ -26,8 +26,6 @@ from potlp_jax.types import NO_STATE
 from potlp_jax.world.moves import DIAGONAL
 from tests.reference import dijkstra
 
-pytestmark = pytest.mark.numbers
-
 FORMULAS = {
     "F a": ("a", "b"),
     "!b U a": ("a", "b"),

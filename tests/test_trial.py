@@ -38,8 +38,6 @@ from potlp_jax.world.grid import BeliefMap, belief_from_numpy, make_world, pad_w
 from potlp_jax.world.sensing import SensorConfig
 from tests.reference.domains import domain_of
 
-pytestmark = pytest.mark.numbers
-
 SIZES = TaskSizes(states=6, propositions=3, edges=9, classes=9, compound=3, cubes=3)
 CONFIG = TrialConfig(
     sensor=SensorConfig(range_cells=6.0),
