@@ -29,7 +29,7 @@ from flax import struct
 from jaxtyping import Array, Float32, Int8, Int32, PRNGKeyArray
 
 from potlp_jax.errors import NetworkError
-from potlp_jax.learning.network import Answers
+from potlp_jax.learning.network import Answers, require_phi
 from potlp_jax.learning.painting import Painting
 from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.frontiers import frontier_cells
@@ -343,12 +343,7 @@ class BuildingNetwork:
         Raises:
             NetworkError: the vectors phi have another length than the network's propositions.
         """
-        expected = len(self.config.propositions)
-        if phi_stay.shape[-1] != expected or phi_go.shape[-1] != expected:
-            raise NetworkError(
-                f"phi of lengths {phi_stay.shape[-1]} and {phi_go.shape[-1]}; this network knows {expected} "
-                f"propositions: {', '.join(self.config.propositions)}"
-            )
+        require_phi(phi_stay, phi_go, self.config.propositions)
         phi = jnp.concatenate([phi_stay, phi_go], axis=-1).astype(jnp.float32)
         return self._apply(params, "modulate", phi)
 

@@ -370,12 +370,7 @@ class EstimatorNetwork:
         Raises:
             NetworkError: the vectors phi have another length than the network's propositions.
         """
-        expected = len(self.config.propositions)
-        if phi_stay.shape[-1] != expected or phi_go.shape[-1] != expected:
-            raise NetworkError(
-                f"phi of lengths {phi_stay.shape[-1]} and {phi_go.shape[-1]}; this network knows {expected} "
-                f"propositions: {', '.join(self.config.propositions)}"
-            )
+        require_phi(phi_stay, phi_go, self.config.propositions)
         # Half a column is turned into a quarter of a circle: the sine then uses its whole range.
         angle = centred.residual * jnp.float32(self.config.feature_shape[1] / 2)
         scaled = centred.distance / jnp.float32(self.config.distance_scale)
@@ -414,6 +409,16 @@ class EstimatorNetwork:
 
 def _flat_fovea(centred: CentredView) -> Float32[Array, "B pixels"] | None:
     return None if centred.fovea is None else centred.fovea.reshape(-1, math.prod(centred.fovea.shape[-3:]))
+
+
+def require_phi(phi_stay: Int8[Array, "*B P"], phi_go: Int8[Array, "*B P"], propositions: tuple[str, ...]) -> None:
+    """Check that the vectors phi have an entry for each proposition. Raises NetworkError."""
+    expected = len(propositions)
+    if phi_stay.shape[-1] != expected or phi_go.shape[-1] != expected:
+        raise NetworkError(
+            f"phi of lengths {phi_stay.shape[-1]} and {phi_go.shape[-1]}; this network knows {expected} "
+            f"propositions: {', '.join(propositions)}"
+        )
 
 
 def parameter_count(params: Params) -> int:
