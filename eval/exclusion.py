@@ -12,12 +12,11 @@ from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 from jaxtyping import Float64
 
 from potlp_jax.learning.dataset import read_dataset
-from potlp_jax.learning.metrics import predict
-from potlp_jax.learning.network import EstimatorNetwork
+from potlp_jax.learning.learners import learner_of
+from potlp_jax.learning.metrics import answerable, predict
 from potlp_jax.learning.serialization import load_estimator
 
 EDGES = (0, 10, 16, 25, 40, 80, 200)
@@ -31,15 +30,15 @@ def pairs_of(estimator: Path, dataset: Path) -> Float64[np.ndarray, "pairs 5"]:
     """Distance in cells, and of both subgoals P_S as predicted and whether it succeeded, for every pair."""
     params, config, _, _ = load_estimator(estimator)
     samples = read_dataset(dataset)
-    logits = np.asarray(predict(EstimatorNetwork(config), params, samples).success_logit, float)
+    learner = learner_of(config)
+    samples = answerable(learner, samples)
+    logits = np.asarray(predict(learner, params, samples).success_logit, float)
     chances, truth = 1.0 / (1.0 + np.exp(-logits)), np.asarray(samples.success, float)
-    rows = [row for file in sorted(dataset.glob("samples-*.parquet")) for row in pq.read_table(file).to_pylist()]
-    if [row["success_probability"] for row in rows] != truth.tolist():
-        raise SystemExit(f"{dataset}: the order of the samples is not that of the files")
     together: dict[tuple, dict[tuple[int, int], int]] = {}
-    for index, row in enumerate(rows):
-        question = row["view"], tuple(row["phi_stay"]), tuple(row["phi_go"])
-        together.setdefault(question, {})[row["row"], row["column"]] = index
+    for index, view in enumerate(samples.view_of.tolist()):
+        question = view, tuple(samples.phi_stay[index].tolist()), tuple(samples.phi_go[index].tolist())
+        row, column = samples.cells[index].tolist()
+        together.setdefault(question, {})[row, column] = index
     found = []
     for subgoals in together.values():
         for (first, i), (second, j) in combinations(subgoals.items(), 2):

@@ -6,11 +6,9 @@ import jax
 
 from potlp_jax.bench.planner import PhaseRow, Phases, Scene, measure_decision, world_of
 from potlp_jax.learning.estimator import TrainedEstimator
-from potlp_jax.learning.memory import remember
-from potlp_jax.learning.network import EstimatorNetwork
-from potlp_jax.learning.panorama_estimator import NetworkEstimator
+from potlp_jax.learning.observing import with_memory
 from potlp_jax.planning.policies import Policy
-from potlp_jax.planning.situation import DecisionConfig, assess
+from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.robot import photograph
 from potlp_jax.world.camera import CameraConfig, Disturbance
@@ -22,10 +20,9 @@ def measure_perception(
     """The phases of perception, in their order, then those of the decision (``measure_decision``) with what was seen.
 
     * render: the panorama, in the simulator
-    * first stage: the network's features of the panorama, once per observation
-    * remember: which cells are in sight, and an entry in memory
-    * distances to subgoals: from where the panoramas were taken, part of the estimates
-    * estimates: the second stage, for every subgoal and outcome class
+    * encode: what the estimator makes of the panorama alone, once per observation
+    * remember: what it then keeps, on the map or in its list of panoramas
+    * estimates: the answers, for every subgoal and outcome class
 
     Args:
         scene: a scene with the true map's estimator, which holds the world to render.
@@ -39,26 +36,21 @@ def measure_perception(
     """
     # Phases are fed with what those before returned, so the estimator below answers from a real observation.
     world, key = world_of(scene), jax.random.key(0)
-    network = EstimatorNetwork(trained.config)
     phases = Phases(repeats)
     panorama = phases.measure(
         "render", lambda world, cell: photograph(world, cell, key, camera, Disturbance()), world, scene.cell
     )
     # An estimator before its first observation: an empty memory of the right size.
     blind = trained.start(*world.shape, TrialConfig().panoramas)
-    features = phases.measure(
-        "first stage", lambda params, image: network.encode(params, image), trained.params, panorama
-    )
-    memory = phases.measure("remember", remember, blind.memory, features, scene.belief, scene.cell)
-    estimator = NetworkEstimator(params=trained.params, memory=memory, config=trained.config)
-    subgoals = assess(scene.belief, scene.cell, scene.state, scene.task, config.frontiers).subgoals
-    phases.measure(
-        "distances to subgoals",
-        lambda estimator, belief, subgoals: estimator.distances(belief, subgoals),
-        estimator,
+    seen = phases.measure("encode", lambda estimator, image: estimator.encode(image), blind, panorama)
+    memory = phases.measure(
+        "remember",
+        lambda estimator, seen, belief, cell: estimator.remember(seen, belief, cell).memory,
+        blind,
+        seen,
         scene.belief,
-        subgoals,
+        scene.cell,
     )
-    # The same scene with the network instead of the true map: its "estimates" phase is the second stage.
-    seeing = dataclasses.replace(scene, estimator=estimator)
+    # The same scene with the network instead of the true map: its "estimates" phase is the network's answers.
+    seeing = dataclasses.replace(scene, estimator=with_memory(blind, memory))
     return [*phases.rows, *measure_decision(seeing, config, repeats, Policy.POTLP)]

@@ -19,8 +19,9 @@ from potlp_jax.cli.output import FAILED, console, fail, file_console, make_folde
 
 if TYPE_CHECKING:
     from potlp_jax.learning.dataset import Samples
+    from potlp_jax.learning.learner import Learner
     from potlp_jax.learning.metrics import Predictions, Prior, Report
-    from potlp_jax.learning.network import EstimatorNetwork, Params
+    from potlp_jax.learning.network import Params
 
 logger = logging.getLogger(__name__)
 
@@ -65,8 +66,8 @@ def evaluate_estimator(
         fail("data sets are Parquet files, and pyarrow is not installed: pip install 'potlp-jax[train]'", FAILED)
     from potlp_jax.codec import finite_or_null
     from potlp_jax.learning.dataset import read_dataset
-    from potlp_jax.learning.metrics import INTACT, check_fit, evaluate, prior_of
-    from potlp_jax.learning.network import EstimatorNetwork
+    from potlp_jax.learning.learners import learner_of
+    from potlp_jax.learning.metrics import INTACT, answerable, check_fit, evaluate, prior_of
     from potlp_jax.learning.serialization import load_estimator
     from potlp_jax.sweep.rows import provenance
 
@@ -78,7 +79,9 @@ def evaluate_estimator(
     check_fit(config, domain, samples, str(estimator), str(dataset))
     _warn(metadata, samples)
     folder = None if out is None else make_folder(out)
-    predictions = _predict(EstimatorNetwork(config), params, samples, variants)
+    learner = learner_of(config)
+    samples = answerable(learner, samples)
+    predictions = _predict(learner, params, samples, variants)
     # Skill is measured against this constant; the training data's is honest, since the samples' own would be fitted.
     prior = prior_of(metadata, samples)
     reports = {name: evaluate(samples, entry, prior) for name, entry in predictions.items()}
@@ -135,7 +138,7 @@ def _warn(metadata: Mapping[str, Any], samples: "Samples") -> None:
 
 
 def _predict(
-    network: "EstimatorNetwork", params: "Params", samples: "Samples", variants: tuple[str, ...]
+    learner: "Learner", params: "Params", samples: "Samples", variants: tuple[str, ...]
 ) -> "dict[str, Predictions]":
     from potlp_jax.learning.metrics import ablated, predict
 
@@ -144,7 +147,7 @@ def _predict(
         for name in variants:
             bar = progress.add_task(f"samples, {name}", total=len(samples.success))
             predictions[name] = predict(
-                network,
+                learner,
                 params,
                 ablated(samples, name),
                 # Bound now: a closure would show the last bar's progress for all.

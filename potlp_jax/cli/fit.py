@@ -53,15 +53,6 @@ def fit(
         float | None, typer.Option("--minutes", help="Plan as many steps as fit into this time.")
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Of parameters, order and augmentation.")] = None,
-    exclusive_within: Annotated[
-        float | None,
-        typer.Option(
-            "--exclusive-within", help="Cells within which subgoals exclude each other (`python -m eval.exclusion`)."
-        ),
-    ] = None,
-    fovea: Annotated[
-        int | None, typer.Option("--fovea", help="Columns beside each subgoal that are seen at full resolution.")
-    ] = None,
     processes: Processes = 1,
     settings: Settings = None,
 ) -> None:
@@ -80,7 +71,7 @@ def fit(
     config = with_settings(
         fitting.FitConfig() if given is None else given.fit, settings_from_words(settings or []), "--set"
     )
-    options = {"epochs": epochs, "minutes": minutes, "exclusive_within": exclusive_within, "fovea": fovea}
+    options = {"epochs": epochs, "minutes": minutes}
     config = with_settings(config, _given(**options) | {"training": _given(seed=seed)}, "options")
     folder = make_folder(out)
     with progress_bar() as progress:

@@ -1,34 +1,39 @@
-"""Batches of training data: some panoramas and several samples of each; the first stage runs once per panorama.
+"""Batches of training data: some views and several samples of each; a network's first stage runs once per view.
 
 The batch of a step depends on (seed, step) alone: every epoch has its own permutation of the views and its own choice
 of samples.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float32, Int8, Int32, UInt8
+from jaxtyping import Array, Bool, Float32, Int8, Int32, Int64
 
 from potlp_jax.errors import TrainingError
-from potlp_jax.learning.dataset import Samples, decode
-from potlp_jax.learning.network import Answers, EstimatorNetwork, Params
+from potlp_jax.learning.dataset import Samples
+
+_COLUMNS = ("phi_stay", "phi_go", "success", "success_cost", "failure_cost", "success_weight", "failure_weight")
+"""Of a data set, in every batch."""
 
 # Batches decoded ahead: a few, because each holds its images as pixels.
 _PREFETCHED = 4
 
 
+Inputs = Any
+"""What a network is shown of the views of a batch: a pytree, of a class of its own for each architecture."""
+
+
 @struct.dataclass(kw_only=True)
 class Batch:
-    """``G`` panoramas with ``K`` samples each; ``mask`` is True where a sample is real."""
+    """``G`` views with ``K`` samples each; ``mask`` is True where a sample is real."""
 
-    images: UInt8[Array, "G rows columns 3"]
-    bearing: Float32[Array, "G K"]
-    distance: Float32[Array, "G K"]
+    inputs: Inputs
     phi_stay: Int8[Array, "G K P"]
     phi_go: Int8[Array, "G K P"]
     success: Float32[Array, "G K"]
@@ -42,25 +47,54 @@ class Batch:
     mask: Bool[Array, "G K"]
 
 
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """Which samples a batch holds.
+
+    Attributes:
+        views: of the data set, at most as many as the batch has rows; the remaining rows are padding.
+        index: of the samples; where masked, another one of the same view.
+        mask: True where a sample is real.
+    """
+
+    views: Int64[np.ndarray, " g"]
+    index: Int64[np.ndarray, "G K"]
+    mask: Bool[np.ndarray, "G K"]
+
+
 class Batches:
     """The batches of a data set, each a function of its number.
 
     Args:
         samples: the data; views without samples are never drawn.
+        make_inputs: what the network is shown of a choice of samples; called from another thread.
         views, samples_per_view: shape of a batch.
         seed: of the order.
+        usable: True for the samples that take part; all by default.
     """
 
-    def __init__(self, samples: Samples, views: int, samples_per_view: int, seed: int) -> None:
+    def __init__(
+        self,
+        samples: Samples,
+        make_inputs: Callable[[Samples, Choice], Inputs],
+        views: int,
+        samples_per_view: int,
+        seed: int,
+        usable: Bool[np.ndarray, "N"] | None = None,
+    ) -> None:
+        taking_part = np.arange(len(samples.view_of)) if usable is None else np.flatnonzero(usable)
         # Checked here, where every use of a data set begins.
-        if not len(samples.view_of):
+        if not len(taking_part):
             raise TrainingError("the data set has no samples")
-        self._samples = samples
+        self._samples, self._make_inputs = samples, make_inputs
         self._seed = seed
         # Stable, so that the samples of a view keep the data set's order and batches do not depend on the sort.
-        self._order = np.argsort(samples.view_of, kind="stable")
-        self._views, first, counts = np.unique(samples.view_of[self._order], return_index=True, return_counts=True)
-        self._members = [self._order[start : start + count] for start, count in zip(first, counts, strict=True)]
+        view_of = samples.view_of[taking_part]
+        sort = np.argsort(view_of, kind="stable")
+        self.order = taking_part[sort]
+        """The samples in the order in which ``evaluation_batches`` gives them."""
+        self._views, first, counts = np.unique(view_of[sort], return_index=True, return_counts=True)
+        self._members = [self.order[start : start + count] for start, count in zip(first, counts, strict=True)]
         # A data set smaller than a batch makes batches of its own size.
         self.views = min(views, len(self._views))
         self.samples_per_view = samples_per_view
@@ -99,17 +133,13 @@ class Batches:
         index = np.zeros((self.views, self.samples_per_view), np.int64)
         mask = np.zeros(index.shape, bool)
         for row, (_, members) in enumerate(groups):
+            # Padding repeats a sample of its own view, so that it asks about nothing new.
+            index[row] = members[0]
             index[row, : len(members)] = members
             mask[row, : len(members)] = True
-        images = [decode(self._samples.images[self._views[view]]) for view, _ in groups]
-        # The last group of an evaluation may be short: black panoramas fill it up, and their samples are masked.
-        images += [np.zeros_like(images[0])] * (self.views - len(groups))
-        columns = {
-            name: jnp.asarray(getattr(self._samples, name)[index])
-            for name in Batch.__dataclass_fields__
-            if name not in ("images", "mask")
-        }
-        return Batch(images=jnp.asarray(np.stack(images)), mask=jnp.asarray(mask), **columns)
+        choice = Choice(views=self._views[[view for view, _ in groups]].astype(np.int64), index=index, mask=mask)
+        columns = {name: jnp.asarray(getattr(self._samples, name)[index]) for name in _COLUMNS}
+        return Batch(inputs=self._make_inputs(self._samples, choice), mask=jnp.asarray(mask), **columns)
 
 
 def prefetched(make: Callable[[int], Batch], start: int, stop: int) -> Iterator[Batch]:
@@ -133,26 +163,3 @@ def prefetched(make: Callable[[int], Batch], start: int, stop: int) -> Iterator[
         finally:
             for future in pending:
                 future.cancel()
-
-
-def batch_answers(
-    network: EstimatorNetwork,
-    params: Params,
-    pixels: Float32[Array, "G rows columns 3"],
-    bearing: Float32[Array, "G K"],
-    batch: Batch,
-) -> Answers:
-    """The network's answers for a batch: the first stage once per panorama.
-
-    Args:
-        network, params: the estimator.
-        pixels: in [0, 1], perhaps augmented.
-        bearing: of the subgoals, mirrored where the pixels are.
-        batch: the rest of what is asked; its images and bearings are not used.
-
-    Returns:
-        Answers of shape ``G K``, also where the batch is padded.
-    """
-    features = network.encode_pixels(params, pixels)
-    centred = jax.vmap(network.centre)(features, bearing, batch.distance)
-    return network.answer(params, centred, batch.phi_stay, batch.phi_go)

@@ -9,8 +9,8 @@ from jaxtyping import Array, Float32, Int32, UInt8
 
 from potlp_jax.learning.building_network import BuildingConfig, BuildingNetwork, EncodedMap, Params, map_channels
 from potlp_jax.learning.exclusion import exclusive_chances
+from potlp_jax.learning.network import require_propositions
 from potlp_jax.learning.painting import Painting, paint
-from potlp_jax.learning.serialization import require_propositions
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.world.frontiers import Subgoals
@@ -45,7 +45,7 @@ class BuildingEstimator:
         Raises:
             PropositionsError: the network was trained for other propositions than the task's.
         """
-        require_propositions(self.config, task.propositions, "the estimator's network")
+        require_propositions(self.config.propositions, task.propositions, "the estimator's network")
         network = BuildingNetwork(self.config)
         encoded = self.imagine(belief)
         modulation = network.modulation(self.params, task.class_phi[:, 0], task.class_phi[:, 1])

@@ -1,17 +1,19 @@
 """Records for training the estimator, on disk: Parquet shards, made by simulation or from a robot's log.
 
-A dataset is a folder. Shard ``S`` is two files, ``views-SSSSS.parquet`` (one row a panorama) and
+A dataset is a folder. Shard ``S`` is three files: ``worlds-SSSSS.parquet`` (one row a true map),
+``views-SSSSS.parquet`` (one row a panorama, with what was known and painted on the map when it was taken) and
 ``samples-SSSSS.parquet`` (one row a (view, subgoal, outcome class)). Each is written under a temporary name and
-renamed, the samples last: a shard exists when its samples file does. Every file carries the dataset's metadata as JSON
-in its schema, under the key ``potlp``. ``docs/dataset.md`` describes the columns.
+renamed, the samples last: a shard exists when its samples file does. Every file carries the dataset's metadata as JSON in its schema, under the key
+``potlp``. ``docs/dataset.md`` describes the columns.
 """
 
 import contextlib
 import dataclasses
+import functools
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,16 +22,17 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Float32, Int8, Int32, UInt8
+from jaxtyping import Bool, Float32, Int8, Int32, UInt8
 
 from potlp_jax.codec import config_from_dict, differences, json_copy
 from potlp_jax.errors import ConfigurationError, DatasetError
 from potlp_jax.files import one_line, reading, require_file, short
 from potlp_jax.images import decode_image
 from potlp_jax.learning.domain import Domain
+from potlp_jax.learning.map_images import MAP_COLUMNS, EncodedView, EncodedWorld
 from potlp_jax.world.camera import CameraConfig
 
-SCHEMA_VERSION: int = 1
+SCHEMA_VERSION: int = 2
 """Changes when a column or its meaning does."""
 
 JPEG_QUALITY: int = 92
@@ -38,9 +41,13 @@ _METADATA_KEY = b"potlp"
 
 _TEMPORARY = ".tmp"
 
-_REMEDY = "delete both files of the shard and collect or convert it again"
+_REMEDY = "delete all files of the shard and collect or convert it again"
 
 # docs/dataset.md says what the columns mean; who changes them changes SCHEMA_VERSION.
+WORLDS_SCHEMA = pa.schema(
+    {"world": pa.int64(), "rows": pa.int32(), "columns": pa.int32(), "cells": pa.binary(), "letters": pa.binary()}
+)
+
 VIEWS_SCHEMA = pa.schema(
     {
         "view": pa.int64(),
@@ -50,6 +57,7 @@ VIEWS_SCHEMA = pa.schema(
         "column": pa.int32(),
         "format": pa.string(),
         "image": pa.binary(),
+        **dict.fromkeys(MAP_COLUMNS, pa.binary()),
     }
 )
 
@@ -60,6 +68,7 @@ SAMPLES_SCHEMA = pa.schema(
         "outcome_class": pa.int32(),
         "row": pa.int32(),
         "column": pa.int32(),
+        "in_view": pa.bool_(),
         "bearing": pa.float32(),
         "distance": pa.float32(),
         "phi_stay": pa.list_(pa.int8()),
@@ -91,6 +100,7 @@ class DatasetMetadata:
         versions: of the libraries.
         unit: the unit of every distance, cost and weight.
         resolution: side of a cell in that unit.
+        shape: rows and columns of the array that all maps are padded to.
         source: ``simulation``, or what else made the records.
         schema_version: ``SCHEMA_VERSION`` at the time of writing.
     """
@@ -106,6 +116,7 @@ class DatasetMetadata:
     weights: Mapping[str, float]
     collection: Mapping[str, Any]
     versions: Mapping[str, str]
+    shape: tuple[int, int]
     unit: str = "cells"
     resolution: float = 1.0
     source: str = "simulation"
@@ -154,7 +165,12 @@ class Samples:
 
     Attributes:
         images: one per view.
-        view_of: index into ``images``.
+        maps: one per view: what was known of the map, and painted on it.
+        worlds: the true maps.
+        world_of: of each view, index into ``worlds``.
+        view_of: index into ``images`` and ``maps``.
+        cells: row and column of the subgoal.
+        in_view: whether the panorama of the view shows the subgoal; the map may show it in any case.
         bearing: direction of the subgoal in the map's frame, radians, 0 along increasing columns, growing clockwise
             on a map with row 0 on top.
         distance: known-space geodesic from the pose, letters ignored.
@@ -167,7 +183,12 @@ class Samples:
     """
 
     images: list[bytes]
+    maps: list[EncodedView]
+    worlds: list[EncodedWorld]
+    world_of: Int32[np.ndarray, " views"]
     view_of: Int32[np.ndarray, "N"]
+    cells: Int32[np.ndarray, "N 2"]
+    in_view: Bool[np.ndarray, "N"]
     bearing: Float32[np.ndarray, "N"]
     distance: Float32[np.ndarray, "N"]
     phi_stay: Int8[np.ndarray, "N P"]
@@ -178,6 +199,12 @@ class Samples:
     success_weight: Float32[np.ndarray, "N"]
     failure_weight: Float32[np.ndarray, "N"]
     metadata: DatasetMetadata
+
+    @functools.cached_property
+    def most_subgoals(self) -> int:
+        """Subgoals that are asked about in one view, at most."""
+        distinct = np.unique(np.column_stack([self.view_of, self.cells]), axis=0)
+        return int(np.unique(distinct[:, 0], return_counts=True)[1].max(initial=1))
 
 
 def encode(
@@ -218,6 +245,11 @@ def writer_versions() -> dict[str, str]:
     return {"pyarrow": pa.__version__, "opencv": cv2.__version__}
 
 
+def worlds_file(folder: Path | str, shard: int) -> Path:
+    """The file of a shard's true maps."""
+    return Path(folder) / f"worlds-{shard:05d}.parquet"
+
+
 def views_file(folder: Path | str, shard: int) -> Path:
     """The file of a shard's views."""
     return Path(folder) / f"views-{shard:05d}.parquet"
@@ -243,22 +275,24 @@ def finished_shards(folder: Path | str) -> set[int]:
 def write_shard(
     folder: Path | str,
     number: int,
+    worlds: Mapping[str, Any],
     views: Mapping[str, Any],
     samples: Mapping[str, Any],
     metadata: DatasetMetadata,
 ) -> None:
-    """Write both files of a shard.
+    """Write the files of a shard.
 
     A process that is killed at any time leaves the shard either complete or not there.
 
     Args:
         folder: the dataset; made if it is not there.
         number: of the shard.
-        views, samples: columns as in ``VIEWS_SCHEMA`` and ``SAMPLES_SCHEMA``.
+        worlds, views, samples: columns as in ``WORLDS_SCHEMA``, ``VIEWS_SCHEMA`` and ``SAMPLES_SCHEMA``.
         metadata: what all shards of the dataset share.
     """
     Path(folder).mkdir(parents=True, exist_ok=True)
     # The samples last: a shard exists when its samples file does.
+    _write_table(worlds_file(folder, number), worlds, WORLDS_SCHEMA, metadata)
     _write_table(views_file(folder, number), views, VIEWS_SCHEMA, metadata)
     _write_table(samples_file(folder, number), samples, SAMPLES_SCHEMA, metadata)
 
@@ -279,7 +313,7 @@ def read_metadata(folder: Path | str) -> DatasetMetadata:
     if not shards:
         raise DatasetError(f"there is no dataset in {folder}: no finished shard (samples-*.parquet)")
     # Every file carries the metadata: shards of two collections in one folder are found out.
-    paths = [path(folder, shard) for shard in shards for path in (views_file, samples_file)]
+    paths = [path(folder, shard) for shard in shards for path in (worlds_file, views_file, samples_file)]
     first = _metadata_of(paths[0], _schema_of(paths[0]))
     for path in paths[1:]:
         found = first.differences(_metadata_of(path, _schema_of(path)))
@@ -296,20 +330,56 @@ def read_dataset(folder: Path | str) -> Samples:
             different metadata, samples without a view, or values out of range.
     """
     metadata = read_metadata(folder)
-    # Images stay encoded: decoded, a training set of 1,300 worlds would take 3 GB.
-    images: list[bytes] = []
-    parts: list[dict[str, np.ndarray]] = []
-    for shard in sorted(finished_shards(folder)):
-        views = _read_table(views_file(folder, shard), VIEWS_SCHEMA, ("view", "image"))
-        samples = _read_table(samples_file(folder, shard), SAMPLES_SCHEMA, None)
-        path = samples_file(folder, shard)
-        columns = _sample_columns(samples, len(metadata.propositions), path)
-        columns["view_of"] = len(images) + _index_of(columns.pop("view"), views["view"].to_numpy(), path)
-        parts.append(columns)
-        images += views["image"].to_pylist()
-    # Once at the end: joining shard by shard would copy the first ones again and again.
-    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return Samples(images=images, metadata=metadata, **joined)
+    # Images and maps stay encoded: decoded, a training set of 1,300 worlds would take several gigabytes.
+    parts = [_read_shard(folder, shard, metadata) for shard in sorted(finished_shards(folder))]
+    return joined(parts)
+
+
+def joined(parts: Sequence[Samples]) -> Samples:
+    """Several data sets as one, in this order; the metadata are the first one's.
+
+    Raises:
+        DatasetError: what decides the meaning of a row differs: propositions, family, camera, unit or resolution.
+    """
+    first = parts[0].metadata
+    for part in parts[1:]:
+        for name in ("propositions", "family", "camera", "unit", "resolution"):
+            mine, other = getattr(first, name), getattr(part.metadata, name)
+            if mine != other:
+                raise DatasetError(f"data sets that differ in {name} cannot be joined: {mine} and {other}")
+    views = np.cumsum([0, *(len(part.images) for part in parts)])
+    worlds = np.cumsum([0, *(len(part.worlds) for part in parts)])
+    # Once at the end: joining one by one would copy the first ones again and again.
+    columns = {
+        field.name: np.concatenate([getattr(part, field.name) for part in parts])
+        for field in dataclasses.fields(Samples)
+        if isinstance(getattr(parts[0], field.name), np.ndarray)
+    }
+    shifted = {"view_of": views, "world_of": worlds}
+    for name, offsets in shifted.items():
+        arrays = [getattr(part, name) + np.int32(offset) for part, offset in zip(parts, offsets[:-1], strict=True)]
+        columns[name] = np.concatenate(arrays)
+    lists = {name: [row for part in parts for row in getattr(part, name)] for name in ("images", "maps", "worlds")}
+    everything: dict[str, Any] = {**lists, **columns}
+    return Samples(metadata=first, **everything)
+
+
+def _read_shard(folder: Path | str, shard: int, metadata: DatasetMetadata) -> Samples:
+    paths = worlds_file(folder, shard), views_file(folder, shard), samples_file(folder, shard)
+    worlds = _read_table(paths[0], WORLDS_SCHEMA, None)
+    views = _read_table(paths[1], VIEWS_SCHEMA, ("view", "world", "image", *MAP_COLUMNS))
+    columns = _sample_columns(_read_table(paths[2], SAMPLES_SCHEMA, None), len(metadata.propositions), paths[2])
+    view_of = _index_of(columns.pop("view"), views["view"].to_numpy(), "view", paths[2])
+    world_of = _index_of(views["world"].to_numpy(), worlds["world"].to_numpy(), "world", paths[1])
+    return Samples(
+        images=views["image"].to_pylist(),
+        maps=[EncodedView(**row) for row in views.select(MAP_COLUMNS).to_pylist()],
+        worlds=[EncodedWorld(**row) for row in worlds.drop_columns(["world"]).to_pylist()],
+        world_of=world_of,
+        view_of=view_of,
+        metadata=metadata,
+        **columns,
+    )
 
 
 def _write_table(path: Path, columns: Mapping[str, Any], schema: pa.Schema, metadata: DatasetMetadata) -> None:
@@ -376,6 +446,7 @@ def _sample_columns(table: pa.Table, propositions: int, path: Path) -> dict[str,
     """Columns of ``Samples`` by name, and ``view``."""
     numbers = {
         "view": "view",
+        "in_view": "in_view",
         "bearing": "bearing",
         "distance": "distance",
         "success": "success_probability",
@@ -385,6 +456,7 @@ def _sample_columns(table: pa.Table, propositions: int, path: Path) -> dict[str,
         "failure_weight": "failure_weight",
     }
     columns = {name: table[column].to_numpy() for name, column in numbers.items()}
+    columns["cells"] = np.stack([table["row"].to_numpy(), table["column"].to_numpy()], axis=-1)
     for name in ("phi_stay", "phi_go"):
         # All lists of a column are one array with offsets; equal steps between them mean equal lengths.
         lists = table[name].combine_chunks()
@@ -413,13 +485,13 @@ def _check_values(columns: Mapping[str, np.ndarray], path: Path) -> None:
             raise DatasetError(f"{path}, row {int(np.argmin(holds))}: {rule}")
 
 
-def _index_of(wanted: np.ndarray, views: np.ndarray, path: Path) -> Int32[np.ndarray, "N"]:
-    """Position of each sample's view among the shard's views."""
-    # Files from elsewhere may number their views as they like.
-    position = {view: index for index, view in enumerate(views.tolist())}
-    if len(position) < len(views):
-        raise _broken(path, "has views that occur twice")
+def _index_of(wanted: np.ndarray, known: np.ndarray, what: str, path: Path) -> Int32[np.ndarray, "N"]:
+    """Position of each row's view, or world, among those of the shard."""
+    # Files from elsewhere may number them as they like.
+    position = {number: index for index, number in enumerate(known.tolist())}
+    if len(position) < len(known):
+        raise _broken(path, f"belongs to {what}s that occur twice")
     try:
-        return np.array([position[view] for view in wanted.tolist()], np.int32)
+        return np.array([position[number] for number in wanted.tolist()], np.int32)
     except KeyError as error:
-        raise _broken(path, f"has samples of view {error}, which is not in the shard") from error
+        raise _broken(path, f"has rows of {what} {error}, which is not in the shard") from error

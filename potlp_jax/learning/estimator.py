@@ -1,7 +1,7 @@
 """A trained estimator as it is read from a file, and which one belongs to which worlds.
 
 ``TrainedEstimator`` lives on the host; ``start`` gives the pytree that a decision calls inside jit, with the panoramas
-seen so far (``learning.panorama_estimator``). Which propositions an estimator knows, and which worlds it serves, its
+seen so far (``learning.architectures``). Which propositions an estimator knows, and which worlds it serves, its
 file says.
 """
 
@@ -16,11 +16,11 @@ from typing import Any, cast
 
 from potlp_jax import plugins
 from potlp_jax.errors import EstimatorError, PluginError, PotlpWarning
+from potlp_jax.learning.architectures import EstimatorConfig, architecture_of
 from potlp_jax.learning.domain import Domain
-from potlp_jax.learning.memory import empty_memory
-from potlp_jax.learning.network import NetworkConfig, Params
-from potlp_jax.learning.panorama_estimator import NetworkEstimator
-from potlp_jax.learning.serialization import load_estimator, require_propositions
+from potlp_jax.learning.network import Params, require_propositions
+from potlp_jax.learning.observing import ObservingEstimator
+from potlp_jax.learning.serialization import load_estimator
 from potlp_jax.planning.estimates import Estimator
 
 
@@ -30,7 +30,7 @@ class TrainedEstimator:
     records."""
 
     params: Params
-    config: NetworkConfig
+    config: EstimatorConfig
     domain: Domain
     metadata: Mapping[str, Any]
     name: str
@@ -41,18 +41,17 @@ class TrainedEstimator:
         """Name and digest, as in records."""
         return f"{self.name} {self.digest}"
 
-    def start(self, height: int, width: int, panoramas: int) -> NetworkEstimator:
+    def start(self, height: int, width: int, panoramas: int) -> ObservingEstimator:
         """The estimator for a new trial: nothing observed yet.
 
         Args:
             height, width: of the map's array.
-            panoramas: how many are remembered.
+            panoramas: how many are remembered, by a panorama network.
 
         Returns:
             What a decision calls inside jit.
         """
-        empty = empty_memory(panoramas, self.config.feature_shape, height, width)
-        return NetworkEstimator(params=self.params, memory=empty, config=self.config)
+        return architecture_of(self.config).start(self.params, self.config, height, width, panoramas)
 
 
 @functools.lru_cache(maxsize=8)
@@ -167,7 +166,7 @@ def estimator_for(
             f"{why_none_is_shipped(propositions, here)}: choose another policy, or name the estimator to ask "
             f"({', '.join(shipped_files())}, or one of your own: docs/estimator.md)"
         )
-    require_propositions(estimator.config, propositions, f"estimator {estimator.name}")
+    require_propositions(estimator.config.propositions, propositions, f"estimator {estimator.name}")
     misfits = estimator.domain.misfits(here)
     if misfits:
         # From this one place, so that Python shows it once and not for every trial.

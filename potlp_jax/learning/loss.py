@@ -7,7 +7,8 @@ failure taken costs),
     success cost   y (R_S - predicted R_S)^2 / success_cost_scale^2
     failure cost   (1 - y) (R_F - predicted R_F)^2 / failure_cost_scale^2
 
-averaged over samples and summed, the last two times ``cost_share``. The scales are the standard deviations over the
+averaged over samples and summed, the last two times ``cost_share``. What a network says of the views themselves
+(``building_learner``: the cross-entropy of its squares), averaged over views, is added times ``view_share``. The scales are the standard deviations over the
 training data and stay in ``NetworkConfig``. The weights are divided by their mean over the training data. Weights that
 differ between successes and failures move p away from the frequency of success: p / (1 - p) is multiplied by w_S / w_F.
 ``TrainingConfig.weighting`` mixes them with 1: at 1 the loss is the paper's, at 0 p is calibrated.
@@ -25,7 +26,7 @@ from jaxtyping import Array, Float32
 from potlp_jax.errors import TrainingError
 from potlp_jax.learning.batches import Batch
 from potlp_jax.learning.dataset import Samples
-from potlp_jax.learning.network import Answers, NetworkConfig
+from potlp_jax.learning.network import Answers
 
 
 @struct.dataclass(kw_only=True)
@@ -43,6 +44,9 @@ class Sums:
     brier: Float32[Array, ""]
     prior_brier: Float32[Array, ""]
     """Of the constant answer: the mean P_S of the training data."""
+    views: Float32[Array, ""]
+    view_loss: Float32[Array, ""]
+    """Of what the network says of a view beside its answers."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,75 +83,23 @@ class Evaluation:
     cross_entropy: float
     success_loss: float
     failure_loss: float
+    view_loss: float
     brier: float
     skill: float
     success_rmse: float
     failure_rmse: float
 
 
-def network_config(
-    samples: Samples,
-    image_shape: tuple[int, int],
-    exclusive_within: float = NetworkConfig.exclusive_within,
-    fovea: int = NetworkConfig.fovea,
-    second_widths: tuple[int, ...] = NetworkConfig.second_widths,
-) -> NetworkConfig:
-    """A network for these samples: their propositions and camera, and normalisers from their distances and costs.
-
-    Args:
-        samples: the training data.
-        image_shape: rows and columns of their panoramas.
-        exclusive_within, fovea, second_widths: as in ``NetworkConfig``; training does not depend on the first.
-
-    Returns:
-        The configuration, in which everything that was measured on the data is a number.
-
-    Raises:
-        TrainingError: a fovea is asked for, and the data do not say how their camera sees the floor.
-    """
-    step = float(samples.metadata.resolution)
-    # Each cost is scaled by its spread where it counts in the loss.
-    succeeded, failed = samples.success > 0, (samples.success < 1) & np.isfinite(samples.failure_cost)
-    # Scales are rounded nowhere: they are part of what the network answers and stored with it.
-    return NetworkConfig(
-        propositions=tuple(samples.metadata.propositions),
-        image_shape=image_shape,
-        distance_scale=_spread(samples.distance, step),
-        success_cost_scale=_spread(samples.success_cost[succeeded], step),
-        failure_cost_scale=_spread(samples.failure_cost[failed], step),
-        step=step,
-        exclusive_within=exclusive_within,
-        fovea=fovea,
-        second_widths=second_widths,
-        **(_geometry(samples) if fovea else {}),
-    )
-
-
-def _geometry(samples: Samples) -> dict[str, Any]:
-    # Real data need not have these: a fovea is then refused, and everything else works.
-    names, camera = ("horizon", "far", "fold"), samples.metadata.camera
-    missing = [name for name in names if name not in camera]
-    if missing:
-        raise TrainingError(
-            f"a fovea needs {', '.join(missing)} of the data set's camera (docs/camera.md): collect it again, or train "
-            "without a fovea"
-        )
-    return {name: float(camera[name]) for name in names}
-
-
-def _spread(values: np.ndarray, least: float) -> float:
-    """Standard deviation, at least ``least``."""
-    # In float64: a sum of a million squares in float32 loses digits. At least a cell, should all values be equal.
-    return max(float(np.std(values, dtype=np.float64)), least) if len(values) else least
-
-
-def loss_sums(answers: Answers, batch: Batch, config: NetworkConfig, scale: DataScale, weighting: float) -> Sums:
+def loss_sums(
+    answers: Answers, view_loss: Float32[Array, " G"], batch: Batch, config: Any, scale: DataScale, weighting: float
+) -> Sums:
     """The sums over a batch; padding and costs that are not known count nothing.
 
     Args:
         answers: the network's, of the batch's shape.
+        view_loss: of what the network says of the views.
         batch: labels, weights and mask (True: a real sample).
-        config: of the network, for the scales of costs.
+        config: of the network, for the scales of costs; of any architecture.
         scale: figures of the training data, also when validation data are summed.
         weighting: 1: weights as they are; 0: none; between: a mix.
 
@@ -180,6 +132,8 @@ def loss_sums(answers: Answers, batch: Batch, config: NetworkConfig, scale: Data
         failures=jnp.sum(jnp.where(known_failure, 1 - success, jnp.float32(0))),
         brier=jnp.sum(real * (probability - success) ** 2),
         prior_brier=jnp.sum(real * (jnp.float32(scale.prior) - success) ** 2),
+        views=jnp.sum(jnp.any(batch.mask, axis=1), dtype=jnp.float32),
+        view_loss=jnp.sum(view_loss),
     )
 
 
@@ -189,20 +143,20 @@ def _squared_errors(predicted: Array, true: Array, known: Array, share: Array, s
     return jnp.sum(jnp.where(known, share * error**2, jnp.float32(0)))
 
 
-def total_loss(sums: Sums, cost_share: float) -> Float32[Array, ""]:
-    """The loss that is minimised: all terms per sample."""
-    return (sums.cross_entropy + cost_share * (sums.success_error + sums.failure_error)) / jnp.maximum(
-        sums.count, jnp.float32(1)
-    )
+def total_loss(sums: Sums, cost_share: float, view_share: float) -> Float32[Array, ""]:
+    """The loss that is minimised: terms per sample, and that of the views."""
+    of_samples = sums.cross_entropy + cost_share * (sums.success_error + sums.failure_error)
+    of_views = view_share * sums.view_loss / jnp.maximum(sums.views, jnp.float32(1))
+    return of_samples / jnp.maximum(sums.count, jnp.float32(1)) + of_views
 
 
-def evaluation_of(sums: Sums, config: NetworkConfig, cost_share: float) -> Evaluation:
+def evaluation_of(sums: Sums, config: Any, cost_share: float, view_share: float) -> Evaluation:
     """The scores that follow from sums.
 
     Args:
         sums: over all samples that are scored.
         config: of the network, for the scales of costs.
-        cost_share: factor of both cost terms in the loss.
+        cost_share, view_share: factors of both cost terms, and of the views' term, in the loss.
 
     Returns:
         Scores; NaN where nothing of a kind happened.
@@ -217,10 +171,11 @@ def evaluation_of(sums: Sums, config: NetworkConfig, cost_share: float) -> Evalu
 
     return Evaluation(
         samples=int(figures["count"]),
-        loss=float(total_loss(sums, cost_share)),
+        loss=float(total_loss(sums, cost_share, view_share)),
         cross_entropy=figures["cross_entropy"] / count,
         success_loss=figures["success_error"] / count,
         failure_loss=figures["failure_error"] / count,
+        view_loss=figures["view_loss"] / max(figures["views"], 1.0),
         brier=figures["brier"] / count,
         skill=1 - figures["brier"] / figures["prior_brier"] if figures["prior_brier"] > 0 else float("nan"),
         success_rmse=rmse(figures["success_error"], figures["successes"], config.success_cost_scale),

@@ -23,16 +23,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int8, Int64
 
 from potlp_jax.errors import EvaluationError
-from potlp_jax.learning.batches import Batch, Batches, batch_answers
+from potlp_jax.learning.architectures import EstimatorConfig
+from potlp_jax.learning.batches import Batch, Batches
 from potlp_jax.learning.dataset import Samples, decode, encode
 from potlp_jax.learning.domain import Domain
-from potlp_jax.learning.network import Answers, EstimatorNetwork, NetworkConfig, Params
-from potlp_jax.learning.serialization import require_propositions
+from potlp_jax.learning.learner import Learner
+from potlp_jax.learning.map_images import without_painting
+from potlp_jax.learning.network import Answers, Params, require_propositions
 
 # Ten is usual for reliability diagrams.
 BINS: int = 10
@@ -144,7 +145,7 @@ class Report:
         return {"overall": dataclasses.asdict(self.overall), "groups": groups}
 
 
-def check_fit(config: NetworkConfig, domain: Domain, samples: Samples, estimator: str, dataset: str) -> None:
+def check_fit(config: EstimatorConfig, domain: Domain, samples: Samples, estimator: str, dataset: str) -> None:
     """Whether the estimator's answers mean the same as the data set's labels.
 
     Args:
@@ -157,7 +158,7 @@ def check_fit(config: NetworkConfig, domain: Domain, samples: Samples, estimator
         PropositionsError: other propositions.
         EvaluationError: another size of panorama, another camera or another unit of cost than those it learned from.
     """
-    require_propositions(config, tuple(samples.metadata.propositions), estimator, asker=dataset)
+    require_propositions(config.propositions, tuple(samples.metadata.propositions), estimator, asker=dataset)
     if not samples.images:
         raise EvaluationError(f"{dataset} has no panoramas")
     size = decode(samples.images[0]).shape[:2]
@@ -186,7 +187,7 @@ def prior_of(metadata: Mapping[str, Any], samples: Samples) -> Prior:
 def ablated(samples: Samples, ablation: str) -> Samples:
     """The samples without what ``ablation`` takes away.
 
-    ``image``: all panoramas black. ``phi``: each sample has the pair of vectors phi of another one, by a permutation
+    ``image``: all panoramas black, and nothing painted on the maps. ``phi``: each sample has the pair of vectors phi of another one, by a permutation
     drawn from ``SHUFFLE_SEED``. ``intact``: the samples themselves.
     """
     if ablation == INTACT:
@@ -194,7 +195,8 @@ def ablated(samples: Samples, ablation: str) -> Samples:
     if ablation == "image":
         # As PNG: JPEG may not give back what is exactly black.
         black = encode(np.zeros_like(decode(samples.images[0])), "png")
-        return dataclasses.replace(samples, images=[black] * len(samples.images))
+        blank = [without_painting(view) for view in samples.maps]
+        return dataclasses.replace(samples, images=[black] * len(samples.images), maps=blank)
     if ablation == "phi":
         # A permutation keeps how often each pair occurs: only its connection with the sample is gone.
         order = np.random.default_rng(SHUFFLE_SEED).permutation(len(samples.view_of))
@@ -203,25 +205,25 @@ def ablated(samples: Samples, ablation: str) -> Samples:
 
 
 @functools.lru_cache(8)
-def _make_answer_step(network: EstimatorNetwork) -> Callable[[Params, Batch], Answers]:
+def _make_answer_step(learner: Learner) -> Callable[[Params, Batch], Answers]:
     """The compiled answers to one batch, not augmented."""
 
     @jax.jit
     def answer_step(params: Params, batch: Batch) -> Answers:
-        pixels = batch.images.astype(jnp.float32) / jnp.float32(255)
-        return batch_answers(network, params, pixels, batch.bearing, batch)
+        answers, _ = learner.answers(params, batch.inputs, batch.phi_stay, batch.phi_go)
+        return answers
 
     return answer_step
 
 
 def predict(
-    network: EstimatorNetwork, params: Params, samples: Samples, on_progress: Callable[[int], None] = lambda done: None
+    learner: Learner, params: Params, samples: Samples, on_progress: Callable[[int], None] = lambda done: None
 ) -> Predictions:
     """The estimator's answers to all samples.
 
     Args:
-        network, params: the estimator.
-        samples: what is asked.
+        learner, params: the estimator.
+        samples: what is asked; all must be such as the estimator can answer (``answerable``).
         on_progress: told the number of answers so far, after every batch.
 
     Returns:
@@ -230,22 +232,27 @@ def predict(
     Raises:
         TrainingError: there are no samples.
     """
-    step = _make_answer_step(network)
+    step = _make_answer_step(learner)
     names = tuple(Answers.__dataclass_fields__)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
     done = 0
-    for batch in Batches(samples, _VIEWS_PER_BATCH, _SAMPLES_PER_VIEW, seed=0).evaluation_batches():
+    batches = Batches(samples, learner.inputs, _VIEWS_PER_BATCH, _SAMPLES_PER_VIEW, seed=0)
+    for batch in batches.evaluation_batches():
         answers, mask = step(params, batch), np.asarray(batch.mask)
         for name in names:
             rows[name].append(np.asarray(getattr(answers, name))[mask])
         done += int(mask.sum())
         on_progress(done)
-    # Batches give the samples view by view, and those of a view in the data set's order.
-    order = np.argsort(samples.view_of, kind="stable")
-    columns = {name: np.empty(len(order), np.float32) for name in names}
+    # Batches give the samples view by view.
+    columns = {name: np.empty(len(samples.success), np.float32) for name in names}
     for name in names:
-        columns[name][order] = np.concatenate(rows[name])
+        columns[name][batches.order] = np.concatenate(rows[name])
     return Predictions(**columns)
+
+
+def answerable(learner: Learner, samples: Samples) -> Samples:
+    """The samples that an estimator can answer: a panorama network those in view, a building network all."""
+    return _part(samples, learner.usable(samples))
 
 
 def evaluate(samples: Samples, predictions: Predictions, prior: Prior) -> Report:
@@ -432,8 +439,15 @@ def _gain(error: float, reference: float) -> float:
 
 
 def _part(columns: Any, chosen: np.ndarray | slice) -> Any:
-    """Some of the samples (or predictions); images are not touched."""
+    """Some of the samples (or predictions); images and maps are not touched."""
     arrays = {field.name: getattr(columns, field.name) for field in dataclasses.fields(columns)}
+    # One entry a view, not a sample.
+    of_views = {"world_of"}
     return dataclasses.replace(
-        columns, **{name: array[chosen] for name, array in arrays.items() if isinstance(array, np.ndarray)}
+        columns,
+        **{
+            name: array[chosen]
+            for name, array in arrays.items()
+            if isinstance(array, np.ndarray) and name not in of_views
+        },
     )

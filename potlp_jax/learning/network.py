@@ -36,6 +36,7 @@ from jaxtyping import Array, Float32, Int8, PRNGKeyArray, UInt8
 
 from potlp_jax.errors import NetworkError
 from potlp_jax.learning.fovea import ABOVE, BAND, BELOW, bands_of, packed, patch, unpacked
+from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.world.camera import CameraConfig, floor_rows
 
 Params = Any
@@ -419,6 +420,30 @@ def require_phi(phi_stay: Int8[Array, "*B P"], phi_go: Int8[Array, "*B P"], prop
             f"phi of lengths {phi_stay.shape[-1]} and {phi_go.shape[-1]}; this network knows {expected} "
             f"propositions: {', '.join(propositions)}"
         )
+
+
+def require_propositions(
+    known: tuple[str, ...], propositions: tuple[str, ...], where: str, asker: str = "the task"
+) -> None:
+    """Check that an estimator was trained with these propositions, in this order.
+
+    Args:
+        known: those of the estimator's network.
+        propositions: those of the task or the data.
+        where: names the estimator in the message.
+        asker: names the task or the data.
+
+    Raises:
+        PropositionsError: it was not.
+    """
+    # An entry of phi means what its position says, as a bit of a letter does.
+    require_same_propositions(
+        propositions,
+        known,
+        asker=asker,
+        knower=where,
+        remedy="give an estimator that was trained for the former, or train one (docs/estimator.md)",
+    )
 
 
 def parameter_count(params: Params) -> int:

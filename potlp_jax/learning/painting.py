@@ -69,7 +69,9 @@ def paint(
     row = jnp.clip(jnp.round(floor_rows(camera, distance)).astype(jnp.int32), 0, panorama.shape[0] - 1)
     # The longest line of sight on the grid is shorter than the sum of its sides.
     in_sight = visible(belief.occupied, cell, SensorConfig(range_cells=float(height + width)))
-    nearer = in_sight & (distance < painting.distance)
+    # What pads the map to an array is no part of the building, although nothing that is known hides it.
+    inside = (jnp.arange(height)[:, None] < belief.extent[0]) & (jnp.arange(width)[None, :] < belief.extent[1])
+    nearer = in_sight & inside & (distance < painting.distance)
     return Painting(
         floor=jnp.where(nearer[:, :, None], panorama[row, column], painting.floor),
         beyond=jnp.where(nearer[:, :, None], panorama[math.floor(camera.horizon), column], painting.beyond),

@@ -14,8 +14,7 @@ from potlp_jax.learning.memory import (
     remember,
     slots_of_observations,
 )
-from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
-from potlp_jax.learning.serialization import require_propositions
+from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params, require_propositions
 from potlp_jax.planning.distances.product import product_distances
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.task.task import TaskArrays
@@ -47,7 +46,7 @@ class NetworkEstimator:
         Raises:
             PropositionsError: the network was trained for other propositions than the task's.
         """
-        require_propositions(self.config, task.propositions, "the estimator's network")
+        require_propositions(self.config.propositions, task.propositions, "the estimator's network")
         # Each subgoal is judged from the panorama in which it was last in sight, taken from where the robot then stood.
         places = slots_of_observations(self.memory, observation_of_subgoals(self.memory, subgoals))
         distance = self.distances(belief, subgoals)

@@ -1,8 +1,9 @@
 """From poses to the rows of a dataset: what is asked at a pose, and what the true map answers.
 
-In simulation and from a robot's log alike. A **pose** is where the robot stood and what it knew of the map. Now and
-then a panorama is recorded, and for every subgoal in line of sight and some outcome classes, drawn from a pool of
-tasks, the true P_S, R_S, R_F and the weights of the loss. ``docs/dataset.md`` describes the rows.
+In simulation and from a robot's log alike. A **pose** is where the robot stood and what it knew of the map; at each one
+a panorama is taken and painted on the map. Now and then the panorama and the map are recorded, and for every subgoal
+and some outcome classes, drawn from a pool of tasks, the true P_S, R_S, R_F and the weights of the loss.
+``docs/dataset.md`` describes the rows.
 """
 
 import dataclasses
@@ -23,12 +24,15 @@ from potlp_jax.learning.dataset import (
     JPEG_QUALITY,
     SAMPLES_SCHEMA,
     VIEWS_SCHEMA,
+    WORLDS_SCHEMA,
     DatasetMetadata,
     encode,
     view_id,
     writer_versions,
 )
 from potlp_jax.learning.labels import true_labels
+from potlp_jax.learning.map_images import encode_view, encode_world
+from potlp_jax.learning.painting import Painting, blank_painting, paint
 from potlp_jax.learning.questions import Question, TaskDistribution, draw_questions, question_sheet
 from potlp_jax.learning.sample_weights import WeightBounds, Weights, loss_weights
 from potlp_jax.planning.distances.product import grid_distances
@@ -126,9 +130,13 @@ class Pose:
 
 @struct.dataclass(kw_only=True)
 class Scene:
-    """What there is to ask at a pose: the subgoals, D and bearing of each, and which are in the camera's view."""
+    """What there is to ask at a pose: the subgoals, D and bearing of each, and which are in the camera's view.
+
+    All are ``asked`` about, but for those of a log that does not show what lies beyond.
+    """
 
     subgoals: Subgoals
+    asked: Bool[Array, " S"]
     distance: Float32[Array, " S"]
     bearing: Float32[Array, " S"]
     in_view: Bool[Array, " S"]
@@ -157,6 +165,7 @@ def survey(
     in_view = jnp.any((subgoals.component[None] == index) & seen[None], axis=(1, 2))
     return Scene(
         subgoals=subgoals,
+        asked=subgoals.mask,
         distance=subgoals.distance,
         bearing=bearing(cell, subgoals.cells),
         in_view=in_view & subgoals.mask,
@@ -216,30 +225,43 @@ def is_answered(
 
 
 class Recorder:
-    """Columns of the views and samples of one shard."""
+    """Columns of the worlds, views and samples of one shard."""
 
     def __init__(self, shard: int, config: RecordingConfig, bounds: WeightBounds) -> None:
         self._shard, self._bounds = shard, bounds
         self.config = config
+        self.worlds: dict[str, list[Any]] = {name: [] for name in WORLDS_SCHEMA.names}
         self.views: dict[str, list[Any]] = {name: [] for name in VIEWS_SCHEMA.names}
         self.samples: dict[str, list[Any]] = {name: [] for name in SAMPLES_SCHEMA.names}
+
+    def add_world(self, world: World, index: int, unseen: Bool[np.ndarray, "H W"] | None = None) -> None:
+        """Record a true map; the views that are added next are of it.
+
+        Args:
+            world, index: the true map and its number.
+            unseen: as in ``map_images.encode_world``.
+        """
+        row = {"world": index, **dataclasses.asdict(encode_world(world, unseen))}
+        for name, value in row.items():
+            self.worlds[name].append(value)
 
     def add(
         self,
         world: World,
-        index: int,
         pose: Pose,
         image: UInt8[np.ndarray, "rows columns 3"],
+        painting: Painting,
         scene: Scene,
         questions: Sequence[Question],
     ) -> None:
-        """Record a view and its samples.
+        """Record a view of the world that was added last, and its samples.
 
         Args:
-            world, index: the true map and its number.
+            world: the true map.
             pose: where the robot stands.
             image: what the camera saw.
-            scene: the subgoals; those in view become samples.
+            painting: what it painted on the map until then, this image included.
+            scene: the subgoals; each becomes a sample for every question.
             questions: what is asked of each of them.
         """
         config = self.config
@@ -250,12 +272,13 @@ class Recorder:
         view = view_id(self._shard, len(self.views["view"]))
         row = {
             "view": view,
-            "world": index,
+            "world": self.worlds["world"][-1],
             "step": pose.step,
             "row": pose.cell[0],
             "column": pose.cell[1],
             "format": config.image_format,
             "image": encode(image, config.image_format, config.quality),
+            **dataclasses.asdict(encode_view(pose.belief, painting)),
         }
         for name, value in row.items():
             self.views[name].append(value)
@@ -266,55 +289,70 @@ class Recorder:
 def record_views(
     recorder: Recorder,
     world: World,
-    index: int,
     poses: Iterable[Pose],
     tasks: Sequence[Task],
     rng: np.random.Generator,
     photograph: Callable[[Pose], UInt8[np.ndarray, "rows columns 3"] | None],
+    *,
+    most: int,
     unexplored: Bool[np.ndarray, "H W"] | None = None,
-) -> None:
-    """Record views of one world from which a subgoal can be seen, at random intervals along ``poses``.
+) -> int:
+    """Record views of one drive through a world at random intervals along ``poses``.
 
     Args:
-        recorder: gets the rows.
-        world, index: the true map and its number.
-        poses: of the robot, in order; not read further than needed.
+        recorder: gets the rows; the world was added to it.
+        world: the true map.
+        poses: of the robot, in order, nothing known before the first; not read further than needed.
         tasks: the pool that questions are drawn from.
         rng: moves on.
-        photograph: called once a view, in the order of the poses; None: there is no picture, and the pose is passed
-            over.
+        photograph: called once a pose, in their order; None: there is no picture, and the pose is passed over.
+        most: views to record.
         unexplored: as in ``is_answered``; subgoals that ``world`` does not answer for are left out. None: it answers
             for all.
+
+    Returns:
+        How many views were recorded.
     """
     config, due, recorded = recorder.config, 0.0, 0
+    painting = blank_painting(*world.shape)
     for pose in poses:
-        if recorded == config.views_per_world:
-            return
+        if recorded == most:
+            break
+        # At every pose, as in a trial, where each decision is preceded by a panorama.
+        image = photograph(pose)
+        if image is None:
+            continue
+        painting = _painted(painting, image, pose.belief, jnp.asarray(pose.cell, jnp.int32), config.camera)
         # Before the scene is made: finding subgoals is what takes time.
         if pose.travelled < due:
             continue
         scene = survey(world, pose.belief, jnp.asarray(pose.cell, jnp.int32), config.frontiers)
         if unexplored is not None:
-            answered = jnp.asarray(is_answered(world, pose.belief, scene.subgoals, unexplored))
-            scene = dataclasses.replace(scene, in_view=scene.in_view & answered)
-        if not np.any(scene.in_view):
+            scene = _answered_part(scene, world, pose.belief, unexplored)
+        if not np.any(scene.asked):
             continue
-        image = photograph(pose)
-        if image is None:
-            continue
-        # After the picture: a pose without one draws nothing, and the views that follow stay as they are.
         questions = draw_questions(rng, tasks, config.classes, config.staying_sets)
-        recorder.add(world, index, pose, image, scene, questions)
+        recorder.add(world, pose, image, painting, scene, questions)
         # More views where there is more to choose, which is where a decision matters.
-        due = pose.travelled + rng.uniform(*config.spacing) / int(np.sum(scene.in_view))
+        due = pose.travelled + rng.uniform(*config.spacing) / max(1, int(np.sum(scene.in_view)))
         recorded += 1
+    return recorded
+
+
+_painted = jax.jit(paint, static_argnames="camera")
+
+
+def _answered_part(scene: Scene, world: World, belief: BeliefMap, unexplored: Bool[np.ndarray, "H W"]) -> Scene:
+    """Only the subgoals for which the world answers."""
+    asked = jnp.asarray(is_answered(world, belief, scene.subgoals, unexplored))
+    return dataclasses.replace(scene, asked=scene.asked & asked)
 
 
 def _sample_columns(
     view: int, scene: Scene, questions: Sequence[Question], labels: Estimates, weights: Weights
 ) -> dict[str, list[Any]]:
-    """Columns of one view: its subgoals in view, times its questions."""
-    chosen = np.flatnonzero(scene.in_view)
+    """Columns of one view: its subgoals, times its questions."""
+    chosen = np.flatnonzero(scene.asked)
     count = len(questions)
 
     # Rows by subgoal, then by question: what belongs to a subgoal is repeated, what belongs to a question runs through.
@@ -331,6 +369,7 @@ def _sample_columns(
         "outcome_class": [question.outcome_class for question in questions] * len(chosen),
         "row": per_subgoal(scene.subgoals.cells[:, 0]),
         "column": per_subgoal(scene.subgoals.cells[:, 1]),
+        "in_view": per_subgoal(scene.in_view),
         "bearing": per_subgoal(scene.bearing),
         "distance": per_subgoal(scene.distance),
         "phi_stay": [list(question.phi_stay) for question in questions] * len(chosen),

@@ -1,7 +1,7 @@
 """The estimator that is shipped: one ``.npz`` file.
 
-The network's parameters as float32 arrays by name, and one JSON text with the network's configuration (Sigma included),
-the domain that it serves, training metadata and figures. One file, not a checkpoint's folder, because it is shipped
+The network's parameters as float32 arrays by name, and one JSON text with the network's architecture and configuration
+(Sigma included), the domain that it serves, training metadata and figures. One file, not a checkpoint's folder, because it is shipped
 with the package and copied by people: it is read with NumPy alone, needs no device topology, and the zip's checksums
 find damage.
 """
@@ -20,10 +20,9 @@ import numpy as np
 from potlp_jax.codec import config_from_dict, differences
 from potlp_jax.errors import ConfigurationError, EstimatorError, NetworkError, PotlpError
 from potlp_jax.files import read_npz, reading, require_mapping, short
-from potlp_jax.learning.building_network import BuildingConfig
+from potlp_jax.learning.architectures import ARCHITECTURES, EstimatorConfig, architecture_of
 from potlp_jax.learning.domain import Domain
-from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
-from potlp_jax.task.propositions import require_same_propositions
+from potlp_jax.learning.network import Params
 
 ESTIMATOR_FORMAT: str = "potlp-estimator-4"
 """Changed when older files can no longer be read."""
@@ -34,7 +33,7 @@ _HEADER = "header"
 
 
 def save_estimator(
-    path: Path | str, params: Params, config: NetworkConfig, domain: Domain, metadata: Mapping[str, Any]
+    path: Path | str, params: Params, config: EstimatorConfig, domain: Domain, metadata: Mapping[str, Any]
 ) -> None:
     """Write an estimator.
 
@@ -49,7 +48,12 @@ def save_estimator(
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     arrays = named_arrays(params)
-    description = {"network": dataclasses.asdict(config), "domain": dataclasses.asdict(domain), "metadata": metadata}
+    description = {
+        "architecture": architecture_of(config).name,
+        "network": dataclasses.asdict(config),
+        "domain": dataclasses.asdict(domain),
+        "metadata": metadata,
+    }
     header = json.dumps({"format": ESTIMATOR_FORMAT, **description})
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("wb") as file:
@@ -62,7 +66,7 @@ def save_estimator(
     temporary.replace(path)
 
 
-def load_estimator(path: Path | str) -> tuple[Params, NetworkConfig, Domain, dict[str, Any]]:
+def load_estimator(path: Path | str) -> tuple[Params, EstimatorConfig, Domain, dict[str, Any]]:
     """Parameters, network configuration, domain and metadata of an estimator.
 
     Raises:
@@ -83,7 +87,7 @@ def load_estimator(path: Path | str) -> tuple[Params, NetworkConfig, Domain, dic
     with reading(path, EstimatorError, "an estimator"):
         config, domain, metadata = _configuration(path, header)
         # What the network would have, without computing it: names and shapes must agree before anything is used.
-        like = jax.eval_shape(EstimatorNetwork(config).init, jax.random.key(0))
+        like = jax.eval_shape(architecture_of(config).network(config).init, jax.random.key(0))
         wanted = named_leaves(like)
     found = differences(array_shapes(arrays), array_shapes(wanted), "array")
     if found:
@@ -115,37 +119,19 @@ def require_finite(arrays: Mapping[str, np.ndarray], where: str, kind: type[Potl
             )
 
 
-def _configuration(path: Path | str, header: Mapping[str, Any]) -> tuple[NetworkConfig, Domain, dict[str, Any]]:
+def _configuration(path: Path | str, header: Mapping[str, Any]) -> tuple[EstimatorConfig, Domain, dict[str, Any]]:
+    # Files from before there was a choice are of the first architecture.
+    name = header.get("architecture", next(iter(ARCHITECTURES)))
+    if name not in ARCHITECTURES:
+        raise EstimatorError(
+            f"{path}: architecture {short(name)} is not known; this library has {', '.join(ARCHITECTURES)}"
+        )
     try:
-        config = config_from_dict(NetworkConfig, header["network"], "network")
+        config = config_from_dict(ARCHITECTURES[name].config, header["network"], "network")
         domain = config_from_dict(Domain, header["domain"], "domain")
     except (ConfigurationError, NetworkError) as error:
         raise EstimatorError(f"{path}: {error}") from error
     return config, domain, require_mapping(path, header["metadata"], EstimatorError, "an estimator with metadata")
-
-
-def require_propositions(
-    config: NetworkConfig | BuildingConfig, propositions: tuple[str, ...], where: str, asker: str = "the task"
-) -> None:
-    """Check that an estimator was trained with these propositions, in this order.
-
-    Args:
-        config: of the estimator's network.
-        propositions: those of the task or the data.
-        where: names the estimator in the message.
-        asker: names the task or the data.
-
-    Raises:
-        PropositionsError: it was not.
-    """
-    # An entry of phi means what its position says, as a bit of a letter does.
-    require_same_propositions(
-        propositions,
-        config.propositions,
-        asker=asker,
-        knower=where,
-        remedy="give an estimator that was trained for the former, or train one (docs/estimator.md)",
-    )
 
 
 def named_leaves(tree: Any) -> dict[str, Any]:

@@ -21,11 +21,13 @@ from flax import struct
 from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
 from potlp_jax.errors import TrainingError
-from potlp_jax.learning.batches import Batch, Batches, batch_answers, prefetched
+from potlp_jax.learning.augmentation import Augmentation
+from potlp_jax.learning.batches import Batch, Batches, prefetched
 from potlp_jax.learning.checkpoints import checkpoint_steps, load_checkpoint, save_checkpoint
 from potlp_jax.learning.dataset import Samples
+from potlp_jax.learning.learner import Learner
 from potlp_jax.learning.loss import DataScale, Evaluation, Sums, evaluation_of, loss_sums, total_loss
-from potlp_jax.learning.network import EstimatorNetwork, Params
+from potlp_jax.learning.network import Params
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -34,7 +36,7 @@ class TrainingOptions:
 
     Attributes:
         seed: of the parameters, the order of the data and the augmentation.
-        views_per_batch, samples_per_view: panoramas in a batch, and samples of each; a view with more samples gives
+        views_per_batch, samples_per_view: views in a batch, and samples of each; a view with more samples gives
             a new random choice in every epoch, one with fewer is padded.
         learning_rate: the peak, after a linear rise over ``warmup`` of all steps, then a cosine to 0.
         weight_decay: of AdamW.
@@ -42,9 +44,8 @@ class TrainingOptions:
         average_decay: of the moving average of the parameters that is evaluated and kept; 0 for none.
         weighting: 1: the cross-entropy weighted by what mistakes cost; 0: not weighted; between: a mix.
         cost_share: factor of both cost terms.
-        mirror: probability of mirroring a panorama, its subgoals' bearings with it.
-        brightness, colour: standard deviations of the logarithm of a random gain per panorama, of all channels and of
-            each channel.
+        view_share: factor of what the network says of a view beside its answers.
+        augmentation: how views are varied.
         patience: evaluations without a better validation loss before training stops; 0 for never.
         checkpoint_steps: steps between checkpoints; there is one after every epoch too.
     """
@@ -59,16 +60,15 @@ class TrainingOptions:
     average_decay: float = 0.995
     weighting: float = 0.25
     cost_share: float = 0.5
-    mirror: float = 0.5
-    brightness: float = 0.05
-    colour: float = 0.02
+    view_share: float = 1.0
+    augmentation: Augmentation = Augmentation()
     patience: int = 6
     checkpoint_steps: int = 200
 
     def __post_init__(self) -> None:
         for name in ("views_per_batch", "samples_per_view", "checkpoint_steps"):
             _require_one(name, getattr(self, name))
-        for name in ("weighting", "mirror", "warmup", "average_decay"):
+        for name in ("weighting", "warmup", "average_decay"):
             if not 0 <= getattr(self, name) <= 1:
                 raise TrainingError(f"{name} is {getattr(self, name)}; give a number from 0 to 1")
 
@@ -142,36 +142,6 @@ class Trained:
     seconds: float
 
 
-def augment(
-    batch: Batch, key: PRNGKeyArray, config: TrainingConfig
-) -> tuple[Float32[Array, "G rows columns 3"], Float32[Array, "G K"]]:
-    """Pixels in [0, 1] and bearings, after random mirroring and gains.
-
-    The column of a pixel and its bearing change sign together, so mirroring the panorama negates the bearings. It is
-    the image that is mirrored, not the features: the first stage's kernels are not symmetrical.
-
-    Args:
-        batch: images as bytes, and bearings.
-        key: used up.
-        config: how much; 0 for none of a kind.
-
-    Returns:
-        Pixels and bearings of the batch's shapes.
-    """
-    of_mirror, of_brightness, of_colour = jax.random.split(key, 3)
-    views = batch.images.shape[0]
-    mirrored = jax.random.bernoulli(of_mirror, config.mirror, (views,))
-    images = jnp.where(mirrored[:, None, None, None], batch.images[:, :, ::-1], batch.images)
-    bearing = jnp.where(mirrored[:, None], -batch.bearing, batch.bearing)
-    pixels = images.astype(jnp.float32) / jnp.float32(255)
-    if config.brightness or config.colour:
-        # As a lamp and a camera's white balance change a picture: by factors, around 1.
-        gain = config.brightness * jax.random.normal(of_brightness, (views, 1, 1, 1))
-        gain = gain + config.colour * jax.random.normal(of_colour, (views, 1, 1, 3))
-        pixels = jnp.clip(pixels * jnp.exp(gain), 0, 1)
-    return pixels, bearing
-
-
 def learning_rate_schedule(config: TrainingConfig) -> optax.Schedule:
     """Linear warm-up, then a cosine to 0 at the last planned step."""
     # At least one step each, so that the schedule is defined for the shortest trainings of tests.
@@ -193,11 +163,17 @@ def make_optimizer(config: TrainingConfig) -> optax.GradientTransformation:
     )
 
 
-def initial_state(network: EstimatorNetwork, config: TrainingConfig) -> TrainState:
-    """The state before the first step."""
+def initial_state(learner: Learner, config: TrainingConfig, params: Any = None) -> TrainState:
+    """The state before the first step.
+
+    Args:
+        learner: what is trained.
+        config: how.
+        params: to begin with; new ones by default.
+    """
     # Two keys: changing the augmentation leaves the initial parameters as they were.
     of_params, of_augmentation = jax.random.split(jax.random.key(config.seed))
-    params = network.init(of_params)
+    params = learner.init(of_params) if params is None else params
     return TrainState(
         step=jnp.int32(0),
         key=jax.random.key_data(of_augmentation),
@@ -219,12 +195,12 @@ def _no_sums() -> Sums:
 
 @functools.lru_cache(8)
 def make_train_step(
-    network: EstimatorNetwork, config: TrainingConfig, scale: DataScale
+    learner: Learner, config: TrainingConfig, scale: DataScale
 ) -> Callable[[TrainState, Batch], tuple[TrainState, Float32[Array, ""]]]:
     """One compiled step.
 
     Args:
-        network: what is trained.
+        learner: what is trained.
         config: how; a new configuration compiles again.
         scale: figures of the training data.
 
@@ -234,10 +210,10 @@ def make_train_step(
     optimizer = make_optimizer(config)
 
     def loss(params: Params, batch: Batch, key: PRNGKeyArray) -> tuple[Array, Sums]:
-        pixels, bearing = augment(batch, key, config)
-        answers = batch_answers(network, params, pixels, bearing, batch)
-        sums = loss_sums(answers, batch, network.config, scale, config.weighting)
-        return total_loss(sums, config.cost_share), sums
+        inputs = learner.augmented(batch.inputs, key, config.augmentation)
+        answers, view_loss = learner.answers(params, inputs, batch.phi_stay, batch.phi_go)
+        sums = loss_sums(answers, view_loss, batch, learner.config, scale, config.weighting)
+        return total_loss(sums, config.cost_share, config.view_share), sums
 
     @jax.jit
     def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, Float32[Array, ""]]:
@@ -265,13 +241,11 @@ def make_train_step(
 
 
 @functools.lru_cache(8)
-def make_evaluate_step(
-    network: EstimatorNetwork, scale: DataScale, weighting: float
-) -> Callable[[Params, Batch], Sums]:
+def make_evaluate_step(learner: Learner, scale: DataScale, weighting: float) -> Callable[[Params, Batch], Sums]:
     """The compiled sums of one batch, not augmented.
 
     Args:
-        network: what is evaluated.
+        learner: what is evaluated.
         scale: figures of the training data, so that losses compare.
         weighting: as in training.
 
@@ -281,9 +255,8 @@ def make_evaluate_step(
 
     @jax.jit
     def evaluate_step(params: Params, batch: Batch) -> Sums:
-        pixels = batch.images.astype(jnp.float32) / jnp.float32(255)
-        answers = batch_answers(network, params, pixels, batch.bearing, batch)
-        return loss_sums(answers, batch, network.config, scale, weighting)
+        answers, view_loss = learner.answers(params, batch.inputs, batch.phi_stay, batch.phi_go)
+        return loss_sums(answers, view_loss, batch, learner.config, scale, weighting)
 
     return evaluate_step
 
@@ -297,19 +270,31 @@ def check_data(training: Samples, validation: Samples) -> None:
             raise TrainingError(f"the data sets differ in {name}: {one} for training, {other} for validation")
 
 
-def seconds_per_step(network: EstimatorNetwork, training: Samples, config: TrainingConfig, steps: int = 8) -> float:
+def batches_of(learner: Learner, samples: Samples, config: TrainingConfig) -> Batches:
+    """The batches of a data set as a learner is shown them."""
+    return Batches(
+        samples,
+        learner.inputs,
+        config.views_per_batch,
+        config.samples_per_view,
+        config.seed,
+        learner.usable(samples),
+    )
+
+
+def seconds_per_step(learner: Learner, training: Samples, config: TrainingConfig, steps: int = 8) -> float:
     """Measured time of a step with its share of decoding, after compilation; nothing is kept of these steps.
 
     Args:
-        network, training, config: as for ``train``.
+        learner, training, config: as for ``train``.
         steps: how many are timed.
 
     Returns:
         Seconds.
     """
-    batches = Batches(training, config.views_per_batch, config.samples_per_view, config.seed)
-    train_step = make_train_step(network, config, DataScale.of(training))
-    state = initial_state(network, config)
+    batches = batches_of(learner, training, config)
+    train_step = make_train_step(learner, config, DataScale.of(training))
+    state = initial_state(learner, config)
     started = 0.0
     for number, batch in enumerate(prefetched(batches.training_batch, 0, steps + 2)):
         # Two steps first: the one that compiles, and one that finds what was decoded during that.
@@ -320,18 +305,18 @@ def seconds_per_step(network: EstimatorNetwork, training: Samples, config: Train
     return (time.perf_counter() - started) / steps
 
 
-def steps_per_epoch(training: Samples, config: TrainingConfig) -> int:
+def steps_per_epoch(learner: Learner, training: Samples, config: TrainingConfig) -> int:
     """Batches in an epoch."""
-    return Batches(training, config.views_per_batch, config.samples_per_view, config.seed).per_epoch
+    return batches_of(learner, training, config).per_epoch
 
 
 def training_identity(
-    network: EstimatorNetwork, training: Samples, validation: Samples, config: TrainingConfig
+    learner: Learner, training: Samples, validation: Samples, config: TrainingConfig
 ) -> dict[str, Any]:
     """What must be equal for a training to be resumed.
 
     Args:
-        network: what is trained.
+        learner: what is trained.
         training, validation: the data, of which the sizes and splits are compared.
         config: how.
 
@@ -343,7 +328,7 @@ def training_identity(
         return {"views": len(samples.images), "samples": len(samples.success), "split": samples.metadata.split}
 
     return {
-        "network": dataclasses.asdict(network.config),
+        "network": dataclasses.asdict(learner.config),
         "training": dataclasses.asdict(config),
         "training_data": data(training),
         "validation_data": data(validation),
@@ -352,11 +337,12 @@ def training_identity(
 
 
 def train(
-    network: EstimatorNetwork,
+    learner: Learner,
     training: Samples,
     validation: Samples,
     config: TrainingConfig,
     *,
+    initial: Params | None = None,
     folder: Path | None = None,
     budget_seconds: float = float("inf"),
     on_start: Callable[[int], None] = lambda step: None,
@@ -366,10 +352,11 @@ def train(
     """Train, from the newest checkpoint in ``folder`` if there is one, and give the best parameters.
 
     Args:
-        network: what is trained.
+        learner: what is trained.
         training: what is learned from.
         validation: of other worlds; decides which parameters are the best.
         config: how, and for how many steps.
+        initial: parameters to begin with; new ones by default.
         folder: where checkpoints go; None for none.
         budget_seconds: training stops after this time, over all resumptions, also where steps are left.
         on_start: told the number of steps already done.
@@ -385,7 +372,7 @@ def train(
     """
     # Everything that a checkpoint must hold is in the loop's state: what stands here may be killed at any line.
     check_data(training, validation)
-    loop = _Loop(network, training, validation, config, folder)
+    loop = _Loop(learner, training, validation, config, folder, initial)
     on_start(loop.steps_done)
     # Decoding of the next batches goes on while the device is busy with this one.
     remaining = prefetched(loop.batches.training_batch, loop.steps_done, config.steps)
@@ -409,22 +396,23 @@ class _Loop:
 
     def __init__(
         self,
-        network: EstimatorNetwork,
+        learner: Learner,
         training: Samples,
         validation: Samples,
         config: TrainingConfig,
         folder: Path | None,
+        initial: Params | None,
     ) -> None:
-        self._network, self._config, self._folder = network, config, folder
+        self._learner, self._config, self._folder = learner, config, folder
         # Figures of the training data also scale the validation loss: they belong to the loss, not to the data.
         scale = DataScale.of(training)
-        self.batches = Batches(training, config.views_per_batch, config.samples_per_view, config.seed)
-        self._validation = Batches(validation, config.views_per_batch, config.samples_per_view, config.seed)
-        self._identity = training_identity(network, training, validation, config)
-        self._train_step = make_train_step(network, config, scale)
-        self._evaluate_step = make_evaluate_step(network, scale, config.weighting)
+        self.batches = batches_of(learner, training, config)
+        self._validation = batches_of(learner, validation, config)
+        self._identity = training_identity(learner, training, validation, config)
+        self._train_step = make_train_step(learner, config, scale)
+        self._evaluate_step = make_evaluate_step(learner, scale, config.weighting)
         self._schedule = learning_rate_schedule(config)
-        self._state = initial_state(network, config)
+        self._state = initial_state(learner, config, initial)
         before = 0.0
         saved = checkpoint_steps(folder) if folder is not None else []
         if folder is not None and saved:
@@ -458,9 +446,9 @@ class _Loop:
         # The moving average is what is evaluated and kept: it is less noisy than the parameters of any step.
         for batch in self._validation.evaluation_batches():
             sums = jax.tree.map(jnp.add, sums, self._evaluate_step(self._state.average, batch))
-        config, network = self._config, self._network.config
-        validation = evaluation_of(sums, network, config.cost_share)
-        trained = evaluation_of(self._state.sums, network, config.cost_share)
+        config, network = self._config, self._learner.config
+        validation = evaluation_of(sums, network, config.cost_share, config.view_share)
+        trained = evaluation_of(self._state.sums, network, config.cost_share, config.view_share)
         # NaN compares as worse than any best loss, so that training would go on in vain.
         if not np.isfinite(validation.loss):
             raise TrainingError(f"the validation loss after step {self.steps_done} is {validation.loss}")

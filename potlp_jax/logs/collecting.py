@@ -73,17 +73,18 @@ def collect_drives(
         recorder = recording.Recorder(number, config, WeightBounds(**metadata.weights))
         rng, pool = recording.draws_of_world(config, split, number, tasks)
         reader = PanoramaReader(drive, config.camera)
+        recorder.add_world(drive.world, number, ~drive.seen)
         recording.record_views(
             recorder,
             drive.world,
-            number,
             poses_of(drive),
             pool,
             rng,
             lambda pose, reader=reader: reader.panorama(pose.step),
-            drive.unexplored(),
+            most=config.views_per_world,
+            unexplored=drive.unexplored(),
         )
-        write_shard(folder, number, recorder.views, recorder.samples, metadata)
+        write_shard(folder, number, recorder.worlds, recorder.views, recorder.samples, metadata)
         counts.append(len(recorder.views["view"]))
     return counts
 
@@ -98,6 +99,7 @@ def _metadata(
         config,
         WeightBounds.of_map(height, width, resolution),
         versions(),
+        shape=(height, width),
         propositions=places.names,
         environment=environment,
         family=LOGS,

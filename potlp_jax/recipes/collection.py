@@ -1,16 +1,18 @@
 """Collects a dataset for the estimator from simulated buildings.
 
-A heuristic robot (``recipes.exploration``) wanders through each world. Now and then the panorama is recorded, and for
-every subgoal in line of sight and some outcome classes, drawn from a distribution of tasks, the true P_S, R_S, R_F and
-the weights of the loss. ``docs/dataset.md`` describes the files. A collection that was interrupted continues where it
-stopped: what is recorded depends on the seed, the split and the index of the world alone.
+A robot drives through each world: a heuristic one (``recipes.exploration``) that wanders, or PO-TLP itself with an
+estimator that was trained before (``recipes.policy_drives``), so that the next one learns from the states that it will
+meet. Now and then the panorama and the map are recorded, and for every subgoal and some outcome classes, drawn from a
+distribution of tasks, the true P_S, R_S, R_F and the weights of the loss. ``docs/dataset.md`` describes the files. A
+collection that was interrupted continues where it stopped: what is recorded depends on the seed, the split, the index
+of the world and the estimator alone.
 """
 
 import dataclasses
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -34,6 +36,7 @@ from potlp_jax.learning.dataset import (
     write_shard,
 )
 from potlp_jax.learning.domain import unit_of
+from potlp_jax.learning.estimator import named_estimator
 from potlp_jax.learning.questions import HELD_OUT, TaskDistribution
 from potlp_jax.learning.recording import (
     Pose,
@@ -45,6 +48,8 @@ from potlp_jax.learning.recording import (
 )
 from potlp_jax.learning.sample_weights import WeightBounds
 from potlp_jax.recipes.exploration import Explorer, ExplorerConfig
+from potlp_jax.recipes.policy_drives import policy_drives
+from potlp_jax.task.task import Task
 from potlp_jax.trials.config import trial_config_for
 from potlp_jax.trials.loop import versions
 from potlp_jax.world.camera import Disturbance, disturb
@@ -57,14 +62,21 @@ class CollectConfig(RecordingConfig):
     """What is recorded, and how the robot comes there.
 
     Attributes:
+        first_world: index in the split of the first world; those of a second collection follow those of the first.
         worlds_per_shard: what is lost, at most, where a process is killed.
         disturbance: of the images.
         explorer: how the robot wanders; it pursues the tasks that the outcome classes are from.
+        estimator: of PO-TLP, by name or file (``named_estimator``), where it drives; empty where the robot wanders.
+        drives: tasks that PO-TLP pursues in a world, each from the start; the views are divided among them, and what
+            one leaves over is the next one's.
     """
 
+    first_world: int = 0
     worlds_per_shard: int = 4
     disturbance: Disturbance = Disturbance()
     explorer: ExplorerConfig = ExplorerConfig()
+    estimator: str = ""
+    drives: int = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,7 +121,7 @@ def collect(
     processes: int = 1,
     tell: Callable[[Collected], None] = lambda collected: None,
 ) -> None:
-    """Collect what is missing of the first ``worlds`` worlds of a split.
+    """Collect what is missing of ``worlds`` worlds of a split, from ``config.first_world`` on.
 
     Args:
         generator: where worlds come from.
@@ -179,6 +191,7 @@ def dataset_metadata(generator: Generator, environment: str, split: Split, confi
         config,
         WeightBounds.of_map(*world.shape, resolution),
         versions(),
+        shape=world.shape,
         propositions=generator.propositions,
         environment=environment,
         family=world.family,
@@ -194,11 +207,11 @@ def _collect_shard(job: _Job) -> int:
     tasks = TaskDistribution(job.generator.propositions, job.config.held_out)
     # The bounds from the metadata: of the family's first world, so that all shards share them.
     recorder = Recorder(job.shard, job.config, WeightBounds(**job.metadata.weights))
-    first = job.shard * job.config.worlds_per_shard
+    first = job.config.first_world + job.shard * job.config.worlds_per_shard
     for index in range(first, first + job.config.worlds_per_shard):
         world = job.generator.generate(world_key(job.split, index, job.generator.name))
         _collect_world(recorder, world, index, tasks, job)
-    write_shard(job.folder, job.shard, recorder.views, recorder.samples, job.metadata)
+    write_shard(job.folder, job.shard, recorder.worlds, recorder.views, recorder.samples, job.metadata)
     return len(recorder.views["view"])
 
 
@@ -212,7 +225,23 @@ def _collect_world(recorder: Recorder, world: World, index: int, tasks: TaskDist
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), index), pose.step)
         return np.asarray(_image(world, jnp.asarray(pose.cell, jnp.int32), key, config))
 
-    record_views(recorder, world, index, Explorer(world, pool, rng, config.explorer).poses(), pool, rng, photograph)
+    recorder.add_world(world, index)
+    recorded = 0
+    drives, count = _drives(world, index, pool, rng, config)
+    for number, poses in enumerate(drives, start=1):
+        # What the drives before left over is for those that follow.
+        most = config.views_per_world * number // count - recorded
+        recorded += record_views(recorder, world, poses, pool, rng, photograph, most=most)
+
+
+def _drives(
+    world: World, index: int, pool: Sequence[Task], rng: np.random.Generator, config: CollectConfig
+) -> tuple[Iterable[Iterable[Pose]], int]:
+    """The drives through a world, and their number."""
+    if not config.estimator:
+        return [Explorer(world, pool, rng, config.explorer).poses()], 1
+    tasks, key = pool[: config.drives], jax.random.fold_in(jax.random.key(config.seed), index)
+    return policy_drives(world, tasks, named_estimator(config.estimator), key), len(tasks)
 
 
 @partial(jax.jit, static_argnames="config")

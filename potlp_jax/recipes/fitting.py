@@ -19,9 +19,12 @@ from typing import Any
 from potlp_jax.codec import differences
 from potlp_jax.errors import TrainingError
 from potlp_jax.files import MOST_TEXT, read_json, reading
-from potlp_jax.learning.dataset import Samples, decode
-from potlp_jax.learning.loss import DataScale, network_config
-from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, operation_counts, parameter_count
+from potlp_jax.learning.building_learner import BuildingOptions
+from potlp_jax.learning.dataset import Samples
+from potlp_jax.learning.learner import Learner
+from potlp_jax.learning.loss import DataScale
+from potlp_jax.learning.network import Params, parameter_count
+from potlp_jax.learning.panorama_learner import PanoramaOptions
 from potlp_jax.learning.serialization import save_estimator
 from potlp_jax.learning.training import (
     Trained,
@@ -49,17 +52,13 @@ class FitConfig:
     Attributes:
         epochs: passes over the panoramas, at most.
         minutes: plan as many steps as fit into this time; None for all epochs.
-        exclusive_within: cells within which subgoals exclude each other, as ``eval.exclusion`` measures; 0: nowhere.
-        fovea: columns of pixels on each side of a subgoal that the network sees at full resolution; 0 for none.
-        second_widths: channels of the eight convolutions after phi is joined.
+        network: the architecture and its sizes.
         training: of the optimiser and the data.
     """
 
     epochs: int = 10
     minutes: float | None = None
-    exclusive_within: float = NetworkConfig.exclusive_within
-    fovea: int = NetworkConfig.fovea
-    second_widths: tuple[int, ...] = NetworkConfig.second_widths
+    network: BuildingOptions | PanoramaOptions = BuildingOptions()
     training: TrainingOptions = TrainingOptions()
 
     def __post_init__(self) -> None:
@@ -69,7 +68,14 @@ class FitConfig:
             raise TrainingError(f"minutes is {self.minutes}; give a positive number, or null for no limit")
 
 
-def fit(training: Samples, validation: Samples, out: Path, config: FitConfig, display: Display = Display()) -> Trained:
+def fit(
+    training: Samples,
+    validation: Samples,
+    out: Path,
+    config: FitConfig,
+    display: Display = Display(),
+    initial: Params | None = None,
+) -> Trained:
     """Fit an estimator, or resume.
 
     Args:
@@ -78,6 +84,7 @@ def fit(training: Samples, validation: Samples, out: Path, config: FitConfig, di
         out: the fit's folder.
         config: what is fitted, and how.
         display: shows how it goes.
+        initial: parameters to begin with, of a fit before; new ones by default.
 
     Returns:
         The best parameters, which ``out`` / ``ESTIMATOR`` holds as well.
@@ -86,12 +93,12 @@ def fit(training: Samples, validation: Samples, out: Path, config: FitConfig, di
         TrainingError: the data do not fit, ``out`` has a plan for something else, or the loss is not finite.
         CheckpointError: ``out`` holds a damaged checkpoint, or one of another training.
     """
-    network = EstimatorNetwork(_network_config(training, config))
+    learner = config.network.learner(training)
     out.mkdir(parents=True, exist_ok=True)
     # Measuring counts: the time asked for is that of the whole command.
     began = time.perf_counter()
-    plan = _plan(network, training, out, config)
-    _say_what_is_fitted(network, training, plan, config, display)
+    plan = _plan(learner, training, out, config)
+    _say_what_is_fitted(training, plan, config, display)
     journal = Journal(out, plan.steps, display)
     budget = float("inf")
     if config.minutes is not None:
@@ -99,10 +106,11 @@ def fit(training: Samples, validation: Samples, out: Path, config: FitConfig, di
     # The journal is closed whatever happens, so that TensorBoard's file is whole.
     try:
         trained = train(
-            network,
+            learner,
             training,
             validation,
             plan,
+            initial=initial,
             folder=out / "checkpoints",
             budget_seconds=budget,
             on_start=journal.start,
@@ -113,30 +121,18 @@ def fit(training: Samples, validation: Samples, out: Path, config: FitConfig, di
         journal.close()
     # Whoever has the file alone can still say how it was made.
     metadata = _metadata(training, validation, plan, trained, journal)
-    save_estimator(out / ESTIMATOR, trained.params, network.config, training.metadata.domain, metadata)
+    save_estimator(out / ESTIMATOR, trained.params, learner.config, training.metadata.domain, metadata)
     return trained
 
 
-def _network_config(training: Samples, config: FitConfig) -> NetworkConfig:
-    if not training.images:
-        raise TrainingError("the dataset has no panoramas: collect more worlds")
-    # All panoramas of a dataset have the size of the first.
-    rows, columns, _ = decode(training.images[0]).shape
-    return network_config(
-        training,
-        (rows, columns),
-        exclusive_within=config.exclusive_within,
-        fovea=config.fovea,
-        second_widths=config.second_widths,
-    )
-
-
-def _plan(network: EstimatorNetwork, training: Samples, out: Path, config: FitConfig) -> TrainingConfig:
+def _plan(learner: Learner, training: Samples, out: Path, config: FitConfig) -> TrainingConfig:
     """How to train, and for how many steps."""
     options = dataclasses.asdict(config.training)
     # The number of steps changes neither the batches nor the time of a step, so any serves to find it out.
     one = TrainingConfig(steps=1, **options)
-    steps = planned_steps(out, steps_per_epoch(training, one), config, lambda: seconds_per_step(network, training, one))
+    steps = planned_steps(
+        out, steps_per_epoch(learner, training, one), config, lambda: seconds_per_step(learner, training, one)
+    )
     return TrainingConfig(steps=steps, **options)
 
 
@@ -180,13 +176,10 @@ def planned_steps(folder: Path, epoch: int, config: FitConfig, measure: Callable
     return int(plan["steps"])
 
 
-def _say_what_is_fitted(
-    network: EstimatorNetwork, training: Samples, plan: TrainingConfig, config: FitConfig, display: Display
-) -> None:
-    first, second = operation_counts(network.config)
+def _say_what_is_fitted(training: Samples, plan: TrainingConfig, config: FitConfig, display: Display) -> None:
     display.say(
-        f"{len(training.images)} panoramas, {len(training.success)} samples; {plan.steps} steps in at most "
-        f"{config.epochs} epochs; {first / 1e6:.1f} MFLOP per panorama and {second / 1e6:.1f} per sample, forward"
+        f"a {config.network.kind} network; {len(training.images)} views, {len(training.success)} samples; {plan.steps} "
+        f"steps in at most {config.epochs} epochs"
     )
 
 

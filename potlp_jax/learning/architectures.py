@@ -1,0 +1,62 @@
+"""The architectures of estimators: what a file's configuration is, what its parameters are, and how a trial begins."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+from potlp_jax.learning.building_estimator import BuildingEstimator
+from potlp_jax.learning.building_network import BuildingConfig, BuildingNetwork
+from potlp_jax.learning.memory import empty_memory
+from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
+from potlp_jax.learning.observing import ObservingEstimator
+from potlp_jax.learning.painting import blank_painting
+from potlp_jax.learning.panorama_estimator import NetworkEstimator
+
+EstimatorConfig = NetworkConfig | BuildingConfig
+"""Configuration of an estimator's network."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Architecture:
+    """One architecture.
+
+    Attributes:
+        name: as files have it.
+        config: class of its configurations.
+        network: the network of a configuration, with ``init``.
+        start: from parameters, configuration, rows and columns of the map's array, and panoramas that are remembered:
+            the estimator for a new trial.
+    """
+
+    name: str
+    config: type[Any]
+    network: Callable[[Any], Any]
+    start: Callable[[Params, Any, int, int, int], ObservingEstimator]
+
+
+def _start_panorama(params: Params, config: NetworkConfig, height: int, width: int, panoramas: int) -> NetworkEstimator:
+    memory = empty_memory(panoramas, config.feature_shape, height, width)
+    return NetworkEstimator(params=params, memory=memory, config=config)
+
+
+def _start_building(params: Params, config: BuildingConfig, height: int, width: int, _: int) -> BuildingEstimator:
+    # A painting holds any number of panoramas.
+    return BuildingEstimator(params=params, memory=blank_painting(height, width), config=config)
+
+
+ARCHITECTURES: Mapping[str, Architecture] = MappingProxyType(
+    {
+        architecture.name: architecture
+        for architecture in (
+            Architecture("panorama", NetworkConfig, EstimatorNetwork, _start_panorama),
+            Architecture("building", BuildingConfig, BuildingNetwork, _start_building),
+        )
+    }
+)
+"""By name: ``panorama`` answers from one panorama (Bradley et al. 2021), ``building`` from all that was seen."""
+
+
+def architecture_of(config: EstimatorConfig) -> Architecture:
+    """The architecture that a configuration is of."""
+    return next(found for found in ARCHITECTURES.values() if isinstance(config, found.config))
