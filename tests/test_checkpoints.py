@@ -11,8 +11,8 @@ import pytest
 from potlp_jax.errors import CheckpointError, EstimatorError, PropositionsError
 from potlp_jax.learning import serialization as estimator_files
 from potlp_jax.learning.checkpoints import checkpoint_steps, load_checkpoint, save_checkpoint
-from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
-from potlp_jax.learning.serialization import load_estimator, require_propositions, save_estimator
+from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, require_propositions
+from potlp_jax.learning.serialization import load_estimator, save_estimator
 from tests.reference.domains import domain_of
 
 CONFIG = NetworkConfig(
@@ -197,7 +197,7 @@ def test_an_estimator_of_another_format_or_network_is_refused_by_name(tmp_path, 
 
 
 def test_other_propositions_or_another_order_are_refused():
-    require_propositions(CONFIG, ("fire", "exit"), "the estimator")
+    require_propositions(CONFIG.propositions, ("fire", "exit"), "the estimator")
     for other in (("exit", "fire"), ("fire", "exit", "alarm")):
         with pytest.raises(PropositionsError, match=rf"task.*\({', '.join(other)}\), the estimator \(fire, exit\)"):
-            require_propositions(CONFIG, other, "the estimator")
+            require_propositions(CONFIG.propositions, other, "the estimator")

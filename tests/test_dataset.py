@@ -15,14 +15,17 @@ from potlp_jax.learning.dataset import (
     decode,
     encode,
     finished_shards,
+    joined,
     read_dataset,
     read_metadata,
     remove_unfinished_files,
     samples_file,
     view_id,
     views_file,
+    worlds_file,
     write_shard,
 )
+from tests.reference.data_sets import SHAPE, blank_columns, world_columns
 
 METADATA = DatasetMetadata(
     propositions=("fire", "exit", "alarm"),
@@ -36,6 +39,7 @@ METADATA = DatasetMetadata(
     weights={"low": 1.0, "high": 9.0},
     collection={"seed": 3},
     versions={"numpy": "2"},
+    shape=SHAPE,
 )
 
 
@@ -58,6 +62,7 @@ def _shard(shard, views=3, seed=0):
         "column": [2] * views,
         "format": ["png"] * views,
         "image": [encode(_image(shard * 100 + index), "png") for index in range(views)],
+        **blank_columns(views),
     }
     sample_columns = {
         "view": ids[::-1] * 2,
@@ -65,6 +70,7 @@ def _shard(shard, views=3, seed=0):
         "outcome_class": [0] * count,
         "row": [3] * count,
         "column": [4] * count,
+        "in_view": rng.integers(0, 2, count) > 0,
         "bearing": rng.uniform(-3, 3, count),
         "phi_stay": rng.integers(-1, 2, (count, 3)).tolist(),
         "phi_go": rng.integers(-1, 2, (count, 3)).tolist(),
@@ -78,7 +84,7 @@ def _shard(shard, views=3, seed=0):
 def _write(folder, shards, metadata=METADATA):
     columns = {shard: _shard(shard) for shard in shards}
     for shard, (views, samples) in columns.items():
-        write_shard(folder, shard, views, samples, metadata)
+        write_shard(folder, shard, world_columns(7), views, samples, metadata)
     return columns
 
 
@@ -93,6 +99,8 @@ def test_what_is_written_is_read_back(tmp_path):
         for index, view in enumerate(expected["view"]):
             image = samples.images[samples.view_of[row]]
             assert image == views["image"][views["view"].index(view)]
+            assert samples.in_view[row] == expected["in_view"][index]
+            assert samples.cells[row].tolist() == [3, 4]
             assert samples.bearing[row] == np.float32(expected["bearing"][index])
             assert samples.distance[row] == np.float32(expected["distance"][index])
             assert samples.phi_stay[row].tolist() == expected["phi_stay"][index]
@@ -104,7 +112,10 @@ def test_what_is_written_is_read_back(tmp_path):
             assert samples.failure_weight[row] == np.float32(expected["failure_weight"][index])
             row += 1
     assert row == len(samples.success)
-    assert len(samples.images) == 6
+    assert len(samples.images) == len(samples.maps) == 6
+    # Each shard has its own true maps, also of a world that both have.
+    assert samples.world_of.tolist() == [0, 0, 0, 1, 1, 1]
+    assert len(samples.worlds) == 2
 
 
 def test_pandas_reads_it_without_this_library(tmp_path):
@@ -153,7 +164,7 @@ def test_an_empty_folder_is_no_dataset(tmp_path):
         read_dataset(tmp_path)
 
 
-@pytest.mark.parametrize("file", [views_file, samples_file])
+@pytest.mark.parametrize("file", [worlds_file, views_file, samples_file])
 def test_a_truncated_file_is_named(tmp_path, file):
     _write(tmp_path, [0, 1])
     path = file(tmp_path, 1)
@@ -225,7 +236,7 @@ def test_values_out_of_range_are_named(tmp_path, column, value, message):
     views, samples = _shard(0)
     samples[column] = list(samples[column])
     samples[column][1] = value
-    write_shard(tmp_path, 0, views, samples, METADATA)
+    write_shard(tmp_path, 0, world_columns(7), views, samples, METADATA)
     with pytest.raises(DatasetError, match=message):
         read_dataset(tmp_path)
 
@@ -234,13 +245,34 @@ def test_a_success_has_a_cost(tmp_path):
     views, samples = _shard(0)
     samples["success_probability"] = [1.0] * 6
     samples["success_cost"] = [2.0] * 5 + [np.nan]
-    write_shard(tmp_path, 0, views, samples, METADATA)
+    write_shard(tmp_path, 0, world_columns(7), views, samples, METADATA)
     with pytest.raises(DatasetError, match="row 5: success_cost"):
         read_dataset(tmp_path)
 
 
 def test_views_are_unique(tmp_path):
     views, samples = _shard(0)
-    write_shard(tmp_path, 0, {**views, "view": [0, 1, 0]}, {**samples, "view": [0] * 6}, METADATA)
+    write_shard(tmp_path, 0, world_columns(7), {**views, "view": [0, 1, 0]}, {**samples, "view": [0] * 6}, METADATA)
     with pytest.raises(DatasetError, match="twice"):
         read_dataset(tmp_path)
+
+
+def test_views_are_of_worlds_in_their_shard(tmp_path):
+    views, samples = _shard(0)
+    write_shard(tmp_path, 0, world_columns(8), views, samples, METADATA)
+    with pytest.raises(DatasetError, match="rows of world 7, which is not in the shard"):
+        read_dataset(tmp_path)
+
+
+def test_data_sets_of_one_family_are_joined(tmp_path):
+    _write(tmp_path / "one", [0])
+    _write(tmp_path / "two", [1, 2], dataclasses.replace(METADATA, collection={"estimator": "mine"}))
+    one, two = read_dataset(tmp_path / "one"), read_dataset(tmp_path / "two")
+    both = joined([one, two])
+    assert both.images == one.images + two.images
+    assert both.view_of.tolist() == one.view_of.tolist() + (two.view_of + 3).tolist()
+    assert both.world_of.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2]
+    np.testing.assert_array_equal(both.distance, np.concatenate([one.distance, two.distance]))
+    other = dataclasses.replace(two, metadata=dataclasses.replace(two.metadata, resolution=0.5))
+    with pytest.raises(DatasetError, match=r"differ in resolution cannot be joined: 1\.0 and 0\.5"):
+        joined([one, other])

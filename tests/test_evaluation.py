@@ -38,10 +38,13 @@ from potlp_jax.learning.metrics import (
     roc_auc,
 )
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
+from potlp_jax.learning.panorama_learner import PanoramaLearner
 from potlp_jax.learning.serialization import save_estimator
 from potlp_jax.view.calibration import draw_costs, draw_predictions, draw_reliability, probability_table
 from potlp_jax.view.style import CHOSEN, rgb
 from potlp_jax.world.camera import CameraConfig
+from tests.reference import data_sets as blank
+from tests.reference.data_sets import blank_fields
 
 SHAPE = (64, 128)
 SIGMA = ("fire", "alarm", "exit")
@@ -57,6 +60,7 @@ METADATA = DatasetMetadata(
     weights={"low": 1.0, "high": 50.0},
     collection={},
     versions={},
+    shape=blank.SHAPE,
 )
 CONFIG = NetworkConfig(
     propositions=SIGMA,
@@ -66,6 +70,7 @@ CONFIG = NetworkConfig(
     dense_widths=(4, 4, 4, 4),
 )
 NETWORK = EstimatorNetwork(CONFIG)
+LEARNER = PanoramaLearner(CONFIG)
 
 
 def make_samples(views: int, count: int, seed: int, soft: bool = False) -> Samples:
@@ -87,6 +92,7 @@ def make_samples(views: int, count: int, seed: int, soft: bool = False) -> Sampl
         success_weight=np.ones(count, np.float32),
         failure_weight=np.ones(count, np.float32),
         metadata=METADATA,
+        **blank_fields(views, count),
     )
 
 
@@ -102,7 +108,8 @@ def make_predictions(count: int, seed: int, decimals: int = 1) -> Predictions:
 
 def _only(samples: Samples, chosen) -> Samples:
     arrays = {f.name: getattr(samples, f.name) for f in dataclasses.fields(samples)}
-    return dataclasses.replace(samples, **{k: v[chosen] for k, v in arrays.items() if isinstance(v, np.ndarray)})
+    of_samples = {k: v[chosen] for k, v in arrays.items() if isinstance(v, np.ndarray) and k != "world_of"}
+    return dataclasses.replace(samples, **of_samples)
 
 
 @settings(max_examples=30, deadline=None)
@@ -226,7 +233,7 @@ def test_every_sample_gets_its_own_answer():
     assert np.any(np.diff(samples.view_of) < 0)
     params = NETWORK.init(jax.random.key(1))
     seen = []
-    predictions = predict(NETWORK, params, samples, seen.append)
+    predictions = predict(LEARNER, params, samples, seen.append)
     assert seen[-1] == 150
 
     @jax.jit
@@ -424,7 +431,7 @@ def test_evaluate_reports_what_the_library_computes(estimator, dataset, tmp_path
     assert (report["prior"], report["prior_source"]) == (0.25, "training")
     assert list(report["figures"]) == ["intact", "image", "phi"]
     for name, found in report["figures"].items():
-        expected = evaluate(samples, predict(NETWORK, params, ablated(samples, name)), Prior(0.25, "training"))
+        expected = evaluate(samples, predict(LEARNER, params, ablated(samples, name)), Prior(0.25, "training"))
         assert found["overall"]["brier"] == expected.overall.brier
         assert found["overall"]["failure_cost"]["rmse"] == expected.overall.failure_cost.rmse
         assert found["groups"].keys() == expected.groups.keys()

@@ -108,10 +108,12 @@ def test_a_dataset_from_a_bag_has_the_rows_of_the_simulator(bags, tmp_path, kind
     (count,) = collect_drives([drive], places_of(bags), tmp_path, "toy", "training", config)
     views, samples = pd.read_parquet(views_file(tmp_path, 0)), pd.read_parquet(samples_file(tmp_path, 0))
 
-    recorder = Recorder(0, RecordingConfig(views_per_world=200, **settings), WeightBounds.of_map(*WORLD.shape, 1.0))
+    seen_as = RecordingConfig(views_per_world=200, camera=CAMERA, **settings)
+    recorder = Recorder(0, seen_as, WeightBounds.of_map(*WORLD.shape, 1.0))
+    recorder.add_world(WORLD, 0)
     rng = np.random.default_rng([0, zlib.crc32(b"training"), 0])
     pool = [TaskDistribution(TOY.propositions).draw(rng) for _ in range(2)]
-    record_views(recorder, WORLD, 0, _simulated_poses(), pool, rng, lambda pose: panorama_of(pose.step))
+    record_views(recorder, WORLD, _simulated_poses(), pool, rng, lambda pose: panorama_of(pose.step), most=200)
     expected = pd.DataFrame(recorder.samples)
     assert count == len(views) == len(recorder.views["view"]) > 2
     assert set(samples["success_probability"]) == {0.0, 1.0}

@@ -17,21 +17,25 @@ import numpy as np
 import pytest
 
 from potlp_jax.errors import CheckpointError, TrainingError
-from potlp_jax.learning.batches import Batch, Batches, batch_answers
+from potlp_jax.learning.augmentation import Augmentation
+from potlp_jax.learning.batches import Batch, Batches
 from potlp_jax.learning.checkpoints import checkpoint_steps
 from potlp_jax.learning.dataset import DatasetMetadata, Samples, encode
-from potlp_jax.learning.loss import DataScale, evaluation_of, loss_sums, network_config, total_loss
-from potlp_jax.learning.network import Answers, EstimatorNetwork
+from potlp_jax.learning.loss import DataScale, evaluation_of, loss_sums, total_loss
+from potlp_jax.learning.network import Answers
+from potlp_jax.learning.panorama_learner import PanoramaLearner, PanoramaOptions
 from potlp_jax.learning.serialization import load_estimator
 from potlp_jax.learning.training import (
     TrainingConfig,
-    augment,
+    batches_of,
     initial_state,
     learning_rate_schedule,
     make_train_step,
     train,
 )
 from potlp_jax.world.camera import CameraConfig
+from tests.reference import data_sets as blank
+from tests.reference.data_sets import blank_columns, blank_fields, world_columns
 
 SHAPE = (64, 128)
 ROOT = Path(__file__).parents[1]
@@ -53,6 +57,7 @@ METADATA = DatasetMetadata(
     weights={"low": 1.0, "high": 50.0},
     collection={},
     versions={},
+    shape=blank.SHAPE,
 )
 
 
@@ -92,19 +97,27 @@ def synthetic(views: int, per_view: int, seed: int) -> Samples:
         success_weight=draw.uniform(1, 50, len(success)).astype(np.float32),
         failure_weight=draw.uniform(1, 50, len(success)).astype(np.float32),
         metadata=METADATA,
+        **blank_fields(views, views * per_view),
     )
 
 
-def _network(samples: Samples, widths) -> EstimatorNetwork:
-    return EstimatorNetwork(dataclasses.replace(network_config(samples, SHAPE), **widths))
+def _learner(samples: Samples, widths) -> PanoramaLearner:
+    return PanoramaLearner(dataclasses.replace(PanoramaOptions().learner(samples).config, **widths))
+
+
+def _batches(samples: Samples, views: int, per_view: int, seed: int = 0) -> Batches:
+    return Batches(samples, PanoramaOptions().learner(samples).inputs, views, per_view, seed)
 
 
 def _batch(samples: Samples, views: int, per_view: int, step: int = 0) -> Batch:
-    return Batches(samples, views, per_view, 0).training_batch(step)
+    return _batches(samples, views, per_view).training_batch(step)
+
+
+PLAIN = Augmentation(mirror_rows=0.0, brightness=0.0, colour=0.0)
 
 
 def _config(steps: int, **changes) -> TrainingConfig:
-    plain = {"mirror": 0.0, "brightness": 0.0, "colour": 0.0, "patience": 0}
+    plain = {"augmentation": PLAIN, "patience": 0}
     return TrainingConfig(steps=steps, views_per_batch=4, samples_per_view=4, **{**plain, **changes})
 
 
@@ -112,13 +125,13 @@ def _config(steps: int, **changes) -> TrainingConfig:
 def test_the_loss_equals_the_formula_written_out(weighting):
     samples = synthetic(3, 5, 1)
     batch = _batch(samples, 3, 7)
-    network, scale = _network(samples, TINY), DataScale.of(samples)
+    network, scale = _learner(samples, TINY), DataScale.of(samples)
     draw = np.random.default_rng(0)
     logit, success_cost, failure_cost = (draw.normal(2, 3, (3, 7)).astype(np.float32) for _ in range(3))
     answers = Answers(
         success_logit=jnp.asarray(logit), success_cost=jnp.asarray(success_cost), failure_cost=jnp.asarray(failure_cost)
     )
-    sums = loss_sums(answers, batch, network.config, scale, weighting)
+    sums = loss_sums(answers, jnp.array([0.5, 1.0, 3.0]), batch, network.config, scale, weighting)
     weights = np.where(samples.success == 1, samples.success_weight, samples.failure_weight).tolist()
     mean, entropy, errors, brier, count = sum(weights) / len(weights), 0.0, 0.0, 0.0, 0
     for i, k in itertools.product(range(3), range(7)):
@@ -134,8 +147,8 @@ def test_the_loss_equals_the_formula_written_out(weighting):
         else:
             errors += (float(failure_cost[i, k] - batch.failure_cost[i, k]) / network.config.failure_cost_scale) ** 2
     assert count == 15
-    assert float(total_loss(sums, 0.3)) == pytest.approx((entropy + 0.3 * errors) / count, rel=1e-4)
-    evaluation = evaluation_of(sums, network.config, 0.3)
+    assert float(total_loss(sums, 0.3, 0.2)) == pytest.approx((entropy + 0.3 * errors) / count + 0.2 * 1.5, rel=1e-4)
+    evaluation = evaluation_of(sums, network.config, 0.3, 0.2)
     assert evaluation.brier == pytest.approx(brier / count, rel=1e-4)
     prior = float(np.mean(samples.success))
     assert evaluation.skill == pytest.approx(1 - brier / count / (prior * (1 - prior)), rel=1e-4)
@@ -143,30 +156,30 @@ def test_the_loss_equals_the_formula_written_out(weighting):
 
 def test_scales_are_those_of_the_labels_that_count():
     samples = synthetic(6, 8, 2)
-    config = network_config(samples, SHAPE)
+    config = PanoramaOptions().learner(samples).config
     won = samples.success == 1
     assert config.success_cost_scale == pytest.approx(np.std(samples.success_cost[won]), rel=1e-5)
     assert config.failure_cost_scale == pytest.approx(np.std(samples.failure_cost[~won]), rel=1e-5)
     assert config.propositions == ("red", "green")
     nothing = dataclasses.replace(samples, success=np.zeros_like(samples.success))
-    assert network_config(nothing, SHAPE).success_cost_scale == 1.0
+    assert PanoramaOptions().learner(nothing).config.success_cost_scale == 1.0
 
 
 def test_a_fovea_looks_through_the_data_sets_camera():
     samples = synthetic(6, 8, 2)
     bare = dataclasses.replace(samples, metadata=dataclasses.replace(samples.metadata, camera={"width": 128}))
     with pytest.raises(TrainingError, match="horizon, far, fold"):
-        network_config(bare, SHAPE, fovea=3)
+        PanoramaOptions(fovea=3).learner(bare)
     camera = {"horizon": 20.0, "far": 40.0, "fold": 8.0}
     seen = dataclasses.replace(samples, metadata=dataclasses.replace(samples.metadata, camera=camera))
-    config = network_config(seen, SHAPE, fovea=3)
+    config = PanoramaOptions(fovea=3).learner(seen).config
     assert (config.fovea, config.horizon, config.far, config.fold) == (3, 20.0, 40.0, 8.0)
 
 
 def test_costs_that_are_not_known_give_no_nan_gradient_and_padding_gives_none():
     samples = synthetic(4, 3, 3)
     samples = dataclasses.replace(samples, failure_cost=np.full_like(samples.failure_cost, np.nan))
-    network, scale = _network(samples, TINY), DataScale.of(samples)
+    network, scale = _learner(samples, TINY), DataScale.of(samples)
     params = network.init(jax.random.key(0))
     batch = _batch(samples, 4, 5)
     assert bool(jnp.any(jnp.isnan(batch.success_cost)))
@@ -175,9 +188,8 @@ def test_costs_that_are_not_known_give_no_nan_gradient_and_padding_gives_none():
     @jax.jit
     def gradient(batch):
         def loss(params):
-            pixels = batch.images.astype(jnp.float32) / jnp.float32(255)
-            answers = batch_answers(network, params, pixels, batch.bearing, batch)
-            return total_loss(loss_sums(answers, batch, network.config, scale, 1.0), 1.0)
+            answers, of_views = network.answers(params, batch.inputs, batch.phi_stay, batch.phi_go)
+            return total_loss(loss_sums(answers, of_views, batch, network.config, scale, 1.0), 1.0, 1.0)
 
         return jax.grad(loss)(params)
 
@@ -192,28 +204,36 @@ def test_costs_that_are_not_known_give_no_nan_gradient_and_padding_gives_none():
         np.testing.assert_array_equal(one, two)
 
 
-def test_mirroring_mirrors_the_image_and_negates_the_bearing_together():
-    samples = synthetic(4, 4, 4)
-    batch = _batch(samples, 4, 4)
-    pixels, bearing = augment(batch, jax.random.key(0), _config(1, mirror=1.0))
+def _augmented(inputs, seed=0, **amount):
+    learner = PanoramaLearner(PanoramaOptions().learner(synthetic(1, 1, 0)).config)
+    return learner.augmented(inputs, jax.random.key(seed), dataclasses.replace(PLAIN, **amount))
+
+
+@pytest.mark.parametrize("amount", [{"mirror_rows": 1.0}, {"mirror_columns": 1.0}])
+def test_mirroring_mirrors_the_image_and_the_bearing_together(amount):
+    batch = _batch(synthetic(4, 4, 4), 4, 4)
+    inputs, mirrored = batch.inputs, _augmented(batch.inputs, **amount)
     # XLA divides by 255 as it multiplies by its reciprocal: the last bit may differ from NumPy's.
-    clean = np.asarray(batch.images).astype(np.float32) / np.float32(255)
-    np.testing.assert_allclose(pixels, clean[:, :, ::-1], rtol=3e-7)
-    np.testing.assert_array_equal(bearing, -batch.bearing)
+    clean = np.asarray(inputs.pixels).astype(np.float32) / np.float32(255)
+    assert not np.allclose(mirrored.pixels, clean)
+    # A direction keeps its row's part and changes its column's part, or the other way round.
+    sign = -1 if "mirror_rows" in amount else 1
+    np.testing.assert_allclose(np.sin(mirrored.bearing), sign * np.sin(inputs.bearing), atol=1e-6)
+    np.testing.assert_allclose(np.cos(mirrored.bearing), -sign * np.cos(inputs.bearing), atol=1e-6)
     # The colour that a subgoal's bearing points at stays the same: looked up by the definition of the bearing.
-    for image, angles in ((np.asarray(batch.images) / 255, batch.bearing), (pixels, bearing)):
+    for image, angles in ((clean, inputs.bearing), (mirrored.pixels, mirrored.bearing)):
         columns = np.floor((np.asarray(angles) + math.pi) / (2 * math.pi) * SHAPE[1]).astype(int) % SHAPE[1]
         red = np.asarray(image)[np.arange(4)[:, None], 34, columns, 0] > 0.5
         np.testing.assert_array_equal(red, (np.asarray(batch.phi_go)[..., 0] == 1) == (np.asarray(batch.success) == 1))
-    same, kept = augment(batch, jax.random.key(0), _config(1))
-    np.testing.assert_array_equal(kept, batch.bearing)
-    np.testing.assert_allclose(same, clean, rtol=3e-7)
+    same = _augmented(inputs)
+    np.testing.assert_array_equal(same.bearing, inputs.bearing)
+    np.testing.assert_allclose(same.pixels, clean, rtol=3e-7)
 
 
 def test_gains_change_pixels_within_their_range_and_per_panorama():
-    batch = _batch(synthetic(4, 4, 4), 4, 4)
-    clean = np.asarray(batch.images).astype(np.float32) / 255
-    pixels, _ = augment(batch, jax.random.key(1), _config(1, brightness=0.2))
+    inputs = _batch(synthetic(4, 4, 4), 4, 4).inputs
+    clean = np.asarray(inputs.pixels).astype(np.float32) / 255
+    pixels = _augmented(inputs, seed=1, brightness=0.2).pixels
     assert float(jnp.min(pixels)) >= 0
     assert float(jnp.max(pixels)) <= 1
     gains = (np.asarray(pixels) / np.maximum(clean, 1e-3))[:, 0, 0]
@@ -221,14 +241,25 @@ def test_gains_change_pixels_within_their_range_and_per_panorama():
     np.testing.assert_allclose(gains[:, 0], gains[:, 1], rtol=1e-4)
 
 
+def test_a_panorama_network_learns_from_the_subgoals_in_view_alone():
+    samples = synthetic(3, 6, 5)
+    samples.in_view[::2] = False
+    samples = dataclasses.replace(samples, distance=np.arange(18, dtype=np.float32))  # names every sample
+    learner = PanoramaOptions().learner(samples)
+    batches = batches_of(learner, samples, TrainingConfig(steps=1, views_per_batch=3, samples_per_view=6))
+    batch = batches.training_batch(0)
+    asked = np.asarray(batch.inputs.distance)[np.asarray(batch.mask)]
+    assert sorted(asked.tolist()) == list(range(1, 18, 2))
+
+
 def test_the_order_is_a_function_of_seed_and_step_and_covers_an_epoch():
     samples = synthetic(11, 6, 5)
     samples = dataclasses.replace(samples, distance=np.arange(66, dtype=np.float32))  # names every sample
-    batches, again = Batches(samples, 3, 4, 7), Batches(samples, 3, 4, 7)
+    batches, again = _batches(samples, 3, 4, 7), _batches(samples, 3, 4, 7)
     assert batches.per_epoch == 3
     epochs = []
     for epoch in range(2):
-        seen = [np.asarray(batches.training_batch(3 * epoch + step).distance).astype(int) for step in range(3)]
+        seen = [np.asarray(batches.training_batch(3 * epoch + step).inputs.distance).astype(int) for step in range(3)]
         views = [set((rows // 6).tolist()) for block in seen for rows in block]
         assert all(len(view) == 1 for view in views)
         assert len(set.union(*views)) == 9
@@ -239,14 +270,14 @@ def test_the_order_is_a_function_of_seed_and_step_and_covers_an_epoch():
         one, other = batches.training_batch(step), again.training_batch(step)
         pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
         assert all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
-    other = Batches(samples, 3, 4, 8).training_batch(0)
-    assert not np.array_equal(other.distance, batches.training_batch(0).distance)
+    other = _batches(samples, 3, 4, 8).training_batch(0)
+    assert not np.array_equal(other.inputs.distance, batches.training_batch(0).inputs.distance)
 
 
 def test_evaluation_sees_every_sample_once():
     samples = synthetic(5, 7, 6)
     samples = dataclasses.replace(samples, distance=np.arange(35, dtype=np.float32))
-    seen = [np.asarray(b.distance)[np.asarray(b.mask)] for b in Batches(samples, 2, 3, 0).evaluation_batches()]
+    seen = [np.asarray(b.inputs.distance)[np.asarray(b.mask)] for b in _batches(samples, 2, 3, 0).evaluation_batches()]
     assert sorted(np.concatenate(seen).tolist()) == list(range(35))
 
 
@@ -262,20 +293,18 @@ def test_the_learning_rate_rises_and_ends_at_zero():
 
 def test_it_learns_64_samples_whose_label_needs_picture_bearing_and_phi():
     samples = synthetic(16, 4, 8)
-    network = _network(samples, WIDTHS)
+    network = _learner(samples, WIDTHS)
     config = TrainingConfig(
         steps=120, views_per_batch=16, samples_per_view=4, learning_rate=6e-3, weighting=0.5, patience=0,
-        mirror=0.0, brightness=0.0, colour=0.0, average_decay=0.88,
+        augmentation=PLAIN, average_decay=0.88,
     )  # fmt: skip
     step = make_train_step(network, config, DataScale.of(samples))
     state, batch = initial_state(network, config), _batch(samples, 16, 4)
     for _ in range(config.steps):
         state, _ = step(state, batch)
-    pixels = batch.images.astype(jnp.float32) / jnp.float32(255)
-    answers = batch_answers(network, state.average, pixels, batch.bearing, batch)
-    evaluation = evaluation_of(
-        loss_sums(answers, batch, network.config, DataScale.of(samples), 1.0), network.config, config.cost_share
-    )
+    answers, of_views = network.answers(state.average, batch.inputs, batch.phi_stay, batch.phi_go)
+    sums = loss_sums(answers, of_views, batch, network.config, DataScale.of(samples), 1.0)
+    evaluation = evaluation_of(sums, network.config, config.cost_share, config.view_share)
     assert evaluation.skill > 0.95
     assert evaluation.success_rmse < 0.3 * network.config.success_cost_scale
     assert evaluation.failure_rmse < 0.3 * network.config.failure_cost_scale
@@ -284,7 +313,7 @@ def test_it_learns_64_samples_whose_label_needs_picture_bearing_and_phi():
 def test_a_loss_that_is_not_finite_stops_with_the_step():
     samples = synthetic(4, 4, 9)
     samples.distance[:] = np.inf
-    network = _network(synthetic(4, 4, 9), TINY)
+    network = _learner(synthetic(4, 4, 9), TINY)
     with pytest.raises(TrainingError, match="loss of step 1 is nan"):
         train(network, samples, samples, _config(2))
 
@@ -293,7 +322,7 @@ def test_data_that_do_not_belong_together_are_refused():
     samples = synthetic(4, 4, 9)
     metadata = dataclasses.replace(METADATA, propositions=("red", "blue"))
     with pytest.raises(TrainingError, match=r"propositions.*blue"):
-        train(_network(samples, TINY), samples, dataclasses.replace(samples, metadata=metadata), _config(2))
+        train(_learner(samples, TINY), samples, dataclasses.replace(samples, metadata=metadata), _config(2))
 
 
 def test_patience_ends_training_and_the_best_is_kept():
@@ -302,7 +331,7 @@ def test_patience_ends_training_and_the_best_is_kept():
     config = _config(50, learning_rate=1e-30, patience=3)
     losses = []
     done = train(
-        _network(samples, TINY), samples, samples, config, on_evaluation=lambda p: losses.append(p.validation.loss)
+        _learner(samples, TINY), samples, samples, config, on_evaluation=lambda p: losses.append(p.validation.loss)
     )
     assert (done.reason, done.best_step, done.steps, len(losses)) == ("patience", 1, 4, 4)
     assert done.best_loss == pytest.approx(losses[0])
@@ -311,7 +340,7 @@ def test_patience_ends_training_and_the_best_is_kept():
 def test_a_time_budget_ends_training_with_an_evaluation():
     samples = synthetic(4, 4, 9)
     seen = []
-    done = train(_network(samples, TINY), samples, samples, _config(2), budget_seconds=0.001, on_evaluation=seen.append)
+    done = train(_learner(samples, TINY), samples, samples, _config(2), budget_seconds=0.001, on_evaluation=seen.append)
     # The budget is over before the first step: nothing is trained, or one step and its evaluation.
     assert done.reason == "time"
     assert [progress.step for progress in seen] == list(range(1, done.steps + 1))
@@ -326,9 +355,9 @@ def _trial(folder: str) -> None:
         print(f"step {step} {loss!r}", flush=True)
         time.sleep(0.02)  # so that the kill comes in the middle
 
-    config = _config(40, mirror=0.5, brightness=0.1, colour=0.1, average_decay=0.9, checkpoint_steps=3)
+    config = _config(40, augmentation=Augmentation(brightness=0.1, colour=0.1), average_decay=0.9, checkpoint_steps=3)
     done = train(
-        _network(samples, TINY),
+        _learner(samples, TINY),
         samples,
         validation,
         config,
@@ -381,13 +410,13 @@ def test_killed_and_resumed_it_reaches_the_same_parameters_bit_for_bit(tmp_path)
 
 def test_resuming_with_other_options_or_data_names_the_difference(tmp_path):
     samples = synthetic(4, 4, 9)
-    network = _network(samples, TINY)
+    network = _learner(samples, TINY)
     train(network, samples, samples, _config(2), folder=tmp_path)
     with pytest.raises(CheckpointError, match=r"training\.learning_rate was 0\.002, is 0\.1"):
         train(network, samples, samples, _config(2, learning_rate=0.1), folder=tmp_path)
     renamed = dataclasses.replace(network.config, propositions=("red", "blue"))
     with pytest.raises(CheckpointError, match=r"network\.propositions .*green.*blue"):
-        train(EstimatorNetwork(renamed), samples, samples, _config(2), folder=tmp_path)
+        train(PanoramaLearner(renamed), samples, samples, _config(2), folder=tmp_path)
 
 
 def test_the_command_writes_an_estimator_and_resumes(tmp_path):
@@ -397,18 +426,19 @@ def test_the_command_writes_an_estimator_and_resumes(tmp_path):
     for name, seed in (("training", 12), ("validation", 13)):
         samples = synthetic(4, 5, seed)
         views = {key: [0] * 4 for key in ("world", "step", "row", "column")}
-        views |= {"view": list(range(4)), "format": ["png"] * 4, "image": samples.images}
+        views |= {"view": list(range(4)), "format": ["png"] * 4, "image": samples.images, **blank_columns(4)}
         plain = ("bearing", "distance", "success_cost", "failure_cost", "success_weight", "failure_weight")
         columns = {key: getattr(samples, key).tolist() for key in plain}
         columns |= {key: getattr(samples, key).tolist() for key in ("phi_stay", "phi_go")}
         columns |= {key: [0] * 20 for key in ("outcome_class", "row", "column")}
         columns |= {"view": samples.view_of.tolist(), "task": ["F red"] * 20}
-        columns |= {"success_probability": samples.success.tolist()}
-        write_shard(tmp_path / name, 0, views, columns, recorded)
+        columns |= {"success_probability": samples.success.tolist(), "in_view": samples.in_view.tolist()}
+        write_shard(tmp_path / name, 0, world_columns(0), views, columns, recorded)
     command = [sys.executable, "-c", "from potlp_jax.cli import main; main()", "fit", str(tmp_path / "training")]
     command += ["--validation", str(tmp_path / "validation"), "--out", str(tmp_path / "out"), "--epochs", "2"]
     command += ["--set", "training.views_per_batch=2", "--set", "training.samples_per_view=2"]
-    command += ["--fovea", "3", "--set", "second_widths=[3, 4, 5, 6, 7, 8, 9, 9]"]
+    command += ["--set", "network.kind=panorama", "--set", "network.fovea=3"]
+    command += ["--set", "network.second_widths=[3, 4, 5, 6, 7, 8, 9, 9]"]
     for expected in ("epoch   2.0", "resumed at step"):
         done = subprocess.run(
             command, capture_output=True, text=True, cwd=ROOT, timeout=400, env=_environment(tmp_path)

@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import numpy as np
 
 from potlp_jax.environments.ros.map_files import GridFrame
 from potlp_jax.environments.ros.places import Disc, Places, Polygon, save_places
-from potlp_jax.world.grid import belief_from_numpy
+from potlp_jax.world.grid import BeliefMap, belief_from_numpy, make_world
 
 Tree = dict[str, bytes]
 """Contents of files by their path within a folder."""
@@ -225,11 +226,17 @@ def make_checkpoint(folder: Path) -> None:
 def make_dataset(folder: Path) -> None:
     """A dataset of two shards."""
     from potlp_jax.learning.dataset import DatasetMetadata, encode, view_id, write_shard
+    from potlp_jax.learning.map_images import encode_view, encode_world
+    from potlp_jax.learning.painting import blank_painting
 
     random = np.random.default_rng(0)
     metadata = DatasetMetadata(
-        ("fire", "extinguisher"), "toy", "toy", {}, "training", {}, {}, {}, {"low": 1.0, "high": 2.0}, {}, {}
+        ("fire", "extinguisher"), "toy", "toy", {}, "training", {}, {}, {}, {"low": 1.0, "high": 2.0}, {}, {}, (5, 6)
     )
+    walls = np.pad(np.zeros((3, 4), bool), 1, constant_values=True)
+    world = make_world(walls, np.zeros(walls.shape, np.int32), (1, 1), propositions=metadata.propositions)
+    view = asdict(encode_view(BeliefMap.unobserved(world), blank_painting(*world.shape)))
+    worlds = {"world": [0], **{name: [value] for name, value in asdict(encode_world(world)).items()}}
     for shard in range(2):
         images = [encode(random.integers(0, 255, (16, 32, 3)).astype(np.uint8)) for _ in range(3)]
         views = {
@@ -237,18 +244,20 @@ def make_dataset(folder: Path) -> None:
             **{name: [0] * 3 for name in ("world", "step", "row", "column")},
             "format": ["jpeg"] * 3,
             "image": images,
+            **{name: [image] * 3 for name, image in view.items()},
         }
         numbers = ("bearing", "distance", "success_probability", "success_cost", "failure_cost")
         samples = {
             "view": [view_id(shard, index % 3) for index in range(8)],
             "task": ["F fire"] * 8,
             **{name: [0] * 8 for name in ("outcome_class", "row", "column")},
+            "in_view": [True, False] * 4,
             **{name: random.uniform(0.1, 1.0, 8).astype(np.float32) for name in numbers},
             "phi_stay": [[0, 1]] * 8,
             "phi_go": [[1, -1]] * 8,
             **{name: np.ones(8, np.float32) for name in ("success_weight", "failure_weight")},
         }
-        write_shard(folder, shard, views, samples, metadata)
+        write_shard(folder, shard, worlds, views, samples, metadata)
 
 
 def make_export(folder: Path) -> None:

@@ -205,18 +205,20 @@ def _write(
 def show_estimator(estimator: EstimatorArgument, json: Json = False) -> None:
     """Show what an estimator knows, how large it is and how it was trained."""
     from potlp_jax.codec import finite_or_null
-    from potlp_jax.learning.network import operation_counts, parameter_count
+    from potlp_jax.learning.architectures import architecture_of
+    from potlp_jax.learning.network import parameter_count
     from potlp_jax.learning.serialization import load_estimator
 
     params, config, domain, metadata = load_estimator(estimator)
-    # The network runs in two parts: once for a panorama, then once for each subgoal and outcome class.
-    per_panorama, per_answer = operation_counts(config)
+    architecture = architecture_of(config)
+    # What a map costs goes by its size; 64 × 192 cells where the file does not say of what maps it learned.
+    shape = tuple(metadata.get("data", {}).get("shape", (64, 192)))
     description = {
         "estimator": str(estimator),
         "bytes": estimator.stat().st_size,
         "parameters": parameter_count(params),
-        "operations_per_panorama": per_panorama,
-        "operations_per_answer": per_answer,
+        "operations": architecture.operations(config, shape),
+        "architecture": architecture.name,
         "network": dataclasses.asdict(config),
         "domain": dataclasses.asdict(domain),
         "metadata": metadata,
@@ -234,33 +236,38 @@ def show_estimator(estimator: EstimatorArgument, json: Json = False) -> None:
     out.print(table)
 
 
-def _fovea(reach: int) -> str:
-    # Estimators without a fovea see the panorama at one resolution.
-    if not reach:
-        return "nothing"
+def _sizes(description: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The sizes of the network, by its architecture."""
+    network = description["network"]
+    if description["architecture"] == "building":
+        return [
+            ("convolutions", f"{_list(network['widths'])} channels, with {_list(network['blocks'])} residual blocks"),
+            ("way back, head", f"{network['decoder']} channels, {network['head']} units"),
+        ]
     from potlp_jax.learning.fovea import ABOVE, BAND, BELOW
 
-    return f"{2 * reach + 1} columns × {(ABOVE + BELOW) * BAND} rows around each subgoal"
+    reach = network["fovea"]
+    fovea = f"{2 * reach + 1} columns × {(ABOVE + BELOW) * BAND} rows around each subgoal" if reach else "nothing"
+    return [
+        ("fovea", fovea),
+        ("convolutions", f"{_list(network['first_widths'])}, then {_list(network['second_widths'])} channels"),
+        ("fully connected", f"{_list(network['dense_widths'])} units"),
+    ]
 
 
 def _rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     """Names and values for people; what the file does not say is left out."""
     # Estimators of others may lack any entry of the metadata; those of the network are always there.
     network, domain, metadata = (description[name] for name in ("network", "domain", "metadata"))
-    data = metadata.get("data", {})
+    data, operations = metadata.get("data", {}), description["operations"]
     rows = [
         ("propositions", ", ".join(network["propositions"])),
         ("serves", f"worlds of {domain['family'] or 'no named family'}, costs in {domain['unit']}"),
         ("panorama", " × ".join(map(str, network["image_shape"])) + " pixels"),
-        ("fovea", _fovea(network["fovea"])),
         ("file", f"{description['bytes'] / 1e6:.2f} MB, {description['parameters']:,} parameters"),
-        (
-            "arithmetic",
-            f"{description['operations_per_panorama'] / 1e6:.1f} MFLOP a panorama, "
-            f"{description['operations_per_answer'] / 1e6:.1f} MFLOP a subgoal and class",
-        ),
-        ("convolutions", f"{_list(network['first_widths'])}, then {_list(network['second_widths'])} channels"),
-        ("fully connected", f"{_list(network['dense_widths'])} units"),
+        ("arithmetic", "; ".join(f"{count / 1e6:.2f} MFLOP {what}" for what, count in operations.items())),
+        ("architecture", description["architecture"]),
+        *_sizes(description),
     ]
     if data:
         rows.append(("trained on", f"{data.get('environment')}/{data.get('split')}"))

@@ -6,9 +6,9 @@ from types import MappingProxyType
 from typing import Any
 
 from potlp_jax.learning.building_estimator import BuildingEstimator
-from potlp_jax.learning.building_network import BuildingConfig, BuildingNetwork
+from potlp_jax.learning.building_network import BuildingConfig, BuildingNetwork, building_operations
 from potlp_jax.learning.memory import empty_memory
-from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params
+from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params, operation_counts
 from potlp_jax.learning.observing import ObservingEstimator
 from potlp_jax.learning.painting import blank_painting
 from potlp_jax.learning.panorama_estimator import NetworkEstimator
@@ -25,6 +25,8 @@ class Architecture:
         name: as files have it.
         config: class of its configurations.
         network: the network of a configuration, with ``init``.
+        operations: from a configuration, and rows and columns of a map: floating-point operations forward, by what
+            they are done for.
         start: from parameters, configuration, rows and columns of the map's array, and panoramas that are remembered:
             the estimator for a new trial.
     """
@@ -32,7 +34,18 @@ class Architecture:
     name: str
     config: type[Any]
     network: Callable[[Any], Any]
+    operations: Callable[[Any, tuple[int, int]], dict[str, int]]
     start: Callable[[Params, Any, int, int, int], ObservingEstimator]
+
+
+def _panorama_operations(config: NetworkConfig, _: tuple[int, int]) -> dict[str, int]:
+    return dict(zip(("a panorama", "a subgoal and class"), operation_counts(config), strict=True))
+
+
+def _building_operations(config: BuildingConfig, shape: tuple[int, int]) -> dict[str, int]:
+    height, width = shape
+    names = (f"a map of {height} × {width} cells", "a subgoal", "a subgoal and class")
+    return dict(zip(names, building_operations(config, height, width), strict=True))
 
 
 def _start_panorama(params: Params, config: NetworkConfig, height: int, width: int, panoramas: int) -> NetworkEstimator:
@@ -49,8 +62,8 @@ ARCHITECTURES: Mapping[str, Architecture] = MappingProxyType(
     {
         architecture.name: architecture
         for architecture in (
-            Architecture("panorama", NetworkConfig, EstimatorNetwork, _start_panorama),
-            Architecture("building", BuildingConfig, BuildingNetwork, _start_building),
+            Architecture("panorama", NetworkConfig, EstimatorNetwork, _panorama_operations, _start_panorama),
+            Architecture("building", BuildingConfig, BuildingNetwork, _building_operations, _start_building),
         )
     }
 )

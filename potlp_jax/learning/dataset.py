@@ -3,8 +3,8 @@
 A dataset is a folder. Shard ``S`` is three files: ``worlds-SSSSS.parquet`` (one row a true map),
 ``views-SSSSS.parquet`` (one row a panorama, with what was known and painted on the map when it was taken) and
 ``samples-SSSSS.parquet`` (one row a (view, subgoal, outcome class)). Each is written under a temporary name and
-renamed, the samples last: a shard exists when its samples file does. Every file carries the dataset's metadata as JSON in its schema, under the key
-``potlp``. ``docs/dataset.md`` describes the columns.
+renamed, the samples last: a shard exists when its samples file does. Every file carries the dataset's metadata as JSON
+in its schema, under the key ``potlp``. ``docs/dataset.md`` describes the columns.
 """
 
 import contextlib

@@ -1,6 +1,6 @@
 """What training and evaluation need of a network, whatever its architecture."""
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Array, Bool, Float32, Int8, PRNGKeyArray
@@ -11,6 +11,7 @@ from potlp_jax.learning.dataset import Samples
 from potlp_jax.learning.network import Answers, Params
 
 
+@runtime_checkable
 class Learner(Protocol):
     """A network and how it is shown a data set; hashable, since compiled steps are kept for each.
 

@@ -8,10 +8,12 @@ failure taken costs),
     failure cost   (1 - y) (R_F - predicted R_F)^2 / failure_cost_scale^2
 
 averaged over samples and summed, the last two times ``cost_share``. What a network says of the views themselves
-(``building_learner``: the cross-entropy of its squares), averaged over views, is added times ``view_share``. The scales are the standard deviations over the
-training data and stay in ``NetworkConfig``. The weights are divided by their mean over the training data. Weights that
-differ between successes and failures move p away from the frequency of success: p / (1 - p) is multiplied by w_S / w_F.
-``TrainingConfig.weighting`` mixes them with 1: at 1 the loss is the paper's, at 0 p is calibrated.
+(``building_learner``: the cross-entropy of its squares), averaged over views, is added times ``view_share``.
+
+The scales are the standard deviations over the training data and stay in the network's configuration. The weights are
+divided by their mean over the training data. Weights that differ between successes and failures move p away from the
+frequency of success: p / (1 - p) is multiplied by w_S / w_F. ``TrainingConfig.weighting`` mixes them with 1: at 1 the
+loss is the paper's, at 0 p is calibrated.
 """
 
 import dataclasses

@@ -187,8 +187,8 @@ def prior_of(metadata: Mapping[str, Any], samples: Samples) -> Prior:
 def ablated(samples: Samples, ablation: str) -> Samples:
     """The samples without what ``ablation`` takes away.
 
-    ``image``: all panoramas black, and nothing painted on the maps. ``phi``: each sample has the pair of vectors phi of another one, by a permutation
-    drawn from ``SHUFFLE_SEED``. ``intact``: the samples themselves.
+    ``image``: all panoramas black, and nothing painted on the maps. ``phi``: each sample has the pair of vectors phi of
+    another one, by a permutation drawn from ``SHUFFLE_SEED``. ``intact``: the samples themselves.
     """
     if ablation == INTACT:
         return samples

@@ -1,9 +1,9 @@
 """The estimator that is shipped: one ``.npz`` file.
 
 The network's parameters as float32 arrays by name, and one JSON text with the network's architecture and configuration
-(Sigma included), the domain that it serves, training metadata and figures. One file, not a checkpoint's folder, because it is shipped
-with the package and copied by people: it is read with NumPy alone, needs no device topology, and the zip's checksums
-find damage.
+(Sigma included), the domain that it serves, training metadata and figures. One file, not a checkpoint's folder, because
+it is shipped with the package and copied by people: it is read with NumPy alone, needs no device topology, and the
+zip's checksums find damage.
 """
 
 import dataclasses

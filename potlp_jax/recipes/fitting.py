@@ -127,7 +127,8 @@ def fit(
 
 def _plan(learner: Learner, training: Samples, out: Path, config: FitConfig) -> TrainingConfig:
     """How to train, and for how many steps."""
-    options = dataclasses.asdict(config.training)
+    # Not ``asdict``, which would also take nested options apart.
+    options = {field.name: getattr(config.training, field.name) for field in dataclasses.fields(config.training)}
     # The number of steps changes neither the batches nor the time of a step, so any serves to find it out.
     one = TrainingConfig(steps=1, **options)
     steps = planned_steps(
