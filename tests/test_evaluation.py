@@ -19,6 +19,7 @@ from potlp_jax.cli import app
 from potlp_jax.codec import config_from_dict
 from potlp_jax.errors import EvaluationError, PropositionsError
 from potlp_jax.learning.dataset import DatasetMetadata, Samples, decode, encode, view_id, write_shard
+from potlp_jax.learning.map_images import without_painting
 from potlp_jax.learning.metrics import (
     BINS,
     DISTANCE_BANDS,
@@ -44,7 +45,7 @@ from potlp_jax.view.calibration import draw_costs, draw_predictions, draw_reliab
 from potlp_jax.view.style import CHOSEN, rgb
 from potlp_jax.world.camera import CameraConfig
 from tests.reference import data_sets as blank
-from tests.reference.data_sets import blank_fields
+from tests.reference.data_sets import blank_columns, blank_fields, world_columns
 
 SHAPE = (64, 128)
 SIGMA = ("fire", "alarm", "exit")
@@ -257,13 +258,14 @@ def test_ablations_take_away_what_they_say_and_nothing_else():
     assert len(dark.images) == 4
     for image in dark.images:
         np.testing.assert_array_equal(decode(image), np.zeros((*SHAPE, 3), np.uint8))
+    assert dark.maps == [without_painting(view) for view in samples.maps]
     pairs = [
         [(*stay, *go) for stay, go in zip(some.phi_stay.tolist(), some.phi_go.tolist(), strict=True)]
         for some in (samples, mixed)
     ]
     assert Counter(pairs[0]) == Counter(pairs[1])
     assert sum(a != b for a, b in zip(*pairs, strict=True)) > 40
-    for other, changed in ((dark, {"images"}), (mixed, {"phi_stay", "phi_go"})):
+    for other, changed in ((dark, {"images", "maps"}), (mixed, {"phi_stay", "phi_go"})):
         for field in dataclasses.fields(Samples):
             if field.name not in changed:
                 assert getattr(other, field.name) is getattr(samples, field.name)
@@ -411,14 +413,14 @@ def dataset(tmp_path_factory):
     samples = make_samples(3, 50, 15)
     folder = tmp_path_factory.mktemp("dataset")
     views = {"view": [view_id(0, i) for i in range(3)], "image": samples.images, "format": ["png"] * 3}
-    views |= {name: [0] * 3 for name in ("world", "step", "row", "column")}
+    views |= {name: [0] * 3 for name in ("world", "step", "row", "column")} | blank_columns(3)
     names = {"success_probability": "success"}
     columns = ("bearing", "distance", "success_probability", "success_cost", "failure_cost", "success_weight")
     rows = {name: getattr(samples, names.get(name, name)) for name in (*columns, "failure_weight")}
     rows |= {"view": [view_id(0, view) for view in samples.view_of.tolist()], "task": ["F exit"] * 50}
     rows |= {name: getattr(samples, name).tolist() for name in ("phi_stay", "phi_go")}
-    rows |= {name: [0] * 50 for name in ("outcome_class", "row", "column")}
-    write_shard(folder, 0, views, rows, METADATA)
+    rows |= {name: [0] * 50 for name in ("outcome_class", "row", "column")} | {"in_view": [True] * 50}
+    write_shard(folder, 0, world_columns(0), views, rows, METADATA)
     return folder, samples
 
 

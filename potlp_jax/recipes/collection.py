@@ -1,11 +1,11 @@
 """Collects a dataset for the estimator from simulated buildings.
 
-A robot drives through each world: a heuristic one (``recipes.exploration``) that wanders, or PO-TLP itself with an
-estimator that was trained before (``recipes.policy_drives``), so that the next one learns from the states that it will
-meet. Now and then the panorama and the map are recorded, and for every subgoal and some outcome classes, drawn from a
-distribution of tasks, the true P_S, R_S, R_F and the weights of the loss. ``docs/dataset.md`` describes the files. A
-collection that was interrupted continues where it stopped: what is recorded depends on the seed, the split, the index
-of the world and the estimator alone.
+A robot drives through each world: a heuristic one that wanders (``recipes.exploration``), or a policy
+(``recipes.policy_drives``): PO-TLP with an estimator that was trained before, so that the next one learns from the
+states that it will meet. Now and then the panorama and the map are recorded, and for every subgoal and some outcome
+classes, drawn from a distribution of tasks, the true P_S, R_S, R_F and the weights of the loss. ``docs/dataset.md``
+describes the files. A collection that was interrupted continues where it stopped: what is recorded depends on the seed,
+the split, the index of the world and the driver alone.
 """
 
 import dataclasses
@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +37,7 @@ from potlp_jax.learning.dataset import (
     write_shard,
 )
 from potlp_jax.learning.domain import unit_of
-from potlp_jax.learning.estimator import named_estimator
+from potlp_jax.learning.estimator import identity_of, named_estimator
 from potlp_jax.learning.questions import HELD_OUT, TaskDistribution
 from potlp_jax.learning.recording import (
     Pose,
@@ -47,6 +48,7 @@ from potlp_jax.learning.recording import (
     recording_metadata,
 )
 from potlp_jax.learning.sample_weights import WeightBounds
+from potlp_jax.planning.policies import Policy
 from potlp_jax.recipes.exploration import Explorer, ExplorerConfig
 from potlp_jax.recipes.policy_drives import policy_drives
 from potlp_jax.task.task import Task
@@ -66,8 +68,9 @@ class CollectConfig(RecordingConfig):
         worlds_per_shard: what is lost, at most, where a process is killed.
         disturbance: of the images.
         explorer: how the robot wanders; it pursues the tasks that the outcome classes are from.
-        estimator: of PO-TLP, by name or file (``named_estimator``), where it drives; empty where the robot wanders.
-        drives: tasks that PO-TLP pursues in a world, each from the start; the views are divided among them, and what
+        driver: ``explorer``, the robot that wanders; or the policy that drives.
+        estimator: what the policy asks, by name or file (``named_estimator``); empty for a policy that asks none.
+        drives: tasks that a policy pursues in a world, each from the start; the views are divided among them, and what
             one leaves over is the next one's.
     """
 
@@ -75,6 +78,7 @@ class CollectConfig(RecordingConfig):
     worlds_per_shard: int = 4
     disturbance: Disturbance = Disturbance()
     explorer: ExplorerConfig = ExplorerConfig()
+    driver: Literal["explorer", "baseline", "potlp"] = "explorer"
     estimator: str = ""
     drives: int = 3
 
@@ -187,8 +191,10 @@ def dataset_metadata(generator: Generator, environment: str, split: Split, confi
     # All worlds of a family have one array shape and one resolution, so the first stands for all.
     world = generator.generate(world_key(split, 0, generator.name))
     resolution = float(world.resolution)
+    # A path says less than what it leads to: another estimator of the same name would drive otherwise.
+    asked = identity_of(named_estimator(config.estimator)) if config.estimator else ""
     return recording_metadata(
-        config,
+        dataclasses.replace(config, estimator=asked),
         WeightBounds.of_map(*world.shape, resolution),
         versions(),
         shape=world.shape,
@@ -238,10 +244,11 @@ def _drives(
     world: World, index: int, pool: Sequence[Task], rng: np.random.Generator, config: CollectConfig
 ) -> tuple[Iterable[Iterable[Pose]], int]:
     """The drives through a world, and their number."""
-    if not config.estimator:
+    if config.driver == "explorer":
         return [Explorer(world, pool, rng, config.explorer).poses()], 1
     tasks, key = pool[: config.drives], jax.random.fold_in(jax.random.key(config.seed), index)
-    return policy_drives(world, tasks, named_estimator(config.estimator), key), len(tasks)
+    asked = named_estimator(config.estimator) if config.estimator else None
+    return policy_drives(world, tasks, Policy(config.driver), asked, key), len(tasks)
 
 
 @partial(jax.jit, static_argnames="config")

@@ -1,4 +1,4 @@
-"""Drives of PO-TLP with an estimator that was trained before, for collecting the states that a planner meets.
+"""Drives of a policy, for collecting the states that a planner meets: of the baseline, or of PO-TLP with an estimator.
 
 An estimator that learned from a wandering robot is asked about other states once it drives itself; data of its own
 drives mend that (Ross, Gordon and Bagnell, A reduction of imitation learning and structured prediction to no-regret
@@ -24,18 +24,23 @@ from potlp_jax.world.moves import step_lengths
 
 
 def policy_drives(
-    world: World, tasks: Sequence[Task], estimator: TrainedEstimator | Estimator, key: PRNGKeyArray
+    world: World,
+    tasks: Sequence[Task],
+    policy: Policy,
+    estimator: TrainedEstimator | Estimator | None,
+    key: PRNGKeyArray,
 ) -> Iterator[Iterable[Pose]]:
-    """Drives of PO-TLP from the world's start, one for each task, with the settings that the world calls for.
+    """Drives from the world's start, one for each task, with the settings that the world calls for.
 
     Args:
         world: the true map.
         tasks: over the world's propositions.
-        estimator: what PO-TLP asks.
+        policy: who drives.
+        estimator: what it asks, if anything.
         key: of the planner.
 
     Returns:
-        The poses of each drive, in order: where PO-TLP decided.
+        The poses of each drive, in order: where the policy decided.
     """
     # Padded to one size for all tasks: what is compiled for one serves the others.
     sizes = dataclasses.replace(LARGEST, propositions=len(world.propositions))
@@ -43,7 +48,7 @@ def policy_drives(
         trial = run_trial(
             world,
             task,
-            Policy.POTLP,
+            policy,
             arrays=task.padded(sizes),
             estimator=estimator,
             key=jax.random.fold_in(key, number),

@@ -5,10 +5,12 @@ training_worlds: 1300           # of the split training
 validation_worlds: 60           # of the split validation
 collect: {disturbance: {noise: 6}}              # optional: fields of CollectConfig
 fit: {epochs: 7, training: {patience: 10}}      # optional: fields of FitConfig
+rounds:                         # optional: PO-TLP drives with what was fitted, and all is fitted again
+  - {worlds: 300, validation_worlds: 20, epochs: 4}
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -16,14 +18,33 @@ from potlp_jax.codec import read_settings, settings_file, with_settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
 from potlp_jax.errors import ConfigurationError
-from potlp_jax.learning.dataset import read_dataset
+from potlp_jax.learning.dataset import Samples, joined, read_dataset
 from potlp_jax.learning.training import Trained
+from potlp_jax.planning.policies import Policy
 from potlp_jax.recipes.collection import CollectConfig, Collected, collect, collection_of
-from potlp_jax.recipes.fitting import FitConfig, fit
+from potlp_jax.recipes.fitting import ESTIMATOR, FitConfig, fit
 from potlp_jax.recipes.journal import Display
 
 PACKAGE: str = "potlp_jax.recipes"
 """Where the shipped recipes are, as package data."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Round:
+    """Once more: PO-TLP drives through new worlds with what was fitted before, and the fit goes on with all records.
+
+    Attributes:
+        worlds, validation_worlds: how many further worlds of the splits it drives through. The validation data of the
+            round are its own alone: they are of the states that the estimator meets.
+        views_per_world, drives: as in ``CollectConfig``.
+        epochs: passes over all records of training so far.
+    """
+
+    worlds: int
+    validation_worlds: int
+    views_per_world: int = 24
+    drives: int = 2
+    epochs: int = 4
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -35,6 +56,7 @@ class Recipe:
         training_worlds, validation_worlds: how many worlds of these splits are explored.
         collect: what is recorded in them.
         fit: what is fitted to the records.
+        rounds: are made after that, in order.
     """
 
     environment: str
@@ -42,6 +64,7 @@ class Recipe:
     validation_worlds: int
     collect: CollectConfig
     fit: FitConfig = FitConfig()
+    rounds: tuple[Round, ...] = ()
 
     def worlds(self, split: Split) -> int:
         """How many worlds of a split are explored; 0 for the splits that training never sees."""
@@ -80,30 +103,65 @@ def follow(
     tell: Callable[[Split, Collected], None] = lambda split, collected: None,
     display: Display = Display(),
 ) -> Trained:
-    """Make an estimator from nothing: collect what is missing of both datasets, then fit, or resume.
+    """Make an estimator from nothing: collect what is missing of the datasets, fit, and do the rounds; or resume.
 
     Args:
         recipe: what to make.
-        out: gets ``training`` and ``validation``, the datasets, and what ``fit`` writes.
+        out: gets ``training`` and ``validation``, the datasets, and what ``fit`` writes. With rounds, each has such a
+            folder of its own in it, ``round-1`` and so on, and ``out`` the result of the last one.
         processes: explore at the same time.
         tell: called as worlds are explored.
-        display: shows how the fit goes.
+        display: shows how the fits go.
 
     Returns:
         The best parameters.
     """
-    # Both before the fit: it is refused early if the validation worlds cannot be made.
-    generator = make(recipe.environment)
-    for split in (Split.TRAINING, Split.VALIDATION):
-        collect(
-            generator,
-            recipe.environment,
-            split,
-            recipe.worlds(split),
-            out / split.value,
-            recipe.collect,
-            processes,
-            partial(tell, split),
-        )
-    training, validation = (read_dataset(out / split.value) for split in (Split.TRAINING, Split.VALIDATION))
-    return fit(training, validation, out, recipe.fit, display)
+    folders = [*(out / f"round-{number}" for number in range(len(recipe.rounds))), out]
+    worlds = {Split.TRAINING: 0, Split.VALIDATION: 0}
+    records: list[Samples] = []
+    trained = None
+    for number, folder in enumerate(folders):
+        stage = _stage(recipe, number, worlds, folders[number - 1] / ESTIMATOR)
+        for split, count in stage.worlds.items():
+            _collect_of(recipe, stage, split, folder / split.value, processes, partial(tell, split))
+            worlds[split] += count
+        records.append(read_dataset(folder / Split.TRAINING.value))
+        validation = read_dataset(folder / Split.VALIDATION.value)
+        initial = None if trained is None else trained.params
+        trained = fit(joined(records), validation, folder, stage.fit, display, initial)
+    assert trained is not None
+    return trained
+
+
+@dataclasses.dataclass(frozen=True)
+class _Stage:
+    """What is collected and fitted at one time: at first, or in a round."""
+
+    worlds: Mapping[Split, int]
+    first: Mapping[Split, int]
+    collect: CollectConfig
+    fit: FitConfig
+
+
+def _stage(recipe: Recipe, number: int, first: Mapping[Split, int], estimator: Path) -> _Stage:
+    """Stage ``number``; from the second on ``estimator`` is what the one before made."""
+    if number == 0:
+        counts = {split: recipe.worlds(split) for split in first}
+        return _Stage(counts, dict(first), recipe.collect, recipe.fit)
+    chosen = recipe.rounds[number - 1]
+    drives = dataclasses.replace(
+        recipe.collect,
+        driver=Policy.POTLP.value,
+        estimator=str(estimator),
+        drives=chosen.drives,
+        views_per_world=chosen.views_per_world,
+    )
+    counts = {Split.TRAINING: chosen.worlds, Split.VALIDATION: chosen.validation_worlds}
+    return _Stage(counts, dict(first), drives, dataclasses.replace(recipe.fit, epochs=chosen.epochs))
+
+
+def _collect_of(
+    recipe: Recipe, stage: _Stage, split: Split, folder: Path, processes: int, tell: Callable[[Collected], None]
+) -> None:
+    config = dataclasses.replace(stage.collect, first_world=stage.first[split])
+    collect(make(recipe.environment), recipe.environment, split, stage.worlds[split], folder, config, processes, tell)
