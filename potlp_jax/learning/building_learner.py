@@ -24,7 +24,7 @@ from potlp_jax.world.grid import BeliefMap
 
 @struct.dataclass(kw_only=True)
 class BuildingInputs:
-    """``G`` maps with at most ``S`` subgoals each.
+    """``G`` maps with at most ``S`` subgoals each; one without ``G``.
 
     Attributes:
         cells, letters: of the beliefs.
@@ -36,15 +36,15 @@ class BuildingInputs:
         real: True for views, False for what fills the batch up.
     """
 
-    cells: Int8[Array, "G H W"]
-    letters: Int32[Array, "G H W"]
-    extent: Int32[Array, "G 2"]
+    cells: Int8[Array, "*G H W"]
+    letters: Int32[Array, "*G H W"]
+    extent: Int32[Array, "*G 2"]
     painting: Painting
-    true_cells: Int8[Array, "G H W"]
-    true_letters: Int32[Array, "G H W"]
-    subgoals: Int32[Array, "G S 2"]
-    subgoal_of: Int32[Array, "G K"]
-    real: Bool[Array, " G"]
+    true_cells: Int8[Array, "*G H W"]
+    true_letters: Int32[Array, "*G H W"]
+    subgoals: Int32[Array, "*G S 2"]
+    subgoal_of: Int32[Array, "*G K"]
+    real: Bool[Array, "*G"]
 
 
 @dataclasses.dataclass(frozen=True)

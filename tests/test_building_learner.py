@@ -1,0 +1,252 @@
+"""The building network in training: what it is shown is what a trial shows it, mirrored and lit as buildings may be."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from potlp_jax.learning.augmentation import Augmentation
+from potlp_jax.learning.batches import Batches
+from potlp_jax.learning.building_estimator import BuildingEstimator
+from potlp_jax.learning.building_learner import BuildingInputs, BuildingLearner, BuildingOptions, square_targets
+from potlp_jax.learning.building_network import SQUARE
+from potlp_jax.learning.dataset import DatasetMetadata, Samples, encode
+from potlp_jax.learning.loss import DataScale
+from potlp_jax.learning.map_images import encode_view, encode_world
+from potlp_jax.learning.painting import blank_painting, paint
+from potlp_jax.learning.training import TrainingConfig, initial_state, make_train_step
+from potlp_jax.task.task import Task
+from potlp_jax.world.camera import CameraConfig
+from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
+from potlp_jax.world.grid import BeliefMap, World, make_world, pad_world
+from potlp_jax.world.renderer import render
+from potlp_jax.world.sensing import SensorConfig, observe
+
+NAMES = ("goal", "hazard")
+CAMERA = CameraConfig(height=64, width=128, horizon=24.0, fold=8.0)
+SIZES = BuildingOptions(widths=(8, 8, 12), blocks=(0, 1, 1), decoder=8, head=16, condition=8)
+EXTENT, SHAPE = (11, 17), (14, 20)
+PLAIN = Augmentation(mirror_rows=0.0, brightness=0.0, colour=0.0)
+
+
+def _world(goal_above: bool) -> World:
+    """A hallway with a room above and one below; the goal is in one of them, and its floor is red."""
+    occupied = np.ones(EXTENT, bool)
+    occupied[5, 1:-1] = occupied[1:4, 8:-1] = occupied[7:-1, 8:-1] = False
+    occupied[4, 10] = occupied[6, 10] = False
+    letters = np.zeros(EXTENT, np.int32)
+    letters[(2, 14) if goal_above else (9, 14)] = 1
+    letters[5, 15] = 2
+    world = make_world(occupied, letters, (5, 1), propositions=NAMES)
+    floor = np.full((*EXTENT, 3), 120, np.uint8)
+    rows = slice(0, 5) if goal_above else slice(6, None)
+    floor[rows, 8:] = (200, 40, 40)
+    appearance = dataclasses.replace(world.appearance, floor_colour=jnp.asarray(floor))
+    return pad_world(dataclasses.replace(world, appearance=appearance), *SHAPE)
+
+
+@jax.jit
+def _drive(world: World) -> tuple[BeliefMap, object, Subgoals]:
+    """What is known, painted and open after a look from the start and one from before the doors."""
+    belief, painting = BeliefMap.unobserved(world), blank_painting(*SHAPE)
+    for cell in (jnp.array([5, 1], jnp.int32), jnp.array([5, 10], jnp.int32)):
+        belief = observe(belief, world, cell, SensorConfig(range_cells=9.0))
+        painting = paint(painting, render(world, cell, CAMERA), belief, cell, CAMERA)
+    reach = belief.free
+    distances = jnp.where(reach, 1.0, jnp.inf)
+    return belief, painting, find_subgoals(belief, reach, distances, FrontierConfig(max_subgoals=4, min_size=1))
+
+
+def _samples(views: int) -> Samples:
+    """Views of both buildings in turn: is the goal beyond a frontier, without touching the hazard?"""
+    worlds = [_world(True), _world(False)]
+    drives = [_drive(world) for world in worlds]
+    rows = []
+    for view in range(views):
+        subgoals = drives[view % 2][2]
+        for cell in np.asarray(subgoals.cells)[np.asarray(subgoals.mask)].tolist():
+            above = cell[0] < 5
+            rows.append((view, cell, float(above == (view % 2 == 0))))
+    success = np.array([row[2] for row in rows], np.float32)
+    count = len(rows)
+    metadata = DatasetMetadata(
+        propositions=NAMES,
+        environment="synthetic",
+        family="synthetic",
+        generator={},
+        split="training",
+        camera=dataclasses.asdict(CAMERA),
+        disturbance={},
+        encoding={"format": "png"},
+        weights={"low": 1.0, "high": 9.0},
+        collection={},
+        versions={},
+        shape=SHAPE,
+    )
+    return Samples(
+        images=[encode(np.zeros((64, 128, 3), np.uint8), "png")] * views,
+        maps=[encode_view(belief, painting) for belief, painting, _ in (drives[view % 2] for view in range(views))],
+        worlds=[encode_world(world) for world in worlds],
+        world_of=np.arange(views, dtype=np.int32) % 2,
+        view_of=np.array([row[0] for row in rows], np.int32),
+        cells=np.array([row[1] for row in rows], np.int32),
+        in_view=np.zeros(count, bool),
+        bearing=np.zeros(count, np.float32),
+        distance=np.ones(count, np.float32),
+        phi_stay=np.tile(np.array([[0, -1]], np.int8), (count, 1)),
+        phi_go=np.tile(np.array([[1, 0]], np.int8), (count, 1)),
+        success=success,
+        success_cost=np.where(success > 0, 9.0, np.nan).astype(np.float32),
+        failure_cost=np.full(count, 6.0, np.float32),
+        success_weight=np.ones(count, np.float32),
+        failure_weight=np.ones(count, np.float32),
+        metadata=metadata,
+    )
+
+
+@pytest.fixture(scope="module")
+def samples() -> Samples:
+    return _samples(4)
+
+
+@pytest.fixture(scope="module")
+def learner(samples) -> BuildingLearner:
+    return SIZES.learner(samples)
+
+
+def _batch(learner, samples, views=4, per_view=5):
+    return Batches(samples, learner.inputs, views, per_view, 0).training_batch(0)
+
+
+@pytest.fixture(scope="module")
+def params(learner):
+    """Parameters of which none is 0, so that everything that enters has an effect."""
+    leaves, structure = jax.tree.flatten(learner.init(jax.random.key(0)))
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    moved = [leaf + 0.05 * jax.random.normal(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
+    return jax.tree.unflatten(structure, moved)
+
+
+def test_answers_in_training_are_those_of_the_estimator_in_a_trial(learner, params, samples):
+    batch = _batch(learner, samples)
+    # The class that the samples ask for: the goal, without touching the hazard.
+    task = Task.from_formula("!hazard U goal", NAMES)
+    asked = [(tuple(stay), tuple(go)) for stay, go in task.classes].index(((-1, -1), (1, 0)))
+    batch = dataclasses.replace(batch, phi_stay=jnp.broadcast_to(jnp.array([-1, -1], jnp.int8), batch.phi_stay.shape))
+    answers, _ = jax.jit(learner.answers)(params, batch.inputs, batch.phi_stay, batch.phi_go)
+    compared = 0
+    for row in range(4):
+        drives = [_drive(world) for world in _worlds()]
+        (drive,) = [found for found in drives if np.array_equal(found[0].cells, batch.inputs.cells[row])] or [None]
+        belief, painting, subgoals = drive
+        estimator = BuildingEstimator(params=params, memory=painting, config=learner.config)
+        found = jax.jit(lambda estimator, *given: estimator(*given))(estimator, belief, subgoals, task.arrays)
+        cells = np.asarray(batch.inputs.subgoals)[row][np.asarray(batch.inputs.subgoal_of)[row]]
+        real = np.asarray(subgoals.mask)
+        for sample in np.flatnonzero(np.asarray(batch.mask)[row]):
+            (subgoal,) = np.flatnonzero((np.asarray(subgoals.cells) == cells[sample]).all(1) & real)
+            for name, exact in (("success_probability", False), ("failure_cost", True)):
+                one, other = getattr(answers, name)[row, sample], getattr(found, name)[subgoal, asked]
+                # The distance of what was painted is kept in steps of a 32nd of a cell.
+                assert float(one) == pytest.approx(float(other), abs=0 if exact else 2e-3, rel=2e-3)
+            compared += 1
+    assert compared >= 8
+    assert len(np.unique(np.asarray(answers.success_logit))) > 1
+
+
+def _worlds():
+    return _world(True), _world(False)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(True, False), (False, True), (True, True)])
+def test_a_mirrored_view_is_the_view_of_the_mirrored_building(learner, samples, rows, columns):
+    inputs = _batch(learner, samples).inputs
+    amount = dataclasses.replace(PLAIN, mirror_rows=float(rows), mirror_columns=float(columns))
+    found = jax.jit(learner.augmented, static_argnums=2)(inputs, jax.random.key(0), amount)
+    height, width = EXTENT
+
+    for name in ("cells", "letters", "true_cells", "true_letters"):
+        array = np.array(getattr(inputs, name))
+        array[:, :height, :width] = _turned(array[:, :height, :width], rows, columns)
+        np.testing.assert_array_equal(getattr(found, name), array, err_msg=name)
+    for name in ("floor", "beyond", "distance"):
+        array = np.array(getattr(inputs.painting, name))
+        array[:, :height, :width] = _turned(array[:, :height, :width], rows, columns)
+        np.testing.assert_array_equal(getattr(found.painting, name), array, err_msg=name)
+    for row in range(4):
+        for before, after in zip(np.asarray(inputs.subgoals)[row], np.asarray(found.subgoals)[row], strict=True):
+            if before.any():
+                expected = (
+                    height - 1 - before[0] if rows else before[0],
+                    width - 1 - before[1] if columns else before[1],
+                )
+                assert tuple(after.tolist()) == expected
+
+
+def _turned(array, rows, columns):
+    array = array[:, ::-1] if rows else array
+    return array[:, :, ::-1] if columns else array
+
+
+def test_gains_change_colours_and_nothing_else(learner, samples):
+    inputs = _batch(learner, samples).inputs
+    amount = dataclasses.replace(PLAIN, brightness=0.3)
+    found = learner.augmented(inputs, jax.random.key(3), amount)
+    assert not np.array_equal(found.painting.floor, inputs.painting.floor)
+    kept = dataclasses.replace(
+        found, painting=dataclasses.replace(found.painting, floor=inputs.painting.floor, beyond=inputs.painting.beyond)
+    )
+    for one, other in zip(jax.tree.leaves(kept), jax.tree.leaves(inputs), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_targets_of_squares_equal_loops_over_cells(seed):
+    draw = np.random.default_rng(seed)
+    shape = tuple(draw.integers(5, 14, 2).tolist())
+    cells = draw.choice([-1, 0, 1], shape, p=[0.5, 0.3, 0.2]).astype(np.int8)
+    letters = np.where(cells == 0, draw.integers(0, 8, shape), 0).astype(np.int32)
+    known, targets = square_targets(jnp.asarray(cells), jnp.asarray(letters), 3)
+    for row in range(math.ceil(shape[0] / SQUARE)):
+        for column in range(math.ceil(shape[1] / SQUARE)):
+            part = np.s_[row * SQUARE : (row + 1) * SQUARE, column * SQUARE : (column + 1) * SQUARE]
+            there = [(c, z) for c, z in zip(cells[part].flat, letters[part].flat, strict=True) if c != -1]
+            assert bool(known[row, column]) == bool(there)
+            if there:
+                free = sum(c == 0 for c, _ in there) / len(there)
+                has = [float(any(z >> bit & 1 for _, z in there)) for bit in range(3)]
+                np.testing.assert_allclose(targets[row, column], [free, *has], rtol=1e-6)
+
+
+def test_views_that_fill_a_batch_up_count_nothing(learner, params, samples):
+    batches = Batches(samples, learner.inputs, 3, 5, 0)
+    *_, last = batches.evaluation_batches()
+    assert last.inputs.real.tolist() == [True, False, False]
+    _, losses = jax.jit(learner.answers)(params, last.inputs, last.phi_stay, last.phi_go)
+    assert float(losses[0]) > 0
+    assert losses[1:].tolist() == [0.0, 0.0]
+
+
+def test_it_learns_what_only_the_painting_tells(samples, learner):
+    config = TrainingConfig(
+        steps=150, views_per_batch=4, samples_per_view=5, learning_rate=5e-3, weighting=0.0, patience=0,
+        augmentation=PLAIN, average_decay=0.9,
+    )  # fmt: skip
+    step, batch = make_train_step(learner, config, DataScale.of(samples)), _batch(learner, samples)
+    state, first = step(initial_state(learner, config), batch)
+    for _ in range(config.steps):
+        state, last = step(state, batch)
+    assert float(last) < 0.25 * float(first)
+    answers, _ = jax.jit(learner.answers)(state.average, batch.inputs, batch.phi_stay, batch.phi_go)
+    errors = np.abs(np.asarray(answers.success_probability) - np.asarray(batch.success))[np.asarray(batch.mask)]
+    assert errors.max() < 0.2
+
+
+def test_inputs_are_the_same_from_any_thread(learner, samples):
+    one, other = _batch(learner, samples).inputs, _batch(learner, samples).inputs
+    assert isinstance(one, BuildingInputs)
+    for left, right in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(left, right)
