@@ -72,7 +72,7 @@ def main() -> None:
     parser.add_argument("--split", type=Split, default=Split.TEST)
     parser.add_argument("--worlds", type=int, default=16, help="per task")
     parser.add_argument("--estimator", help="file or name of the trained estimator; default: the shipped one")
-    parser.add_argument("--buildings", type=int, default=32, help="that the ideal observer draws at a decision")
+    parser.add_argument("--buildings", type=int, default=16, help="that the ideal observer draws at a decision")
     parser.add_argument("--arms", nargs="+", type=Arm, choices=list(Arm), metavar="ARM", help="default: all there are")
     parser.add_argument("--report", type=Path, help="without suffix: where the results and the page go")
     parser.add_argument("--as-it-is", action="store_true", help="report what is finished, run nothing")

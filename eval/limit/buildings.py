@@ -182,7 +182,7 @@ def draw_buildings(
     # Systematic sampling: every combination is drawn as often as its probability says, to within one building. Drawn
     # one by one, P_S would be off by some tenth.
     cumulated = jnp.cumsum(posterior(prior, belief, evidence))
-    points = (jnp.arange(count) + 0.5) / count * cumulated[-1]
+    points = jnp.asarray((np.arange(count) + 0.5) / count, jnp.float32) * cumulated[-1]
     # The first entry that reaches a point adds something to the sum: none of probability 0 is drawn.
     codes = prior.codes[jnp.searchsorted(cumulated, points)]
     extinguisher, exit = _draw_patches(prior, belief, noise)

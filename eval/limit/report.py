@@ -70,7 +70,7 @@ def _table(formula: str, pairs: Sequence[Mapping[str, Mapping[str, Any]]], arms:
     comparison = Comparison.from_results(results)
     return {
         "task": formula,
-        "worlds": [pair[Arm.BASELINE]["world"] for pair in pairs],
+        "world_numbers": [pair[Arm.BASELINE]["world"] for pair in pairs],
         **comparison.to_dict(),
         "gains": finite_or_null(_gains(results)) if Arm.POTLP in arms else {},
     }
