@@ -275,12 +275,12 @@ def _counting(factor):
 
 
 @struct.dataclass(kw_only=True)
-class Hopeless:
-    """Observes nothing; the first class is impossible."""
+class Decided:
+    """Observes nothing; the first class is impossible, the last one certain, of the others nobody knows."""
 
     def __call__(self, belief, subgoals, task):
         shape = (subgoals.mask.shape[0], task.class_mask.shape[0])
-        chance = jnp.ones(shape).at[:, 0].set(0.0)
+        chance = jnp.full(shape, 0.5).at[:, 0].set(0.0).at[:, -1].set(1.0)
         return Estimates(
             success_probability=chance, success_cost=jnp.full(shape, 50.0), failure_cost=jnp.full(shape, 9.0)
         )
@@ -303,13 +303,14 @@ def test_a_mixture_takes_each_part_from_the_right_one():
     assert int(found.status) == 4
 
 
-def test_where_the_second_has_no_success_its_cost_is_the_firsts():
-    found = _answers(mixed(_counting(1.0), Hopeless()))
+def test_costs_that_the_second_cannot_have_are_the_firsts():
+    found = _answers(mixed(_counting(1.0), Decided()))
     np.testing.assert_allclose(found.success_probability, 3 / 4)
     np.testing.assert_allclose(found.success_cost[:, 0], 3.0)
     np.testing.assert_allclose(found.success_cost[:, 1:], 50.0)
-    np.testing.assert_allclose(found.failure_cost, 9.0)
-    other = _answers(mixed(Hopeless(), _counting(1.0)))
+    np.testing.assert_allclose(found.failure_cost[:, :-1], 9.0)
+    np.testing.assert_allclose(found.failure_cost[:, -1:], 6.0)
+    other = _answers(mixed(Decided(), _counting(1.0)))
     np.testing.assert_allclose(other.success_probability[:, 0], 0.0)
     np.testing.assert_allclose(other.success_cost, 3.0)
 

@@ -127,7 +127,8 @@ def mean_labels(labels: Estimates) -> Estimates:
 class MixedEstimator:
     """P_S of one estimator with the costs of another. Either may observe.
 
-    Where the second one takes an attempt for impossible it has no R_S: there it is that of the first.
+    An estimator that is certain has one cost alone: no R_S of what it takes for impossible, and no R_F of what it takes
+    for certain (true labels have an R_F there, of a failure that cannot be). There the costs are those of the first.
 
     Attributes:
         chances, costs: as they were at the start of the trial.
@@ -154,7 +155,7 @@ class MixedEstimator:
         return Estimates(
             success_probability=first.success_probability,
             success_cost=jnp.where(second.success_probability > 0.0, second.success_cost, first.success_cost),
-            failure_cost=second.failure_cost,
+            failure_cost=jnp.where(second.success_probability < 1.0, second.failure_cost, first.failure_cost),
             status=functools.reduce(jnp.bitwise_or, given) if given else None,
         )
 

@@ -163,8 +163,9 @@ def _shares(results: Mapping[str, Any], data: str) -> Iterator[str]:
     )
     yield "- **true P_S**: the trained estimator's R_S and R_F with the true labels' P_S, 0 or 1;"
     yield (
-        "- **true R_S and R_F**: the trained estimator's P_S with the true labels' costs; where the attempt cannot "
-        "succeed there is no true R_S, and the estimator's own is kept;"
+        "- **true R_S and R_F**: the trained estimator's P_S with the true labels' R_S where the attempt succeeds in the "
+        "building and their R_F where it fails; of an attempt that succeeds there is no true R_F, of one that fails no "
+        "true R_S, and the estimator's own is kept;"
     )
     yield "- **PO-TLP**: the trained estimator alone."
     yield ""
