@@ -159,13 +159,13 @@ def _shares(results: Mapping[str, Any], data: str) -> Iterator[str]:
         "generator, given every mapped cell and letter, and the tiles and the smoke (above a density of 0.01) of every "
         "floor cell that has been in line of sight at a decision, at any distance. It knows how buildings are drawn; "
         "what it does not know, nobody can. The planner takes attempts to be independent of each other (Eq. 3), also "
-        "here;"
+        "here. R_S and R_F are means over the buildings in which the attempt succeeds and over those in which it fails;"
     )
     yield "- **true P_S**: the trained estimator's R_S and R_F with the true labels' P_S, 0 or 1;"
     yield (
-        "- **true R_S and R_F**: the trained estimator's P_S with the true labels' R_S where the attempt succeeds in the "
-        "building and their R_F where it fails; of an attempt that succeeds there is no true R_F, of one that fails no "
-        "true R_S, and the estimator's own is kept;"
+        "- **true R_S and R_F**: the trained estimator's P_S, with the true labels' R_S of attempts that succeed in "
+        "the building and their R_F of those that fail; an attempt that succeeds has no true R_F, one that fails no "
+        "true R_S, and there the estimator's own is kept;"
     )
     yield "- **PO-TLP**: the trained estimator alone."
     yield ""
