@@ -102,7 +102,7 @@ def _notable(pairs: "Sequence[Pair]", policy: str, count: int) -> "Iterator[tupl
 
 
 def _shown(sweep: "Sweep", reason: str, row: "Row", baseline: "Row") -> "Shown":
-    from potlp_jax.trials.replay import panoramas_of
+    from potlp_jax.trials.replay import views_of
     from potlp_jax.view.replay_page import replay_data
     from potlp_jax.view.report_page import Shown
 
@@ -113,7 +113,7 @@ def _shown(sweep: "Sweep", reason: str, row: "Row", baseline: "Row") -> "Shown":
         world=row.item.world,
         cost=row.cost,
         baseline=baseline.cost,
-        data=replay_data(trial, panoramas_of(trial)),
+        data=replay_data(trial, views_of(trial, sweep.asked(row.item.environment, row.item.policy))),
     )
 
 
