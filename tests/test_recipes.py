@@ -13,9 +13,10 @@ from potlp_jax.codec import json_copy, shipped_settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
 from potlp_jax.errors import ConfigurationError
-from potlp_jax.learning.dataset import read_metadata
+from potlp_jax.learning.architectures import architecture_of
+from potlp_jax.learning.dataset import read_dataset, read_metadata
 from potlp_jax.learning.domain import Domain
-from potlp_jax.learning.estimator import shipped_estimator
+from potlp_jax.learning.estimator import read_estimator, shipped_estimator
 from potlp_jax.learning.serialization import load_estimator
 from potlp_jax.recipes.fitting import ESTIMATOR
 from potlp_jax.recipes.journal import Display
@@ -38,7 +39,7 @@ SMALL = {
     },
     "fit": {
         "epochs": 1,
-        "second_widths": [3, 4, 5, 6, 7, 8, 9, 9],
+        "network": {"kind": "panorama", "second_widths": [3, 4, 5, 6, 7, 8, 9, 9]},
         "training": {"views_per_batch": 2, "samples_per_view": 4, "seed": 3},
     },
 }
@@ -55,12 +56,13 @@ def test_a_shipped_recipe_is_what_made_the_shipped_file(name):
     estimator = shipped_estimator(world.propositions, Domain.of_world(world, recipe.collect.camera))
     assert estimator is not None
     made, data = estimator.metadata["training"], estimator.metadata["data"]
-    options = json_copy(dataclasses.asdict(recipe.fit.training))
+    options = _as_of_old(json_copy(dataclasses.asdict(recipe.fit.training)), made)
     assert options == {key: value for key, value in made.items() if key != "steps"}
     per_epoch = estimator.metadata["panoramas"] // recipe.fit.training.views_per_batch
     assert abs(made["steps"] - recipe.fit.epochs * per_epoch) <= recipe.fit.epochs
-    for field in ("exclusive_within", "fovea", "second_widths"):
-        assert getattr(recipe.fit, field) == getattr(estimator.config, field)
+    assert architecture_of(estimator.config).name == recipe.fit.network.kind
+    for field in dataclasses.fields(recipe.fit.network):
+        assert field.name == "kind" or getattr(recipe.fit.network, field.name) == getattr(estimator.config, field.name)
     collected = json_copy(dataclasses.asdict(recipe.collect))
     assert data["environment"] == recipe.environment
     assert data["disturbance"] == collected["disturbance"]
@@ -71,6 +73,16 @@ def test_a_shipped_recipe_is_what_made_the_shipped_file(name):
     # No world gives more views than this; most give as many.
     most = recipe.training_worlds * recipe.collect.views_per_world
     assert 0.9 * most < estimator.metadata["panoramas"] <= most
+
+
+def _as_of_old(options, made):
+    """The options of a training as an estimator names them that was made before they were grouped."""
+    if "augmentation" in made:
+        return options
+    varied = options.pop("augmentation")
+    assert varied.pop("mirror_columns") == 0.0
+    del options["view_share"]
+    return {**options, "mirror": varied.pop("mirror_rows"), **varied}
 
 
 def test_a_small_recipe_makes_an_estimator_and_continues(tmp_path):
@@ -89,13 +101,38 @@ def test_a_small_recipe_makes_an_estimator_and_continues(tmp_path):
     for found, expected in zip(jax.tree.leaves(params), jax.tree.leaves(trained.params), strict=True):
         np.testing.assert_array_equal(found, expected)
     assert config.propositions == make("toy").propositions
-    assert config.second_widths == recipe.fit.second_widths
+    assert config.second_widths == recipe.fit.network.second_widths
     assert metadata["training"]["seed"] == 3
     assert domain == Domain.of_world(make("toy").world(0), recipe.collect.camera)
     assert read_metadata(tmp_path / "out" / "validation").split == "validation"
     again = follow(recipe, tmp_path / "out", display=Display(say=lines.append))
     assert lines[-1].startswith("resumed at step")
     assert again.best_step == trained.best_step
+
+
+def test_rounds_drive_with_what_was_fitted_and_learn_from_all_records(tmp_path):
+    building = {"kind": "building", "widths": [4, 4, 6], "blocks": [0, 0, 1], "decoder": 4, "head": 8, "condition": 4}
+    rounds = [{"worlds": 2, "validation_worlds": 2, "views_per_world": 2, "drives": 2, "epochs": 1}]
+    small = {**SMALL, "fit": {**SMALL["fit"], "network": building}, "rounds": rounds}
+    (tmp_path / "small.yaml").write_text(json.dumps(small))
+    recipe = read_recipe(tmp_path / "small.yaml")
+    lines = []
+    follow(recipe, tmp_path / "out", display=Display(say=lines.append))
+    first, last = tmp_path / "out" / "round-0", tmp_path / "out"
+    driven = read_metadata(last / "training")
+    assert read_metadata(first / "training").collection["driver"] == "explorer"
+    assert (driven.collection["driver"], driven.collection["first_world"]) == ("potlp", 4)
+    assert driven.collection["estimator"] == read_estimator(first / ESTIMATOR).identity
+    assert set(read_dataset(last / "training").world_of) == {0, 1}
+    _, config, _, metadata = load_estimator(last / ESTIMATOR)
+    assert architecture_of(config).name == "building"
+    views = [len(read_dataset(folder / "training").images) for folder in (first, last)]
+    assert metadata["panoramas"] == sum(views)
+    # The scales of costs stay those of the first fit, with which its parameters mean something.
+    assert config == load_estimator(first / ESTIMATOR)[1]
+    again = len(lines)
+    follow(recipe, tmp_path / "out", display=Display(say=lines.append))
+    assert any(line.startswith("resumed at step") for line in lines[again:])
 
 
 def _potlp(*arguments):
@@ -108,7 +145,7 @@ def test_the_commands_collect_and_fit_by_a_recipe(tmp_path):
     assert told.exit_code == 0, told.stderr
     assert "views" in told.stdout
     assert read_metadata(tmp_path / "data").split == "validation"
-    told = _potlp("fit", "--recipe", tmp_path / "small.yaml", "--out", tmp_path / "out", "--fovea", 2)
+    told = _potlp("fit", "--recipe", tmp_path / "small.yaml", "--out", tmp_path / "out", "--set", "network.fovea=2")
     assert told.exit_code == 0, told.stderr
     assert "ended by planned" in told.stdout
     _, config, _, metadata = load_estimator(tmp_path / "out" / ESTIMATOR)

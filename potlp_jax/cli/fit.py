@@ -40,9 +40,11 @@ docs/estimator.md says more.[/dim]
 )
 def fit(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for everything that is written.")],
-    dataset: Annotated[
-        Path | None,
-        typer.Argument(metavar="DATASET", help="Folder that `potlp collect` wrote; none: collect as the recipe says."),
+    datasets: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="DATASET...", help="Folders that `potlp collect` wrote; none: collect as the recipe says."
+        ),
     ] = None,
     validation: Annotated[
         Path | None, typer.Option("--validation", help="Dataset of other worlds; decides which parameters are kept.")
@@ -53,20 +55,25 @@ def fit(
         float | None, typer.Option("--minutes", help="Plan as many steps as fit into this time.")
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Of parameters, order and augmentation.")] = None,
+    initial: Annotated[
+        Path | None, typer.Option("--initial", help="An estimator to go on from. Not with a recipe that collects.")
+    ] = None,
     processes: Processes = 1,
     settings: Settings = None,
 ) -> None:
     """Fit an estimator to a dataset, or make one from nothing with --recipe."""
     require_training_extra()
     from potlp_jax.codec import settings_from_words, with_settings
-    from potlp_jax.learning.dataset import read_dataset
+    from potlp_jax.learning.dataset import joined, read_dataset
     from potlp_jax.recipes import fitting
     from potlp_jax.recipes.recipe import follow, read_recipe
 
-    if (dataset is None) != (validation is None):
+    if bool(datasets) != (validation is not None):
         fail("give a DATASET and, with --validation, another of other worlds: both, or neither with --recipe")
-    if dataset is None and recipe is None:
+    if not datasets and recipe is None:
         fail("give a DATASET and --validation, or a recipe with --recipe")
+    if initial is not None and not datasets:
+        fail("--initial goes on from an estimator with a DATASET; a recipe makes one from nothing")
     given = None if recipe is None else read_recipe(recipe)
     config = with_settings(
         fitting.FitConfig() if given is None else given.fit, settings_from_words(settings or []), "--set"
@@ -75,8 +82,11 @@ def fit(
     config = with_settings(config, _given(**options) | {"training": _given(seed=seed)}, "options")
     folder = make_folder(out)
     with progress_bar() as progress:
-        if dataset is not None and validation is not None:
-            trained = fitting.fit(read_dataset(dataset), read_dataset(validation), folder, config, _display(progress))
+        if datasets and validation is not None:
+            training = joined([read_dataset(dataset) for dataset in datasets])
+            trained = fitting.fit(
+                training, read_dataset(validation), folder, config, _display(progress), initial=initial
+            )
         else:
             assert given is not None
             chosen = dataclasses.replace(given, fit=config)

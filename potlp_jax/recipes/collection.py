@@ -248,7 +248,8 @@ def _drives(
         return [Explorer(world, pool, rng, config.explorer).poses()], 1
     tasks, key = pool[: config.drives], jax.random.fold_in(jax.random.key(config.seed), index)
     asked = named_estimator(config.estimator) if config.estimator else None
-    return policy_drives(world, tasks, Policy(config.driver), asked, key), len(tasks)
+    settings = dataclasses.replace(trial_config_for(world), camera=config.camera, disturbance=config.disturbance)
+    return policy_drives(world, tasks, Policy(config.driver), asked, settings, key), len(tasks)
 
 
 @partial(jax.jit, static_argnames="config")

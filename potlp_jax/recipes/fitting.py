@@ -22,10 +22,11 @@ from potlp_jax.files import MOST_TEXT, read_json, reading
 from potlp_jax.learning.building_learner import BuildingOptions
 from potlp_jax.learning.dataset import Samples
 from potlp_jax.learning.learner import Learner
+from potlp_jax.learning.learners import learner_of
 from potlp_jax.learning.loss import DataScale
-from potlp_jax.learning.network import Params, parameter_count
+from potlp_jax.learning.network import Params, parameter_count, require_propositions
 from potlp_jax.learning.panorama_learner import PanoramaOptions
-from potlp_jax.learning.serialization import save_estimator
+from potlp_jax.learning.serialization import load_estimator, save_estimator
 from potlp_jax.learning.training import (
     Trained,
     TrainingConfig,
@@ -74,7 +75,7 @@ def fit(
     out: Path,
     config: FitConfig,
     display: Display = Display(),
-    initial: Params | None = None,
+    initial: Path | None = None,
 ) -> Trained:
     """Fit an estimator, or resume.
 
@@ -84,7 +85,7 @@ def fit(
         out: the fit's folder.
         config: what is fitted, and how.
         display: shows how it goes.
-        initial: parameters to begin with, of a fit before; new ones by default.
+        initial: an estimator to go on from, whose network is kept as it is; a new one by default.
 
     Returns:
         The best parameters, which ``out`` / ``ESTIMATOR`` holds as well.
@@ -93,7 +94,7 @@ def fit(
         TrainingError: the data do not fit, ``out`` has a plan for something else, or the loss is not finite.
         CheckpointError: ``out`` holds a damaged checkpoint, or one of another training.
     """
-    learner = config.network.learner(training)
+    learner, begin = _beginning(training, config, initial)
     out.mkdir(parents=True, exist_ok=True)
     # Measuring counts: the time asked for is that of the whole command.
     began = time.perf_counter()
@@ -110,7 +111,7 @@ def fit(
             training,
             validation,
             plan,
-            initial=initial,
+            initial=begin,
             folder=out / "checkpoints",
             budget_seconds=budget,
             on_start=journal.start,
@@ -123,6 +124,16 @@ def fit(
     metadata = _metadata(training, validation, plan, trained, journal)
     save_estimator(out / ESTIMATOR, trained.params, learner.config, training.metadata.domain, metadata)
     return trained
+
+
+def _beginning(training: Samples, config: FitConfig, initial: Path | None) -> tuple[Learner, Params | None]:
+    """What is fitted, and its parameters where it does not begin with new ones."""
+    if initial is None:
+        return config.network.learner(training), None
+    params, known, _, _ = load_estimator(initial)
+    require_propositions(known.propositions, training.metadata.propositions, str(initial), asker="the training data")
+    # The scales of costs are the estimator's own: with others its parameters would mean other costs.
+    return learner_of(known), params
 
 
 def _plan(learner: Learner, training: Samples, out: Path, config: FitConfig) -> TrainingConfig:

@@ -18,6 +18,7 @@ from potlp_jax.learning.recording import Pose
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.world.grid import World
 from potlp_jax.world.moves import step_lengths
@@ -28,15 +29,17 @@ def policy_drives(
     tasks: Sequence[Task],
     policy: Policy,
     estimator: TrainedEstimator | Estimator | None,
+    config: TrialConfig,
     key: PRNGKeyArray,
 ) -> Iterator[Iterable[Pose]]:
-    """Drives from the world's start, one for each task, with the settings that the world calls for.
+    """Drives from the world's start, one for each task.
 
     Args:
         world: the true map.
         tasks: over the world's propositions.
         policy: who drives.
         estimator: what it asks, if anything.
+        config: settings of the drives.
         key: of the planner.
 
     Returns:
@@ -49,6 +52,7 @@ def policy_drives(
             world,
             task,
             policy,
+            config=config,
             arrays=task.padded(sizes),
             estimator=estimator,
             key=jax.random.fold_in(key, number),

@@ -107,8 +107,8 @@ def follow(
 
     Args:
         recipe: what to make.
-        out: gets ``training`` and ``validation``, the datasets, and what ``fit`` writes. With rounds, each has such a
-            folder of its own in it, ``round-1`` and so on, and ``out`` the result of the last one.
+        out: gets ``training`` and ``validation``, the datasets, and what ``fit`` writes. With rounds these are of the
+            last one, and ``round-0`` and so on in it hold those of the stages before.
         processes: explore at the same time.
         tell: called as worlds are explored.
         display: shows how the fits go.
@@ -116,6 +116,7 @@ def follow(
     Returns:
         The best parameters.
     """
+    # Each stage has a folder; that of the last one is ``out`` itself.
     folders = [*(out / f"round-{number}" for number in range(len(recipe.rounds))), out]
     worlds = {Split.TRAINING: 0, Split.VALIDATION: 0}
     records: list[Samples] = []
@@ -127,7 +128,7 @@ def follow(
             worlds[split] += count
         records.append(read_dataset(folder / Split.TRAINING.value))
         validation = read_dataset(folder / Split.VALIDATION.value)
-        initial = None if trained is None else trained.params
+        initial = folders[number - 1] / ESTIMATOR if number else None
         trained = fit(joined(records), validation, folder, stage.fit, display, initial)
     assert trained is not None
     return trained
