@@ -57,7 +57,7 @@ class Choice:
         mask: True where a sample is real.
     """
 
-    views: Int64[np.ndarray, " g"]
+    views: Int64[np.ndarray, " _"]
     index: Int64[np.ndarray, "G K"]
     mask: Bool[np.ndarray, "G K"]
 

@@ -409,7 +409,7 @@ def cost_errors(
 
 def cost_bins(
     true: Float64[np.ndarray, "N"], said: Float64[np.ndarray, "N"], weight: Float64[np.ndarray, "N"]
-) -> tuple[tuple[CostBin, ...], Float64[np.ndarray, " bins"]]:
+) -> tuple[tuple[CostBin, ...], Float64[np.ndarray, " k"]]:
     """Up to ``BINS`` bins of the predicted cost with equally many samples each, as far as ties allow.
 
     Args:
