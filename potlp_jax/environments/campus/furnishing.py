@@ -107,12 +107,14 @@ class Floor:
         doors: the cells of doors.
         kinds: the kind of each room, by its number.
         resolution: side of a cell in metres.
+        closed: numbers of the rooms whose doors are closed: nobody is in them, and they cannot be entered.
     """
 
     rooms: Int32[np.ndarray, "H W"]
     doors: Bool[np.ndarray, "H W"]
     kinds: tuple[Kind, ...]
     resolution: float
+    closed: frozenset[int] = frozenset()
 
     @property
     def occupied(self) -> Bool[np.ndarray, "H W"]:
@@ -126,8 +128,8 @@ class Floor:
         return np.append(np.array(self.kinds, np.int32), np.int32(NO_ROOM))[self.rooms]
 
     def rooms_of(self, kind: Kind) -> list[int]:
-        """Numbers of the rooms of a kind."""
-        return [number for number, found in enumerate(self.kinds) if found is kind]
+        """Numbers of the rooms of a kind that can be entered."""
+        return [number for number, found in enumerate(self.kinds) if found is kind and number not in self.closed]
 
 
 @dataclasses.dataclass(frozen=True)
