@@ -144,6 +144,7 @@ class BlockBuilder:
         doors: cells of doors, so far.
         kinds: of the rooms, by number.
         boxes: of the rooms, from room 1 on.
+        closed: numbers of the rooms that get no door.
     """
 
     def __init__(self, style: BlockStyle, rng: np.random.Generator, shape: tuple[int, int]) -> None:
@@ -152,6 +153,7 @@ class BlockBuilder:
         self.doors = np.zeros(shape, bool)
         self.kinds: list[Kind] = [Kind.HALLWAY]
         self.boxes: list[Box] = []
+        self.closed: set[int] = set()
 
     def build_rectangle(self, resolution: float) -> Floor:
         """One building that fills the whole array: its first hallway runs from wall to wall."""
@@ -159,14 +161,14 @@ class BlockBuilder:
         # The outermost cells of the first block are the outer walls.
         block = Box(0, height, 0, width)
         self.cut(block, self._choose_turn(block, [False, True]), first=True)
-        return self.without(set(range(len(self.kinds))) - self.open_doors(), resolution)
+        return self.finish(self.open_doors(), resolution)
 
     def room_width(self, kind: Kind) -> tuple[int, int]:
         """Least and largest width of a room along its row."""
         return _WIDTHS[kind]
 
-    def door_width(self) -> int:
-        """Of the next door."""
+    def door_width(self, number: int) -> int:
+        """Of the next door of a room."""
         return self.style.door_width
 
     def chance(self, probability: float) -> bool:
@@ -245,8 +247,11 @@ class BlockBuilder:
         after = hallway.bottom < len(rooms) and bool((rooms[hallway.bottom, columns] == HALLWAYS).all())
         return before, after
 
-    def carve_hallway(self, hallway: Box, turned: bool) -> None:
-        """Open the hallway up to the hallways that it meets; it may stop short, or be closed in its middle."""
+    def carve_hallway(self, hallway: Box, turned: bool, *, severable: bool = True) -> None:
+        """Open the hallway up to the hallways that it meets; it may stop short, or be closed in its middle.
+
+        One that is ``severable`` joins hallways that are connected without it.
+        """
         rooms, meets = self.rooms.T if turned else self.rooms, self.meets(hallway, turned)
         top, bottom = hallway.top + (not meets[0]), hallway.bottom - (not meets[1])
         # Where the hallway meets another, its first or last row is an opening instead of a wall.
@@ -254,7 +259,7 @@ class BlockBuilder:
         room = int(self.rng.integers(MIN_SIDE + 1, 13))
         parts, closed = [hallway.rows(top, bottom)], None
         # A long hallway between two others may be severed by a room, one with a loose end may stop short: dead ends.
-        if all(meets) and length >= 40 and self.chance(self.style.severed):
+        if severable and all(meets) and length >= 40 and self.chance(self.style.severed):
             # Not near its ends, where a stub would look like a niche.
             middle = top + int(length * self.rng.uniform(0.3, 0.6))
             parts = [hallway.rows(top, middle), hallway.rows(middle + room + 2, bottom)]
@@ -355,9 +360,10 @@ class BlockBuilder:
 
     def open_doors(self) -> set[int]:
         """Doors to the hallways, then from room to room; returns the rooms that can be reached."""
-        walls = {number: list(self.walls_of(box)) for number, box in enumerate(self.boxes, start=1)}
+        boxes = {n: box for n, box in enumerate(self.boxes, start=1) if n not in self.closed}
+        walls = {number: list(self.walls_of(box)) for number, box in boxes.items()}
         reached = {HALLWAYS}
-        for number, box in enumerate(self.boxes, start=1):
+        for number, box in boxes.items():
             if self.open_door(walls[number], number, HALLWAYS):
                 reached.add(number)
                 # Twelve cells are six metres: large rooms have two doors.
@@ -398,7 +404,7 @@ class BlockBuilder:
 
     def open_door(self, walls: list[Wall], number: int, target: int) -> bool:
         """A door from a room to another, anywhere along their common walls; False where they have none."""
-        width = self.door_width()
+        width = self.door_width(number)
         places = []
         for wall in walls:
             # Cells of the wall behind which the target lies, and that are still wall.
@@ -417,13 +423,14 @@ class BlockBuilder:
         self.doors[cells] = True
         return True
 
-    def without(self, walled_up: set[int], resolution: float) -> Floor:
-        """The floor with some rooms solid, the others numbered without gaps."""
+    def finish(self, reached: set[int], resolution: float) -> Floor:
+        """The floor: rooms that are neither reached nor closed become solid, the others are numbered without gaps."""
         # The appended entry keeps NO_ROOM, -1, what it is.
-        kept = np.array([number not in walled_up for number in range(len(self.kinds))])
+        kept = np.array([number in reached or number in self.closed for number in range(len(self.kinds))])
         new_numbers = np.append(np.where(kept, np.cumsum(kept) - 1, NO_ROOM), NO_ROOM).astype(np.int32)
         kinds = tuple(kind for kind, keep in zip(self.kinds, kept, strict=True) if keep)
-        return Floor(new_numbers[self.rooms], self.doors, kinds, resolution)
+        closed = frozenset(int(new_numbers[number]) for number in self.closed)
+        return Floor(new_numbers[self.rooms], self.doors, kinds, resolution, closed)
 
 
 def _neighbours(walls: list[Wall]) -> set[int]:
