@@ -12,7 +12,6 @@ from scipy import ndimage
 
 from potlp_jax.environments.campus.furnishing import NO_ROOM, Floor, Kind
 
-_AROUND = np.ones((3, 3))
 _LEAST_LOOP = 9.0
 """Square metres inside of a hallway's loop; less is furniture or a pillar."""
 _END_WIDTHS = (1.0, 4.0)
@@ -91,7 +90,7 @@ def shape_of(floor: Floor) -> FloorShape:
 
 def _graph_of_rooms(floor: Floor, hallway: Bool[np.ndarray, "H W"]) -> tuple[nx.Graph, int]:
     """Rooms and connected hallways, joined where one can pass, with the number of doors; and how many hallways."""
-    pieces, hallways = ndimage.label(hallway)
+    pieces, hallways = _label(hallway)
     # Hallways come first, then rooms.
     spaces = np.where(hallway, pieces - 1, np.where(floor.occupied, NO_ROOM, floor.rooms + hallways))
     graph = nx.Graph()
@@ -101,8 +100,15 @@ def _graph_of_rooms(floor: Floor, hallway: Bool[np.ndarray, "H W"]) -> tuple[nx.
         for one, other in np.unique(pairs, axis=0).tolist():
             here = meets & (np.minimum(first, second) == one) & (np.maximum(first, second) == other)
             known = graph.get_edge_data(one, other, {"doors": 0})["doors"]
-            graph.add_edge(one, other, doors=known + ndimage.label(here, _AROUND)[1])
+            graph.add_edge(one, other, doors=known + _label(here, corners=True)[1])
     return graph, hallways
+
+
+def _label(cells: Bool[np.ndarray, "H W"], *, corners: bool = False) -> tuple[Int32[np.ndarray, "H W"], int]:
+    """Connected pieces, numbered from 1, and how many; cells that touch at corners are connected if ``corners``."""
+    pieces = np.zeros(cells.shape, np.int32)
+    count = ndimage.label(cells, np.ones((3, 3)) if corners else None, pieces)
+    return pieces, int(count)  # pyright: ignore[reportArgumentType]
 
 
 def _line_lengths(cells: Bool[np.ndarray, "H W"]) -> Int32[np.ndarray, "H W"]:
@@ -110,13 +116,13 @@ def _line_lengths(cells: Bool[np.ndarray, "H W"]) -> Int32[np.ndarray, "H W"]:
     lengths = np.zeros(cells.shape, np.int32)
     for row, line in enumerate(cells):
         edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(np.int8), [0]])))
-        for first, last in edges.reshape(-1, 2).tolist():
+        for first, last in zip(edges[::2], edges[1::2], strict=True):
             lengths[row, first:last] = last - first
     return lengths
 
 
 def _loops(hallway: Bool[np.ndarray, "H W"], side: float) -> int:
-    pieces, count = ndimage.label(np.pad(~hallway, 1, constant_values=True), _AROUND)
+    pieces, count = _label(np.pad(~hallway, 1, constant_values=True), corners=True)
     # What lies around the building is a piece, too.
     sizes = np.bincount(pieces.ravel(), minlength=count + 1)[1:] * side**2
     outside = pieces[0, 0] - 1
@@ -139,7 +145,7 @@ def dead_ends(hallway: Bool[np.ndarray, "H W"], side: float) -> int:
         cells = np.pad(np.rot90(hallway, turned), deep + 1)
         for row in range(deep + 1, len(cells) - deep):
             edges = np.flatnonzero(np.diff(cells[row].astype(np.int8)))
-            for before, last in edges.reshape(-1, 2).tolist():
+            for before, last in zip(edges[::2], edges[1::2], strict=True):
                 inside, walls = slice(before + 1, last + 1), [before, last + 1]
                 stretch = slice(row, row + deep)
                 ends += (

@@ -167,6 +167,16 @@ class BlockBuilder:
         """Least and largest width of a room along its row."""
         return _WIDTHS[kind]
 
+    def draw_mix(self, depth: int) -> Mapping[Kind, float]:
+        """What the rooms of a row this deep are for: shares of the kinds."""
+        # 9 and 13 cells bound the three depths for which ``_USES`` gives chances.
+        uses = np.array([chances[int(np.searchsorted((9, 13), depth))] for _, chances in _USES])
+        return _USES[int(self.rng.choice(len(_USES), p=uses / uses.sum()))][0]
+
+    def deepest_small(self) -> int:
+        """Depth from which on a small room has another behind it."""
+        return _DEEPEST_SMALL
+
     def door_width(self, number: int) -> int:
         """Of the next door of a room."""
         return self.style.door_width
@@ -320,14 +330,12 @@ class BlockBuilder:
 
     def fill_row(self, row: Box, turned: bool, front_first: bool) -> None:
         """Rooms side by side along the columns of ``row``, which has no walls of its own; turned back if ``turned``."""
-        # 9 and 13 cells bound the three depths for which ``_USES`` gives chances.
-        uses = np.array([chances[int(np.searchsorted((9, 13), row.height))] for _, chances in _USES])
-        mix = _USES[int(self.rng.choice(len(_USES), p=uses / uses.sum()))][0]
+        mix = self.draw_mix(row.height)
         left = row.left
         while left < row.right:
             kind = list(mix)[int(self.rng.choice(len(mix), p=list(mix.values())))]
             # A laboratory that would be as narrow as an office is one.
-            if kind in (Kind.LAB, Kind.CLASSROOM) and min(row.right - left, row.height + 3) < self.room_width(kind)[0]:
+            if kind in (Kind.LAB, Kind.CLASSROOM) and min(row.right - left, row.height + 3) < _WIDTHS[kind][0]:
                 kind = Kind.OFFICE
             low, high = self.room_width(kind)
             right = left + int(self.rng.integers(low, high + 1))
@@ -341,7 +349,7 @@ class BlockBuilder:
         """One room, or a small one with another behind it."""
         parts = [(box, kind)]
         small, possible = kind in (Kind.OFFICE, Kind.OTHER), box.height >= 2 * MIN_SIDE + 1
-        if small and possible and (box.height > _DEEPEST_SMALL or self.chance(self.style.room_behind)):
+        if small and possible and (box.height > self.deepest_small() or self.chance(self.style.room_behind)):
             wall = box.top + MIN_SIDE + int(self.rng.integers(0, box.height - 2 * MIN_SIDE))
             # The front room is the one beside the hallway.
             front, back = box.rows(box.top, wall), box.rows(wall + 1, box.bottom)

@@ -11,24 +11,18 @@ All lengths are in cells of ``CampusConfig.resolution`` metres; costs are in met
 """
 
 import dataclasses
-from collections.abc import Mapping
-from types import MappingProxyType
 
 import numpy as np
 
 from potlp_jax.environments.campus.campus_builder import CampusBuilder, CampusFloor, CampusStyle
 from potlp_jax.environments.campus.delivery import DELIVERY_FAMILY, PARCELS_FAMILY
 from potlp_jax.environments.campus.floor_generator import FloorGenerator
-from potlp_jax.environments.campus.furnishing import PARCELS, PEOPLE, Errand, FurnishConfig
-from potlp_jax.environments.campus.outlines import LEAST_COURT, Outline, Site, draw_wings, least_height, least_width
+from potlp_jax.environments.campus.furnishing import NARROW_DOORS, PARCELS, PEOPLE, Errand, FurnishConfig
+from potlp_jax.environments.campus.outlines import LEAST_DEEP, Outline, Site, draw_wings, least_height, least_width
 from potlp_jax.errors import WorldError
-from potlp_jax.world.settings import Settings
 
-SIZES: tuple[str, ...] = ("small", "medium", "large")
-"""Of buildings, by their long side: 24 to 64 m, 64 to 128 m, 128 to 224 m."""
-
-NARROW_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 96, "min_size": 1}}, "panoramas": 128})
-"""Settings of trials, as for real buildings: a door may be as narrow as one cell."""
+_DEPARTMENTS = (1.0, 0.5, 1.6, 0.5)
+"""Of the Dirichlet distribution from which a building's departments are drawn: most have one or two kinds of them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,11 +33,12 @@ class CampusConfig:
         long_side: bounds of the building's longer side, outer walls included.
         largest: rows and columns of the arrays.
         aspect: bounds of the shorter side, as a share of the longer; more where the outline needs it.
-        wing_depth: bounds, drawn once a wing.
+        wing_depth: bounds, drawn once a wing that has one hallway.
+        deep_wing, deep_chance: bounds of the depth of wings with hallways around a core, and how likely they are.
         outlines: how often each is drawn, relative to the others that the building is large enough for.
         grain, row_depth: bounds of what ``CampusStyle`` says.
         hallway_width: bounds of the width of its narrowest hallway; others are up to two cells wider.
-        closed, narrow_door: bounds of what ``CampusStyle`` says.
+        closed, narrow_door, joining_door: bounds of what ``CampusStyle`` says.
         style: what is the same in all buildings; what has bounds here is replaced.
         resolution: side of a cell in metres.
         furnishing: people, light and colours.
@@ -53,27 +48,32 @@ class CampusConfig:
     largest: tuple[int, int]
     outlines: tuple[tuple[Outline, float], ...]
     aspect: tuple[float, float] = (0.3, 0.9)
-    wing_depth: tuple[int, int] = (24, 46)
-    grain: tuple[float, float] = (1.0, 2.2)
-    row_depth: tuple[int, int] = (14, 22)
-    hallway_width: tuple[int, int] = (3, 6)
+    wing_depth: tuple[int, int] = (26, 52)
+    deep_wing: tuple[int, int] = (56, 90)
+    deep_chance: float = 0.45
+    grain: tuple[float, float] = (1.3, 2.8)
+    row_depth: tuple[int, int] = (16, 26)
+    hallway_width: tuple[int, int] = (4, 6)
     closed: tuple[float, float] = (0.0, 0.15)
     narrow_door: tuple[float, float] = (0.0, 0.8)
-    style: CampusStyle = CampusStyle(split=0.06, severed=0.1, outdoors=0.06, lobby=0.08, room_behind=0.4)
+    joining_door: tuple[float, float] = (0.0, 0.2)
+    style: CampusStyle = CampusStyle()
     resolution: float = 0.5
     furnishing: FurnishConfig = FurnishConfig()
 
     def __post_init__(self) -> None:
         deepest = self.wing_depth[1]
         drawn = (self.long_side, self.aspect, self.wing_depth, self.grain, self.row_depth)
-        drawn += (self.hallway_width, self.closed, self.narrow_door)
+        chances = (self.closed, self.narrow_door, self.joining_door)
+        drawn += (self.hallway_width, *chances)
         rules = (
             (all(0 <= low <= high for low, high in drawn), "bounds must not be negative, and be in increasing order"),
             (self.long_side[0] >= 40, "long_side must be at least 40"),
             (self.wing_depth[0] >= 18, "wing_depth must be at least 18"),
+            (self.deep_wing[0] >= LEAST_DEEP, f"deep_wing must be at least {LEAST_DEEP}"),
             (self.row_depth[0] >= 10, "row_depth must be at least 10"),
-            (1 <= self.hallway_width[0] and self.hallway_width[1] <= 6, "hallway_width must lie in 1 to 6"),
-            (self.aspect[1] <= 1 and self.closed[1] <= 1 and self.narrow_door[1] <= 1, "a share must not exceed 1"),
+            (self.hallway_width[0] >= 1 and self.hallway_width[1] <= 6, "hallway_width must lie in 1 to 6"),
+            (all(high <= 1 for _, high in (self.aspect, *chances)), "a share must not exceed 1"),
             (self.resolution > 0, "resolution must be positive"),
             (self.long_side[1] <= self.largest[1], f"largest {self.largest} must have long_side's columns"),
             (
@@ -97,10 +97,10 @@ class CampusConfig:
         return least_width(outline, self.wing_depth[1]) <= width
 
 
-_SMALL = CampusConfig(
+SMALL: CampusConfig = CampusConfig(
     long_side=(48, 128),
     largest=(96, 128),
-    wing_depth=(20, 36),
+    wing_depth=(22, 44),
     outlines=(
         (Outline.BAR, 0.3),
         (Outline.BLOCK, 0.3),
@@ -110,9 +110,10 @@ _SMALL = CampusConfig(
         (Outline.H, 0.05),
     ),
 )
-_MEDIUM = CampusConfig(
+MEDIUM: CampusConfig = CampusConfig(
     long_side=(128, 256),
     largest=(160, 256),
+    aspect=(0.3, 0.75),
     outlines=(
         (Outline.BAR, 0.12),
         (Outline.BLOCK, 0.14),
@@ -125,10 +126,12 @@ _MEDIUM = CampusConfig(
         (Outline.STEPPED, 0.08),
     ),
 )
-_LARGE = CampusConfig(
+LARGE: CampusConfig = CampusConfig(
     long_side=(256, 448),
     largest=(224, 448),
-    aspect=(0.15, 0.6),
+    aspect=(0.15, 0.45),
+    deep_chance=0.3,
+    grain=(1.6, 3.4),
     outlines=(
         (Outline.BAR, 0.12),
         (Outline.L, 0.14),
@@ -140,39 +143,54 @@ _LARGE = CampusConfig(
         (Outline.STEPPED, 0.1),
     ),
 )
-CONFIGS: Mapping[str, CampusConfig] = MappingProxyType(dict(zip(SIZES, (_SMALL, _MEDIUM, _LARGE), strict=True)))
-"""By size."""
 
 
 class Campus(FloorGenerator):
-    """Generator of campus buildings of one size, with people to find: by default those of ``delivery``."""
+    """Generator of campus buildings of one size, with people to find, or parcels to deliver."""
 
     settings = NARROW_DOORS
 
-    def __init__(
-        self, config: CampusConfig = _MEDIUM, name: str = "campus-medium", errand: Errand = PEOPLE, family: str = ""
-    ) -> None:
+    def __init__(self, config: CampusConfig, name: str, errand: Errand = PEOPLE, family: str = DELIVERY_FAMILY) -> None:
         """Of this configuration.
 
         Args:
             config: sizes and chances.
             name: the family's; it goes into the keys of its worlds.
             errand: who is to be found, and where they can be.
-            family: whose worlds these look like, to an estimator; by default ``delivery``.
+            family: whose worlds these look like, to an estimator.
         """
         super().__init__(config, config.largest, config.furnishing, name, errand)
-        self.family = family or DELIVERY_FAMILY
+        self.family = family
 
     @classmethod
-    def of_size(cls, size: str) -> "Campus":
-        """Buildings of one of the ``SIZES``, with people in rooms of their kind."""
-        return cls(CONFIGS[size], f"campus-{size}")
+    def small(cls) -> "Campus":
+        """Buildings 24 to 64 m long."""
+        return cls(SMALL, "campus-small")
 
     @classmethod
-    def parcels_of_size(cls, size: str) -> "Campus":
-        """Buildings of one of the ``SIZES``, with a document and a package to deliver; nothing but light tells where."""
-        plain = dataclasses.replace(CONFIGS[size], furnishing=FurnishConfig(coloured=False))
-        return cls(plain, f"campus-parcels-{size}", PARCELS, PARCELS_FAMILY)
+    def medium(cls) -> "Campus":
+        """Buildings 64 to 128 m long."""
+        return cls(MEDIUM, "campus-medium")
+
+    @classmethod
+    def large(cls) -> "Campus":
+        """Buildings 128 to 224 m long."""
+        return cls(LARGE, "campus-large")
+
+    @classmethod
+    def small_parcels(cls) -> "Campus":
+        """Small buildings with a document and a package to deliver in two rooms, which nothing but light tells."""
+        return cls(_grey(SMALL), "campus-small-parcels", PARCELS, PARCELS_FAMILY)
+
+    @classmethod
+    def medium_parcels(cls) -> "Campus":
+        """The same in medium buildings."""
+        return cls(_grey(MEDIUM), "campus-medium-parcels", PARCELS, PARCELS_FAMILY)
+
+    @classmethod
+    def large_parcels(cls) -> "Campus":
+        """The same in large buildings."""
+        return cls(_grey(LARGE), "campus-large-parcels", PARCELS, PARCELS_FAMILY)
 
     def build(self, rng: np.random.Generator) -> CampusFloor:
         """A building whose size, outline and style are drawn first."""
@@ -180,16 +198,21 @@ class Campus(FloorGenerator):
         width = int(rng.integers(config.long_side[0], config.long_side[1] + 1))
         outlines, weights = zip(*config.outlines_of(width), strict=True)
         outline = outlines[int(rng.choice(len(outlines), p=np.array(weights) / sum(weights)))]
-        site = Site(self._draw_height(outline, width, rng), width, config.wing_depth, rng)
-        builder = CampusBuilder(self._draw_style(rng), rng, (site.height, site.width))
+        style = self._draw_style(rng)
+        # As deep as two rows of rooms and their hallway, at most: deeper ones have two hallways.
+        deepest = min(config.wing_depth[1], 2 * style.row_depth + style.hallway_width[0])
+        depth = min(config.wing_depth[0], deepest), deepest
+        height = self._draw_height(outline, width, depth, rng)
+        site = Site(height, width, depth, config.deep_wing, config.deep_chance, rng)
+        builder = CampusBuilder(style, rng, (height, width))
         return builder.build(outline, draw_wings(outline, site), config.resolution)
 
-    def _draw_height(self, outline: Outline, width: int, rng: np.random.Generator) -> int:
+    def _draw_height(self, outline: Outline, width: int, depth: tuple[int, int], rng: np.random.Generator) -> int:
         config: CampusConfig = self.config
         if outline is Outline.BAR:
-            return int(rng.integers(config.wing_depth[0], config.wing_depth[1] + 1))
+            return int(rng.integers(depth[0], depth[1] + 1))
         height = round(width * rng.uniform(*config.aspect))
-        return int(np.clip(height, least_height(outline, config.wing_depth[1]), config.largest[0]))
+        return int(np.clip(height, least_height(outline, depth[1]), config.largest[0]))
 
     def _draw_style(self, rng: np.random.Generator) -> CampusStyle:
         config: CampusConfig = self.config
@@ -198,7 +221,14 @@ class Campus(FloorGenerator):
             config.style,
             hallway_width=(narrowest, narrowest + 2),
             row_depth=int(rng.integers(config.row_depth[0], config.row_depth[1] + 1)),
+            departments=tuple(rng.dirichlet(_DEPARTMENTS).tolist()),
             grain=float(rng.uniform(*config.grain)),
             closed=float(rng.uniform(*config.closed)),
             narrow_door=float(rng.uniform(*config.narrow_door)),
+            joining_door=float(rng.uniform(*config.joining_door)),
         )
+
+
+def _grey(config: CampusConfig) -> CampusConfig:
+    """The same buildings, in which all rooms look alike."""
+    return dataclasses.replace(config, furnishing=dataclasses.replace(config.furnishing, coloured=False))

@@ -9,6 +9,7 @@
 
 import dataclasses
 import enum
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -21,6 +22,17 @@ _SEGMENT = (30, 60)
 """Columns of a stretch along a hallway that is drawn as a whole, as departments are; 15 to 30 m."""
 _LARGE_ROOM = 240
 """Cells of a room that may have wide doors: 60 square metres."""
+
+_MIXES: tuple[Mapping[Kind, float], ...] = (
+    {Kind.OFFICE: 0.52, Kind.OTHER: 0.38, Kind.LAB: 0.06, Kind.CLASSROOM: 0.04},
+    {Kind.LAB: 0.4, Kind.OTHER: 0.38, Kind.OFFICE: 0.17, Kind.CLASSROOM: 0.05},
+    {Kind.CLASSROOM: 0.5, Kind.OTHER: 0.4, Kind.OFFICE: 0.07, Kind.LAB: 0.03},
+    {Kind.OTHER: 0.78, Kind.OFFICE: 0.12, Kind.CLASSROOM: 0.1},
+)
+"""Kinds of rooms in a row of each of ``CampusStyle.departments``."""
+
+_GRAIN_OF = {Kind.OFFICE: 1.0, Kind.LAB: 0.7, Kind.CLASSROOM: 0.7, Kind.OTHER: 0.4}
+"""Powers of the grain that rooms of a kind are wider by: laboratories are wide anyway, and closets small."""
 
 
 class Part(enum.StrEnum):
@@ -41,18 +53,28 @@ class CampusStyle(BlockStyle):
     """How one building is: lengths in cells, chances for each of what they are about.
 
     Attributes:
-        grain: rooms are so many times as wide as on the floors of ``delivery``.
+        departments: chances that a row of rooms has offices, laboratories, classrooms, or mostly other rooms.
+        grain: offices are so many times as wide as on the floors of ``delivery``, other rooms by less.
         atrium, open_plan, large_room: chance that a stretch along a hallway is one.
         stairs, shaft: chance that a small room that is no office is one.
         closed: chance that a room cannot be entered.
         narrow_door: chance that a door is one cell wide.
         hallway_door: chance of a door across, for every 30 m of a wing's hallway.
+
+    Of what ``BlockStyle`` says, hallways within blocks, lobbies and blocks that stay outdoors are rarer by default:
+    wings have hallways, atria and courts of their own.
     """
 
+    severed: float = 0.1
+    split: float = 0.06
+    outdoors: float = 0.06
+    lobby: float = 0.05
+    room_behind: float = 0.4
+    departments: tuple[float, ...] = (0.4, 0.15, 0.3, 0.15)
     grain: float = 1.4
-    atrium: float = 0.08
+    atrium: float = 0.06
     open_plan: float = 0.06
-    large_room: float = 0.12
+    large_room: float = 0.14
     stairs: float = 0.15
     shaft: float = 0.1
     closed: float = 0.06
@@ -94,12 +116,14 @@ class CampusBuilder(BlockBuilder):
         ground = np.zeros(self.rooms.shape, bool)
         for wing in wings:
             ground[wing.box.cells] = True
-        spines = [self._carve_spine(wing, ground) for wing in wings]
-        for wing, spine in zip(wings, spines, strict=True):
-            for block in self._sides(wing, spine):
-                self.divide(block)
-        for wing, spine in zip(wings, spines, strict=True):
-            self._close_across(spine, wing.turned)
+        hallways = [self._carve_pair(wing) if wing.deep else [self._carve_spine(wing, ground)] for wing in wings]
+        for wing, own in zip(wings, hallways, strict=True):
+            for strip in self._strips(wing, own):
+                for block in self._between_crossings(strip, wing.turned):
+                    self.divide(block)
+        for wing, own in zip(wings, hallways, strict=True):
+            for hallway in own:
+                self._close_across(hallway, wing.turned)
         self._close_rooms()
         reached = self.open_doors()
         self._complete_kinds(reached - {HALLWAYS})
@@ -114,22 +138,28 @@ class CampusBuilder(BlockBuilder):
         box = wing.box.turned if wing.turned else wing.box
         low, high = self.style.hallway_width
         width = int(self.rng.integers(low, high + 1))
-        # Rows of rooms on both sides; in a shallow wing on one side only, now and then.
-        one_sided = box.height <= 2 * self.style.row_depth and self.chance(0.15)
-        place = float(self.rng.choice([0.0, 1.0]) if one_sided else self.rng.uniform(0.35, 0.65))
-        top = box.top + 1 + round(place * (box.height - 2 - width))
+        top = box.top + self._depth_above(box.height, width)
         # Everything in blocks is written for hallways from the first row to the last: rows and columns change places.
         left, right = self._extended(box.rows(top, top + width), wing.turned, ground)
         spine = Box(left, right, top, top + width)
         self.carve_hallway(spine, not wing.turned, severable=False)
         return spine.turned
 
+    def _depth_above(self, depth: int, width: int) -> int:
+        """Rows of a wing before its hallway: as many as rooms can fill, here and behind it."""
+        beside, most = depth - width, self.style.row_depth
+        # A shallow wing may have rooms on one side only: there is the outer wall on the other.
+        if beside - 1 <= most and self.chance(0.3):
+            return int(self.rng.choice([1, beside - 1]))
+        low, high = max(MIN_SIDE + 2, beside - most), min(most, beside - MIN_SIDE - 2)
+        return int(self.rng.integers(low, high + 1)) if low <= high else beside // 2
+
     def _extended(self, line: Box, turned: bool, ground: np.ndarray) -> tuple[int, int]:
         """First and last column of a hallway, as far as there are wings before the next hallway on its way."""
         rooms, land = (self.rooms.T, ground.T) if turned else (self.rooms, ground)
         rows = slice(line.top, line.bottom)
-        hallway = (rooms[rows] == HALLWAYS).all(axis=0)
-        built = land[rows].all(axis=0)
+        hallway: np.ndarray = np.all(rooms[rows] == HALLWAYS, axis=0)
+        built: np.ndarray = np.all(land[rows], axis=0)
         ends = []
         for first, step in ((line.left - 1, -1), (line.right, 1)):
             column = first
@@ -139,20 +169,41 @@ class CampusBuilder(BlockBuilder):
             ends.append(column - step if meets else first - step)
         return ends[0], ends[1] + 1
 
-    def _sides(self, wing: Wing, spine: Box) -> list[Box]:
-        """What lies on both sides of a wing's hallway, between the hallways that cross it."""
-        rooms, box = (self.rooms.T, wing.box.turned) if wing.turned else (self.rooms, wing.box)
-        blocks = []
-        for strip in (box.rows(box.top, spine.top), box.rows(spine.bottom, box.bottom)):
-            if strip.height < MIN_SIDE + 2:
-                continue
-            crossed = (rooms[strip.cells] == HALLWAYS).any(axis=0)
-            edges = np.flatnonzero(np.diff(np.concatenate([[1], crossed.astype(np.int8), [1]])))
-            for first, last in (edges.reshape(-1, 2) + strip.left).tolist():
-                if last - first >= MIN_SIDE + 2:
-                    block = strip.columns(first, last)
-                    blocks.append(block.turned if wing.turned else block)
-        return blocks
+    def _carve_pair(self, wing: Wing) -> list[Box]:
+        """Two hallways along a deep wing, and others across it that join them: loops around a core."""
+        box = wing.box.turned if wing.turned else wing.box
+        rooms = self.rooms.T if wing.turned else self.rooms
+        low, high = self.style.hallway_width
+        width = int(self.rng.integers(low, high + 1))
+        # What remains for the core is a room's least side with its walls, at least.
+        most = min((box.height - 2 * width - MIN_SIDE - 2) // 2, self.style.row_depth)
+        above, below, *ends = (int(side) for side in self.rng.integers(MIN_SIDE + 2, most + 1, size=4))
+        along = box.columns(box.left + 1, box.right - 1)
+        pair = [along.rows(along.top + above, along.top + above + width)]
+        pair.append(along.rows(along.bottom - below - width, along.bottom - below))
+        between = box.rows(pair[0].bottom, pair[1].top)
+        # One near each end, and one for every 40 m or so.
+        places = np.linspace(ends[0], box.width - ends[1] - width, 2 + box.width // 100)
+        across = [between.columns(box.left + int(place), box.left + int(place) + width) for place in places]
+        for hallway in (*pair, *across):
+            rooms[hallway.cells] = HALLWAYS
+        return pair
+
+    def _strips(self, wing: Wing, hallways: list[Box]) -> list[Box]:
+        """What lies beside and between the hallways along a wing."""
+        box = wing.box.turned if wing.turned else wing.box
+        edges = [box.top, *(edge for hallway in hallways for edge in (hallway.top, hallway.bottom)), box.bottom]
+        return [box.rows(top, bottom) for top, bottom in zip(edges[::2], edges[1::2], strict=True)]
+
+    def _between_crossings(self, strip: Box, turned: bool) -> list[Box]:
+        """The blocks of a strip, between the hallways that cross it."""
+        rooms = self.rooms.T if turned else self.rooms
+        if strip.height < MIN_SIDE + 2:
+            return []
+        crossed = (rooms[strip.cells] == HALLWAYS).any(axis=0)
+        edges = strip.left + np.flatnonzero(np.diff(np.concatenate([[1], crossed.astype(np.int8), [1]])))
+        found = [strip.columns(int(first), int(last)) for first, last in zip(edges[::2], edges[1::2], strict=True)]
+        return [block.turned if turned else block for block in found if block.width >= MIN_SIDE + 2]
 
     def _close_across(self, spine: Box, turned: bool) -> None:
         """Doors across a long hallway."""
@@ -174,10 +225,19 @@ class CampusBuilder(BlockBuilder):
 
     # What fills a wing
 
+    def draw_mix(self, depth: int) -> Mapping[Kind, float]:
+        """Departments of a building are those that its style says, however deep the row is."""
+        return _MIXES[int(self.rng.choice(len(_MIXES), p=self.style.departments))]
+
     def room_width(self, kind: Kind) -> tuple[int, int]:
         """As in ``blocks``, as many times as the building's grain says."""
         low, high = super().room_width(kind)
-        return max(round(low * self.style.grain), MIN_SIDE), max(round(high * self.style.grain), MIN_SIDE + 1)
+        grain = self.style.grain ** _GRAIN_OF[kind]
+        return max(round(low * grain), MIN_SIDE), max(round(high * grain), MIN_SIDE + 1)
+
+    def deepest_small(self) -> int:
+        """As in ``blocks``, and deeper where rooms are wider."""
+        return round(super().deepest_small() * min(self.style.grain, 1.6))
 
     def fill(self, block: Box, turned: bool) -> None:
         """Stretches along the block, each of which is rooms or one larger part."""

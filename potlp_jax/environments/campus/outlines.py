@@ -38,11 +38,13 @@ class Wing:
 
     Attributes:
         box: its cells, outer walls included.
-        turned: whether its hallway runs along the columns of ``box.turned``, which is to say from top to bottom.
+        turned: whether it runs from top to bottom, so that its hallway is along the columns of ``box.turned``.
+        deep: whether it has hallways around a core in place of one in its middle.
     """
 
     box: Box
     turned: bool = False
+    deep: bool = False
 
 
 @dataclass(frozen=True)
@@ -51,13 +53,17 @@ class Site:
 
     Attributes:
         height, width: of the rectangle that the building fills; the width is the longer.
-        depth: bounds of the wings' depth.
+        depth: bounds of the depth of wings with one hallway.
+        deep: bounds of the depth of those with a core.
+        deep_chance: how likely a wing is one of these, where there is space, and nothing has to be joined to it.
         rng: draws everything.
     """
 
     height: int
     width: int
     depth: tuple[int, int]
+    deep: tuple[int, int]
+    deep_chance: float
     rng: np.random.Generator
 
     def draw_depth(self, most: int) -> int:
@@ -65,41 +71,53 @@ class Site:
         low, high = self.depth
         return int(self.rng.integers(low, max(min(high, most), low) + 1))
 
-    def row(self, top: int, bottom: int, left: int = 0, right: int | None = None) -> Wing:
+    def draw_first_depth(self, most: int) -> tuple[int, bool]:
+        """Of a wing that need not be joined to others, and whether it is deep."""
+        if self.deep[0] <= most and self.rng.random() < self.deep_chance:
+            return int(self.rng.integers(self.deep[0], min(self.deep[1], most) + 1)), True
+        return self.draw_depth(most), False
+
+    def row(self, top: int, bottom: int, left: int = 0, right: int | None = None, *, deep: bool = False) -> Wing:
         """A wing along the rows."""
-        return Wing(Box(top, bottom, left, self.width if right is None else right))
+        return Wing(Box(top, bottom, left, self.width if right is None else right), deep=deep)
 
     def column(self, left: int, right: int, top: int, bottom: int | None = None) -> Wing:
         """A wing from top to bottom."""
         return Wing(Box(top, self.height if bottom is None else bottom, left, right), turned=True)
 
 
-_ACROSS: Mapping[Outline, tuple[int, int]] = MappingProxyType(
+LEAST_DEEP: int = 40
+"""Depth of a wing with two hallways, at least: 20 m."""
+
+_NEEDED: Mapping[Outline, tuple[tuple[int, int], tuple[int, int]]] = MappingProxyType(
     {
-        Outline.BAR: (1, 1),
-        Outline.BLOCK: (1, 1),
-        Outline.L: (1, 1),
-        Outline.T: (1, 1),
-        Outline.U: (1, 2),
-        Outline.COMB: (1, 3),
-        Outline.H: (2, 2),
-        Outline.RING: (2, 2),
-        Outline.STEPPED: (2, 2),
+        Outline.BAR: ((1, 0), (1, 0)),
+        Outline.BLOCK: ((1, 0), (1, 0)),
+        Outline.L: ((1, 1), (1, 1)),
+        Outline.T: ((1, 1), (1, 1)),
+        Outline.U: ((1, 1), (2, 1)),
+        Outline.COMB: ((1, 1), (3, 2)),
+        Outline.H: ((1, 2), (2, 1)),
+        Outline.RING: ((2, 1), (2, 1)),
+        Outline.STEPPED: ((2, 1), (3, 0)),
     }
 )
-"""Wings that one passes from the first row to the last, and from the first column to the last."""
+"""Wings and courts from the first row to the last, and from the first column to the last."""
 
 
 def least_height(outline: Outline, deepest: int) -> int:
-    """Rows that a building of this outline has at least, where no wing is deeper than this."""
-    court = 0 if outline in (Outline.BAR, Outline.BLOCK) else LEAST_COURT
-    return _ACROSS[outline][0] * deepest + court
+    """Rows that a building of this outline has at least, where no wing with one hallway is deeper than this."""
+    return max(_least(_NEEDED[outline][0], deepest), LEAST_DEEP if outline is Outline.BLOCK else 0)
 
 
 def least_width(outline: Outline, deepest: int) -> int:
     """Columns that a building of this outline has at least."""
-    court = 0 if outline in (Outline.BAR, Outline.BLOCK) else LEAST_COURT
-    return _ACROSS[outline][1] * (deepest + court)
+    return _least(_NEEDED[outline][1], deepest)
+
+
+def _least(needed: tuple[int, int], deepest: int) -> int:
+    wings, courts = needed
+    return wings * deepest + courts * LEAST_COURT
 
 
 def draw_wings(outline: Outline, site: Site) -> tuple[Wing, ...]:
@@ -117,6 +135,10 @@ def draw_wings(outline: Outline, site: Site) -> tuple[Wing, ...]:
 
 def _bar(site: Site) -> tuple[Wing, ...]:
     return (site.row(0, site.height),)
+
+
+def _block(site: Site) -> tuple[Wing, ...]:
+    return (site.row(0, site.height, deep=True),)
 
 
 def _l(site: Site) -> tuple[Wing, ...]:
@@ -139,8 +161,8 @@ def _comb(site: Site) -> tuple[Wing, ...]:
 
 def _with_legs(site: Site, places: list[float], *, regular: bool = False) -> tuple[Wing, ...]:
     """A wing along the site and others that stand on it, at these shares of its length; equally long if ``regular``."""
-    main = site.draw_depth(site.height - LEAST_COURT)
-    wings = [site.row(0, main)]
+    main, deep = site.draw_first_depth(site.height - LEAST_COURT)
+    wings = [site.row(0, main, deep=deep)]
     longest = int(site.rng.integers(len(places)))
     for number, place in enumerate(places):
         # No leg is wider than what there is for each: the courts between them stay.
@@ -164,7 +186,8 @@ def _h(site: Site) -> tuple[Wing, ...]:
 
 
 def _ring(site: Site) -> tuple[Wing, ...]:
-    above, below = (site.draw_depth((site.height - LEAST_COURT) // 2) for _ in range(2))
+    above, deep = site.draw_first_depth((site.height - LEAST_COURT) // 2)
+    below = site.draw_depth((site.height - LEAST_COURT) // 2)
     first, last = (site.draw_depth((site.width - LEAST_COURT) // 2) for _ in range(2))
     sides = [site.column(0, first, above - 1, site.height - below + 1)]
     sides.append(site.column(site.width - last, site.width, above - 1, site.height - below + 1))
@@ -174,7 +197,7 @@ def _ring(site: Site) -> tuple[Wing, ...]:
         wide = site.draw_depth(site.depth[1])
         left = first + int((inner - wide) * site.rng.uniform(0.3, 0.7))
         sides.append(site.column(left, left + wide, above - 1, site.height - below + 1))
-    return site.row(0, above), site.row(site.height - below, site.height), *sides
+    return site.row(0, above, deep=deep), site.row(site.height - below, site.height), *sides
 
 
 def _stepped(site: Site) -> tuple[Wing, ...]:
@@ -192,7 +215,7 @@ def _stepped(site: Site) -> tuple[Wing, ...]:
 _OUTLINES: Mapping[Outline, Callable[[Site], tuple[Wing, ...]]] = MappingProxyType(
     {
         Outline.BAR: _bar,
-        Outline.BLOCK: _bar,
+        Outline.BLOCK: _block,
         Outline.L: _l,
         Outline.T: _t,
         Outline.U: _u,
