@@ -59,6 +59,7 @@ class CampusStyle(BlockStyle):
         stairs, shaft: chance that a small room that is no office is one.
         closed: chance that a room cannot be entered.
         narrow_door: chance that a door is one cell wide.
+        wide_door: chance that a door of a large room is four cells wide.
         hallway_door: chance of a door across, for every 30 m of a wing's hallway.
 
     Of what ``BlockStyle`` says, hallways within blocks, lobbies and blocks that stay outdoors are rarer by default:
@@ -79,6 +80,7 @@ class CampusStyle(BlockStyle):
     shaft: float = 0.1
     closed: float = 0.06
     narrow_door: float = 0.3
+    wide_door: float = 0.4
     hallway_door: float = 0.3
 
 
@@ -318,7 +320,7 @@ class CampusBuilder(BlockBuilder):
     def door_width(self, number: int) -> int:
         """One cell, two, or four for large rooms."""
         box = self.boxes[number - 1]
-        if box.height * box.width >= _LARGE_ROOM and self.chance(0.4):
+        if box.height * box.width >= _LARGE_ROOM and self.chance(self.style.wide_door):
             return 4
         return 1 if self.chance(self.style.narrow_door) else 2
 
