@@ -20,6 +20,8 @@ from potlp_jax.environments.campus.outlines import Outline, Wing
 
 _SEGMENT = (30, 60)
 """Columns of a stretch along a hallway that is drawn as a whole, as departments are; 15 to 30 m."""
+_CORE = (22, 100)
+"""Least and largest side of a core that is one thing, a gym for instance: 11 to 50 m."""
 _LARGE_ROOM = 240
 """Cells of a room that may have wide doors: 60 square metres."""
 
@@ -40,6 +42,7 @@ class Part(enum.StrEnum):
 
     ATRIUM = "atrium"
     FURNISHED_HALL = "furnished hall"
+    COURTYARD = "courtyard"
     OPEN_PLAN = "open-plan office"
     LARGE_ROOM = "large room"
     STAIRS = "stairs"
@@ -56,6 +59,7 @@ class CampusStyle(BlockStyle):
         departments: chances that a row of rooms has offices, laboratories, classrooms, or mostly other rooms.
         grain: offices are so many times as wide as on the floors of ``delivery``, other rooms by less.
         atrium, open_plan, large_room: chance that a stretch along a hallway is one.
+        core: chance that a block with hallways on both sides is one thing: a large room, a courtyard or an atrium.
         stairs, shaft: chance that a small room that is no office is one.
         closed: chance that a room cannot be entered.
         narrow_door: chance that a door is one cell wide.
@@ -76,6 +80,7 @@ class CampusStyle(BlockStyle):
     atrium: float = 0.06
     open_plan: float = 0.06
     large_room: float = 0.14
+    core: float = 0.4
     stairs: float = 0.15
     shaft: float = 0.1
     closed: float = 0.06
@@ -237,6 +242,17 @@ class CampusBuilder(BlockBuilder):
         grain = self.style.grain ** _GRAIN_OF[kind]
         return max(round(low * grain), MIN_SIDE), max(round(high * grain), MIN_SIDE + 1)
 
+    def divide(self, block: Box) -> None:
+        """As in ``blocks``, but for cores that are one thing."""
+        low, high = _CORE
+        inner = any(all(self.contacts(block, turned)) for turned in (False, True))
+        sides = sorted((block.height, block.width))
+        if inner and low <= sides[0] and sides[1] <= high and self.chance(self.style.core):
+            choices = [Part.LARGE_ROOM, Part.COURTYARD, Part.ATRIUM]
+            self._add_part(choices[int(self.rng.choice(3, p=[0.5, 0.35, 0.15]))], block)
+        else:
+            super().divide(block)
+
     def deepest_small(self) -> int:
         """As in ``blocks``, and deeper where rooms are wider."""
         return round(super().deepest_small() * min(self.style.grain, 1.6))
@@ -282,6 +298,8 @@ class CampusBuilder(BlockBuilder):
     def _add_part(self, part: Part, block: Box) -> None:
         self.parts.add(part)
         inside = block.inside
+        if part is Part.COURTYARD:
+            return
         if part is Part.ATRIUM:
             self.open_lobby(block)
             how = Furniture.TABLES if self.chance(0.5) else Furniture.PILLARS
