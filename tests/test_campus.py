@@ -204,10 +204,11 @@ def test_a_robot_passes_a_door_of_one_cell():
     assert len(doors) > 5
     # Two beside each other count as one here.
     assert np.mean([len(door) == 1 for door in doors]) > 0.8
-    policies = (Policy.KNOWN_MAP, Policy.BASELINE)
-    trials = [run_trial(world, generator.task("1"), policy, jax.random.key(0)) for policy in policies]
-    assert [trial.outcome for trial in trials] == [Outcome.SATISFIED] * 2
-    assert trials[0].cost <= trials[1].cost + 1e-3
+    trial = run_trial(world, generator.task("1"), Policy.BASELINE, jax.random.key(0))
+    assert trial.outcome is Outcome.SATISFIED
+    assert {tuple(door[0].tolist()) for door in doors if len(door) == 1} & {
+        tuple(cell) for cell in np.array(trial.path)
+    }
 
 
 def test_furniture_leaves_a_way_around_each_piece_and_stands_before_no_door():

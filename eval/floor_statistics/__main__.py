@@ -95,7 +95,7 @@ def _quantiles(values: Sequence[float]) -> list[float]:
 def _shares(floors: Sequence[Floor]) -> dict[str, float]:
     """How many of the floors have each outline and each part."""
     campus = [floor for floor in floors if isinstance(floor, CampusFloor)]
-    counts = Counter(f"outline {floor.outline}" for floor in campus)
+    counts = Counter(f"outline: {floor.outline}" for floor in campus)
     counts.update(str(part) for floor in campus for part in floor.parts)
     return {name: counts[name] / len(campus) for name in sorted(counts)}
 
@@ -114,7 +114,7 @@ def draw(folder: Path, file: Path) -> None:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--floors", type=int, default=200, help="generated floors of each size")
+    parser.add_argument("--floors", type=int, default=100, help="generated floors of each size")
     parser.add_argument("--out", type=Path, default=RESULTS, help="the folder of results")
     parser.add_argument("--sheet", type=Path, help="write this picture and nothing else")
     arguments = parser.parse_args()

@@ -148,10 +148,10 @@ def dead_ends(hallway: Bool[np.ndarray, "H W"], side: float) -> int:
             for before, last in zip(edges[::2], edges[1::2], strict=True):
                 inside, walls = slice(before + 1, last + 1), [before, last + 1]
                 stretch = slice(row, row + deep)
-                ends += (
+                ends += int(
                     least <= last - before <= most
                     and not cells[row - 1, inside].any()
-                    and bool(cells[stretch, inside].all())
+                    and cells[stretch, inside].all()
                     and not cells[stretch, walls].any()
                 )
     return ends
