@@ -1,7 +1,7 @@
 """Generated academic floors for the delivery task of Bradley et al. 2021, section V-B.
 
 A floor is a rectangle that hallways divide and rooms fill (``environments.campus.blocks``); blocks that stay outdoors
-make wings, courtyards and notches. ``environments.campus.campus`` has floors of other outlines and sizes.
+leave wings, courtyards and notches. ``environments.campus.campus`` has floors of other outlines and sizes.
 
 All lengths are in cells of ``DeliveryConfig.resolution`` metres; costs are in metres. Worlds differ in ``extent`` and
 are padded to one shape.
