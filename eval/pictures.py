@@ -23,7 +23,7 @@ from PIL import Image
 import potlp_jax
 from eval import contact_sheet, delivery_sheet
 from potlp_jax.trials.record import Trial
-from potlp_jax.trials.replay import panoramas_of
+from potlp_jax.trials.replay import views_of
 from potlp_jax.view.maps import draw_side_by_side, draw_trial
 from potlp_jax.view.replay_page import replay_page
 from potlp_jax.view.style import save_figure
@@ -78,7 +78,7 @@ def photograph_replay(file: Path) -> list[Trial]:
     trial = picture_trial("potlp")
     later = trial.decisions[len(trial.decisions) // 3 :]
     decision = max(later, key=lambda decision: len(decision.actions))
-    page = replay_page(trial, panoramas_of(trial))
+    page = replay_page(trial, views_of(trial))
     # The page's slider moves as if a person had drawn it there.
     move = (
         'const slider = document.querySelector("input");'

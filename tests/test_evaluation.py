@@ -28,6 +28,7 @@ from potlp_jax.learning.metrics import (
     ablated,
     check_fit,
     class_in_words,
+    cost_bins,
     evaluate,
     figures_of,
     groups_of,
@@ -39,7 +40,13 @@ from potlp_jax.learning.metrics import (
 )
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.learning.serialization import save_estimator
-from potlp_jax.view.calibration import draw_costs, draw_predictions, draw_reliability, probability_table
+from potlp_jax.view.calibration import (
+    cost_bin_table,
+    draw_costs,
+    draw_predictions,
+    draw_reliability,
+    probability_table,
+)
 from potlp_jax.view.style import CHOSEN, rgb
 from potlp_jax.world.camera import CameraConfig
 
@@ -149,6 +156,52 @@ def test_figures_equal_the_formulas_written_out(count, seed, soft, prior):
         assert errors.bias == pytest.approx(sum(w * (a - b) for a, b, w in kept) / total, abs=1e-9)
         if len(kept) > 1:
             assert errors.r2 == pytest.approx(1 - squared / spread, rel=1e-5)
+        assert sum(entry.samples for entry in errors.bins) == len(kept)
+        gap = 0.0
+        for entry in errors.bins:
+            inside = [(a, b, w) for a, b, w in kept if entry.low <= a <= entry.high]
+            assert len(inside) == entry.samples
+            weight = sum(w for _, _, w in inside)
+            assert entry.predicted == pytest.approx(sum(w * a for a, _, w in inside) / weight)
+            assert entry.true == pytest.approx(sum(w * b for _, b, w in inside) / weight)
+            variance = sum(w * (b - entry.true) ** 2 for _, b, w in inside) / weight
+            assert entry.spread == pytest.approx(math.sqrt(variance), abs=1e-6)
+            gap += weight * abs(entry.predicted - entry.true)
+        assert errors.calibration_error == pytest.approx(gap / total, abs=1e-9)
+
+
+def test_bins_of_costs_have_equally_many_samples_and_equal_predictions_share_one():
+    true, weight = np.arange(1000.0), np.ones(1000)
+    bins, weights = cost_bins(true, true + 5, weight)
+    assert [entry.samples for entry in bins] == [100] * BINS
+    np.testing.assert_array_equal(weights, 100.0)
+    assert [entry.predicted - entry.true for entry in bins] == pytest.approx([5.0] * BINS)
+    constant, _ = cost_bins(true, np.full(1000, 7.0), weight)
+    assert [(entry.low, entry.high, entry.samples) for entry in constant] == [(7.0, 7.0, 1000)]
+    # Half of the predictions are one number: it fills its bins alone.
+    ties, _ = cost_bins(true, np.maximum(true, 500.0), weight)
+    assert ties[0].samples == 501
+    assert all(abs(entry.samples - 100) <= 1 for entry in ties[1:])
+
+
+def test_what_is_too_low_far_away_shows_as_a_bias_of_that_distance():
+    samples, predictions = make_samples(2, 400, 31), make_predictions(400, 31)
+    far = samples.distance >= 120
+    said = np.where(far, samples.failure_cost - 8, samples.failure_cost).astype(np.float32)
+    predictions = dataclasses.replace(predictions, failure_cost=said)
+    report = evaluate(samples, predictions, prior_of({}, samples))
+    bias = {band: figures.failure_cost.bias for band, figures in report.groups["distance"].items()}
+    assert bias.pop("over 120") == pytest.approx(-8, abs=1e-4)
+    assert max(map(abs, bias.values())) < 1e-4
+    table = cost_bin_table(report, "t")
+    assert table.row_count == len(report.overall.success_cost.bins) + len(report.overall.failure_cost.bins)
+    axes = draw_costs(samples, predictions, report, "t").axes[-1]
+    widths = {
+        label.get_text().split(" (")[0]: float(np.sum(bar.get_extents().width))
+        for label, bar in zip(axes.get_yticklabels(), axes.patches, strict=True)
+    }
+    assert widths["distance over 120"] > 0
+    assert widths["distance 0 to 15"] < 0.01 * widths["distance over 120"]
 
 
 def test_figures_equal_those_of_scikit_learn():
@@ -373,7 +426,7 @@ def test_pictures_of_data_without_one_kind_are_drawn():
     samples = dataclasses.replace(samples, success=np.ones(30, np.float32))
     report = evaluate(samples, predictions, prior_of({}, samples))
     figures = (
-        draw_costs(samples, predictions, report.overall, "t"),
+        draw_costs(samples, predictions, report, "t"),
         draw_reliability({INTACT: report}, "t"),
         draw_predictions(samples, predictions, most_confident(samples, predictions, 2), "t"),
     )

@@ -33,7 +33,7 @@ from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import NEVER_SEEN, Outcome, belief_seen_by, load_trial
-from potlp_jax.trials.replay import panorama_at
+from potlp_jax.trials.replay import Views, panorama_at
 from potlp_jax.trials.robot import Robot
 from potlp_jax.trials.rules import Stop
 from potlp_jax.world.camera import CameraConfig
@@ -90,14 +90,14 @@ def test_decisions_along_a_bag_are_those_of_the_simulator(trial, tmp_path, kind)
     bag = tmp_path / name_of(kind)
     writing.write_trial(trial, bag, kind, tmp_path / "labels.yaml", height=64)
     drive = drive_of(bag, places_of(tmp_path))
-    found, panoramas = replay(drive, TASK, Policy.BASELINE, jax.random.key(0), NEAR)
+    found, views = replay(drive, TASK, Policy.BASELINE, jax.random.key(0), NEAR)
     assert trial.outcome is found.outcome is Outcome.SATISFIED
     assert (found.path, found.word, found.states) == (trial.path, trial.word, trial.states)
     assert found.cost == pytest.approx(trial.cost)
     assert found.decisions == trial.decisions
     assert len(found.decisions) > 4
     np.testing.assert_array_equal(found.first_seen, trial.first_seen)
-    assert panoramas == {}
+    assert views == Views()
 
 
 @pytest.mark.parametrize("kind", FORMATS)

@@ -21,7 +21,7 @@ from potlp_jax.trials.batch import Start, run_batch
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import Outcome, load_trial
-from potlp_jax.trials.replay import replay_decision
+from potlp_jax.trials.replay import Views, replay_decision
 from potlp_jax.verify.audit import problems_of
 from potlp_jax.view.replay_page import replay_page
 from potlp_jax.world.frontiers import FrontierConfig
@@ -109,7 +109,7 @@ def test_its_record_is_read_searched_again_and_shown(tmp_path):
     assert read.decisions == trial.decisions
     _, plan, _ = replay_decision(read, 0)
     assert float(plan.value) == pytest.approx(trial.decisions[0].value)
-    assert "finish" in replay_page(read, {})
+    assert "finish" in replay_page(read, Views())
     shown = CliRunner().invoke(app, ["explain", f"{tmp_path}:0", "--json"])
     assert shown.exit_code == 0, shown.output
     (action,) = json.loads(shown.stdout)["actions"]

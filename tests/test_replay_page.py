@@ -17,6 +17,7 @@ from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
+from potlp_jax.trials.replay import Views
 from potlp_jax.view.replay_page import replay_data, replay_page
 from potlp_jax.world.sensing import SensorConfig
 from tests.reference.browser import BROWSER, dump_page
@@ -35,14 +36,14 @@ def trial():
 
 
 @pytest.fixture(scope="module")
-def panoramas():
+def views():
     image = np.full((16, 64, 3), 200, np.uint8)
     image[:, :8] = (0, 0, 255)
-    return {0: image}
+    return Views(panoramas={0: image})
 
 
-def test_the_data_hold_the_whole_trial(trial, panoramas):
-    data = json.loads(json.dumps(replay_data(trial, panoramas)))
+def test_the_data_hold_the_whole_trial(trial, views):
+    data = json.loads(json.dumps(replay_data(trial, views)))
     seen = np.frombuffer(base64.b64decode(data["first_seen"]), "<i4").reshape(trial.first_seen.shape)
     np.testing.assert_array_equal(seen, trial.first_seen)
     occupied = np.frombuffer(base64.b64decode(data["occupied"]), np.uint8).reshape(seen.shape)
@@ -57,16 +58,16 @@ def test_the_data_hold_the_whole_trial(trial, panoramas):
     assert len(data["state_names"]) == len(data["state_colours"]) > max(trial.states)
 
 
-def test_no_text_ends_the_script(trial, panoramas):
+def test_no_text_ends_the_script(trial, views):
     hostile = dataclasses.replace(trial, environment="</script><script>alert(1)</script>", task_text="a < b & </h1>")
-    page = replay_page(hostile, panoramas)
+    page = replay_page(hostile, views)
     assert page.count("<script") == page.count("</script>") == 2
     assert "alert(1)</script>" not in page
     assert "a &lt; b &amp; &lt;/h1&gt;" in page
 
 
-def test_the_page_needs_nothing_from_elsewhere(trial, panoramas):
-    page = replay_page(trial, panoramas)
+def test_the_page_needs_nothing_from_elsewhere(trial, views):
+    page = replay_page(trial, views)
     assert not re.findall(r"""(?:src|href)\s*=\s*["'](?!data:)""", page)
     assert "http" not in page
 
@@ -78,7 +79,7 @@ def test_view_writes_the_page_beside_the_record(trial, tmp_path):
     blind.save(tmp_path / "trial.json")
     told = CliRunner().invoke(app, ["view", str(tmp_path), "--no-open"])
     assert told.exit_code == 0, told.stderr
-    assert (tmp_path / "replay.html").read_text("utf-8") == replay_page(blind, {})
+    assert (tmp_path / "replay.html").read_text("utf-8") == replay_page(blind, Views())
     told = CliRunner().invoke(app, ["view", str(tmp_path), "--no-open", "--out", str(tmp_path / "page.png")])
     assert told.exit_code == 2
     assert ".html" in told.stderr
@@ -110,9 +111,9 @@ addEventListener("load", () => setTimeout(() => {
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed to look at the page with")
-def test_a_browser_shows_the_trial_and_keys_move_through_it(trial, panoramas, tmp_path):
+def test_a_browser_shows_the_trial_and_keys_move_through_it(trial, views, tmp_path):
     page = tmp_path / "page.html"
-    page.write_text(replay_page(trial, panoramas).replace("</body>", TOUR), "utf-8")
+    page.write_text(replay_page(trial, views).replace("</body>", TOUR), "utf-8")
     result = dump_page(page, tmp_path / "profile")
     last, decisions = len(trial.path) - 1, [decision.step for decision in trial.decisions]
     steps = [int(re.match(r"step (\d+) of", text)[1]) for text in result["shown"]]

@@ -162,12 +162,13 @@ def _heading(path: Path, samples: "Samples", prior: "Prior") -> str:
 
 
 def _print_reports(out: Console, heading: str, reports: "Mapping[str, Report]", variants: Sequence[str]) -> None:
-    from potlp_jax.view.calibration import VARIANTS, ablation_table, cost_table, probability_table
+    from potlp_jax.view.calibration import VARIANTS, ablation_table, cost_bin_table, cost_table, probability_table
 
     out.print(heading, style="bold")
     for name in variants:
         out.print(probability_table(reports[name], VARIANTS[name]))
         out.print(cost_table(reports[name], VARIANTS[name]))
+        out.print(cost_bin_table(reports[name], VARIANTS[name]))
     if len(reports) > 1:
         out.print(ablation_table(reports))
 
@@ -184,7 +185,7 @@ def _write(
     # The confident ones, right and wrong, show most of what the network has learned.
     chosen = most_confident(samples, predictions, SHOWN)
     save_figure(draw_reliability(reports, heading), folder / "reliability.png")
-    save_figure(draw_costs(samples, predictions, reports[INTACT].overall, heading), folder / "costs.png")
+    save_figure(draw_costs(samples, predictions, reports[INTACT], heading), folder / "costs.png")
     save_figure(draw_predictions(samples, predictions, chosen, heading), folder / "predictions.png")
 
 

@@ -89,13 +89,15 @@ def _read_decision(name: str) -> "tuple[Trial, Decision]":
 
 
 def _draw(trial: "Trial", decision: "Decision", out: Path, *, depth: int, estimator: str | None) -> list[Path]:
-    """Pictures of the tree and, where the policy looks, of the panoramas; returns their files."""
+    """Pictures of the tree and of what the policy saw, painted and imagined, if it did; returns their files."""
     import numpy as np
 
     from potlp_jax.cli.inputs import read_estimator
+    from potlp_jax.learning.overlays import overlays_of
     from potlp_jax.planning.search.inspect import tree_top
-    from potlp_jax.trials.replay import panorama_at, replay_decision
+    from potlp_jax.trials.replay import estimator_at, panorama_at, replay_decision
     from potlp_jax.view.decisions import describe_decision, task_of, why_no_actions
+    from potlp_jax.view.overlays import draw_overlays
     from potlp_jax.view.panoramas import draw_panoramas
     from potlp_jax.view.style import save_figure
     from potlp_jax.view.trees import draw_tree
@@ -104,16 +106,22 @@ def _draw(trial: "Trial", decision: "Decision", out: Path, *, depth: int, estima
         fail(f"decision {decision.index}: {why_no_actions(trial, decision)}; there is no tree to draw")
     # A record keeps the actions of a decision but not the tree. Searching again, with its key where the search samples,
     # grows the same tree.
-    problem, plan, tree = replay_decision(trial, decision.index, read_estimator(estimator))
+    given = read_estimator(estimator)
+    problem, plan, tree = replay_decision(trial, decision.index, given)
     # Where commitment overrode the search, the record holds what the search itself preferred apart.
     if int(plan.action) != (decision.choice if decision.preferred is None else decision.preferred):
         logger.warning("searching again chose another action than recorded: the versions of the software may differ")
     top = tree_top(problem, tree, depth=depth, width=BREADTH)
     save_figure(draw_tree(top, task_of(trial), describe_decision(trial, decision), breadth=BREADTH), out)
-    if not decision.observations:
-        return [out]
-    seen = {look: np.asarray(panorama_at(trial, trial.decisions[look])) for look in decision.observations}
-    # Panoramas are photographs, for which PNG serves whatever format the tree is wanted in.
-    beside = out.with_name(f"{out.stem}-panoramas.png")
-    save_figure(draw_panoramas(trial, decision, seen), beside)
-    return [out, beside]
+    # Photographs and rasters, for which PNG serves whatever format the tree is wanted in.
+    beside = {}
+    if decision.observations:
+        seen = {look: np.asarray(panorama_at(trial, trial.decisions[look])) for look in decision.observations}
+        beside["panoramas"] = draw_panoramas(trial, decision, seen)
+    overlays = overlays_of(estimator_at(trial, decision.index, given), trial.belief_at(decision.step))
+    if overlays:
+        beside["map"] = draw_overlays(trial, decision, overlays)
+    files = {out.with_name(f"{out.stem}-{name}.png"): figure for name, figure in beside.items()}
+    for file, figure in files.items():
+        save_figure(figure, file)
+    return [out, *files]

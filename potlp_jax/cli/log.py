@@ -254,11 +254,11 @@ def replay_log(
     with progress_bar() as progress:
         progress.add_task("deciding along the drive (the first decision compiles)", total=None)
         # Only the search `uct` draws from the key, and it is fixed so that a log gives the same decisions every time.
-        trial, panoramas = replay(drive, asked, chosen, jax.random.key(0), trial_settings, trained)
+        trial, views = replay(drive, asked, chosen, jax.random.key(0), trial_settings, trained)
     files = [folder / RECORD, folder / "trial.png", folder / PAGE]
     trial.save(files[0])
     save_figure(draw_trial(trial), files[1])
-    files[2].write_text(replay_page(trial, panoramas), "utf-8")
+    files[2].write_text(replay_page(trial, views), "utf-8")
     if json:
         print_json({**trial.summary(), "files": [str(file) for file in files]})
     else:

@@ -102,7 +102,7 @@ def _notable(pairs: "Sequence[Pair]", policy: str, count: int) -> "Iterator[tupl
 
 
 def _shown(sweep: "Sweep", reason: str, row: "Row", baseline: "Row") -> "Shown":
-    from potlp_jax.trials.replay import panoramas_of
+    from potlp_jax.trials.replay import views_of
     from potlp_jax.view.replay_page import replay_data
     from potlp_jax.view.report_page import Shown
 
@@ -113,7 +113,7 @@ def _shown(sweep: "Sweep", reason: str, row: "Row", baseline: "Row") -> "Shown":
         world=row.item.world,
         cost=row.cost,
         baseline=baseline.cost,
-        data=replay_data(trial, panoramas_of(trial)),
+        data=replay_data(trial, views_of(trial, sweep.asked(row.item.environment, row.item.policy))),
     )
 
 
@@ -123,6 +123,8 @@ def _facts(facts: dict[str, Any], rows: "Sequence[Row]") -> list[tuple[str, str]
     # A store that several versions have written names them all: figures are then not of one.
     def all_of(values: Sequence[str]) -> str:
         return "; ".join(sorted({value for value in values if value})) or "-"
+
+    from potlp_jax.sweep.specification import own_settings
 
     specification = facts["specification"]
     versions = [", ".join(f"{name} {number}" for name, number in sorted(row.versions.items())) for row in rows]
@@ -136,6 +138,7 @@ def _facts(facts: dict[str, Any], rows: "Sequence[Row]") -> list[tuple[str, str]
         ("trials", f"{len(rows)}, {sum(row.seconds for row in rows) / 3600:.2f} hours of one core"),
         ("estimator", facts["estimator"] or "-"),
         ("settings", all_of([row.configuration for row in rows])),
+        *((f"settings of {policy}", told) for policy, told in own_settings(specification).items()),
         ("seed", str(specification["seed"])),
         ("versions", all_of(versions)),
         ("commit", all_of([row.commit for row in rows])),

@@ -13,6 +13,7 @@ import dataclasses
 import enum
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -132,6 +133,36 @@ class FirefightingLayout:
         return self.fire_hallway == self.dead_end
 
 
+class Shares(NamedTuple):
+    """What a building is drawn from: independent numbers, uniform in [0, 1), one for each choice (``layout_of``)."""
+
+    side: float
+    mouth: float
+    dead_end: float
+    fire_hallway: float
+    fire: float
+    start: float
+    extinguisher: float
+    exit: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Building:
+    """A layout on the grid.
+
+    Attributes:
+        occupied: True on walls.
+        letters: bit ``i`` is proposition ``i`` of ``Firefighting``.
+        green: True where the floor has the dead end's tiles.
+        smoke: density of the smoke per cell.
+    """
+
+    occupied: Bool[np.ndarray, "H W"]
+    letters: Int32[np.ndarray, "H W"]
+    green: Bool[np.ndarray, "H W"]
+    smoke: Float32[np.ndarray, "H W"]
+
+
 class Firefighting(Generator):
     """Generator of fire-fighting buildings (Bradley et al. 2021, section V-A)."""
 
@@ -165,12 +196,12 @@ class Firefighting(Generator):
     def generate_with_layout(self, key: PRNGKeyArray) -> tuple[World, FirefightingLayout]:
         """The world of this key, and where things are in it."""
         layout_rng, look_rng = host_generators(key, 2)
-        layout = _draw_layout(self.config, layout_rng)
-        occupied = _walls(self.config, layout)
-        letters = _letters(self.config, layout, self.propositions)
-        look = _appearance(self.config, layout, occupied, look_rng)
+        # One number a choice, always in this order: a changed configuration moves nothing that it does not concern.
+        layout = layout_of(self.config, Shares(*layout_rng.random(len(Shares._fields)).tolist()))
+        built = building_of(self.config, layout)
+        look = _appearance(self.config, built, look_rng)
         return self.signed(
-            make_world(occupied, letters, layout.start, appearance=look, propositions=self.propositions)
+            make_world(built.occupied, built.letters, layout.start, appearance=look, propositions=self.propositions)
         ), layout
 
 
@@ -193,17 +224,25 @@ def room_columns(config: FirefightingConfig, room: Room) -> tuple[int, int]:
     return first, first + config.room_width
 
 
-def _draw_layout(config: FirefightingConfig, rng: np.random.Generator) -> FirefightingLayout:
-    # One number a choice, always in this order: a changed configuration moves nothing that it does not concern.
-    side, mouth_chance, dead_end_chance, fire_chance, fire_share, *cell_chances = rng.random(8)
-    robot_room = Room.LEFT if side < 0.5 else Room.RIGHT
-    mouth = robot_room if mouth_chance < config.dead_end_opens_into_robot_room else robot_room.other
+def layout_of(config: FirefightingConfig, shares: Shares) -> FirefightingLayout:
+    """The layout that some shares choose: with independent uniform shares, the family's distribution of layouts.
+
+    Args:
+        config: sizes.
+        shares: ``side``, ``mouth``, ``dead_end`` and ``fire_hallway`` choose between few; ``fire`` is how far along its
+            range the fire begins; the last three choose cells.
+
+    Returns:
+        The layout.
+    """
+    robot_room = Room.LEFT if shares.side < 0.5 else Room.RIGHT
+    mouth = robot_room if shares.mouth < config.dead_end_opens_into_robot_room else robot_room.other
     # Uniform numbers in [0, 1) times the number of hallways, rounded down.
-    dead_end, fire_hallway = int(dead_end_chance * HALLWAYS), int(fire_chance * HALLWAYS)
+    dead_end, fire_hallway = int(shares.dead_end * HALLWAYS), int(shares.fire_hallway * HALLWAYS)
     # A patch reaches beyond its middle, so its middle keeps a distance from the walls; the start is a single cell.
-    start = _cell_at(_room_cells(config, robot_room, 0), cell_chances[0])
-    far_cells = _room_cells(config, robot_room.other, config.patch_radius)
-    extinguisher = _cell_at(far_cells, cell_chances[1])
+    start = _cell_at(room_cells(config, robot_room, 0), shares.start)
+    far_cells = room_cells(config, robot_room.other, config.patch_radius)
+    extinguisher = _cell_at(far_cells, shares.extinguisher)
     # The patches of extinguisher and exit share no cell.
     apart = np.abs(far_cells - np.array(extinguisher)).max(axis=1) > 2 * config.patch_radius
     length = config.dead_end_length
@@ -211,13 +250,13 @@ def _draw_layout(config: FirefightingConfig, rng: np.random.Generator) -> Firefi
     # In the dead end the fire lies between the mouth and the alarm, elsewhere anywhere in the hallway.
     space = length - config.alarm_depth if fire_hallway == dead_end else config.hallway_length
     low, high = config.fire_range
-    fire = round((low + (high - low) * fire_share) * (space - config.fire_thickness))
+    fire = round((low + (high - low) * shares.fire) * (space - config.fire_thickness))
     fire_from = mouth if fire_hallway == dead_end else Room.LEFT
     return FirefightingLayout(
         robot_room=robot_room,
         start=start,
         extinguisher=extinguisher,
-        exit=_cell_at(far_cells[apart], cell_chances[2]),
+        exit=_cell_at(far_cells[apart], shares.exit),
         dead_end=dead_end,
         dead_end_mouth=mouth,
         dead_end_columns=_columns_from(config, mouth, 0, length),
@@ -228,7 +267,16 @@ def _draw_layout(config: FirefightingConfig, rng: np.random.Generator) -> Firefi
     )
 
 
-def _room_cells(config: FirefightingConfig, room: Room, margin: int) -> Int32[np.ndarray, "cells 2"]:
+def building_of(config: FirefightingConfig, layout: FirefightingLayout) -> Building:
+    """Walls, letters, tiles and smoke of a layout."""
+    occupied = _walls(config, layout)
+    green = np.zeros(config.shape, bool)
+    green[slice(*hallway_rows(config, layout.dead_end)), slice(*layout.dead_end_columns)] = True
+    letters = _letters(config, layout, Firefighting.propositions)
+    return Building(occupied=occupied, letters=letters, green=green, smoke=_smoke(config, layout, occupied))
+
+
+def room_cells(config: FirefightingConfig, room: Room, margin: int) -> Int32[np.ndarray, "cells 2"]:
     """The cells of a room that are at least ``margin`` cells away from its sides."""
     first, last = room_columns(config, room)
     rows = np.arange(1 + margin, 1 + config.room_height - margin)
@@ -277,31 +325,24 @@ def _letters(
     return letters
 
 
-def _appearance(
-    config: FirefightingConfig,
-    layout: FirefightingLayout,
-    occupied: Bool[np.ndarray, "H W"],
-    rng: np.random.Generator,
-) -> Appearance:
+def _appearance(config: FirefightingConfig, built: Building, rng: np.random.Generator) -> Appearance:
     rows, columns = np.indices(config.shape)
     first, last = hallway_columns(config)
     in_hallways = (columns >= first) & (columns < last)
     # The outermost wall cells between hallways face the rooms.
     room_side = (columns <= first) | (columns >= last - 1)
-    green = np.zeros(config.shape, bool)
-    green[slice(*hallway_rows(config, layout.dead_end)), slice(*layout.dead_end_columns)] = True
     even = (rows // config.tile_size + columns // config.tile_size) % 2 == 0
     # Every world has its own shade of each colour: a network must not learn one by heart.
     tints = rng.integers(-config.tint, config.tint + 1, size=(6, 3))
     palette = np.array([_ROOM_FLOOR, _HALLWAY_FLOOR, *_GREEN_TILES, _ROOM_WALL, _HALLWAY_WALL]) + tints
     # Indices into the palette.
-    floor = np.where(green, np.where(even, 2, 3), np.where(in_hallways, 1, 0))
+    floor = np.where(built.green, np.where(even, 2, 3), np.where(in_hallways, 1, 0))
     wall = np.where(room_side, 4, 5)
     noise = rng.integers(-config.tint_noise, config.tint_noise + 1, size=(2, *config.shape, 1))
     return Appearance(
         floor_colour=jnp.asarray(_colours(palette[floor] + noise[0])),
         wall_colour=jnp.asarray(_colours(palette[wall] + noise[1])),
-        smoke=jnp.asarray(_smoke(config, layout, occupied)),
+        smoke=jnp.asarray(built.smoke),
         light=jnp.asarray(np.ones(config.shape, np.float32)),
     )
 

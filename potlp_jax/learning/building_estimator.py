@@ -7,8 +7,16 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float32, Int32, UInt8
 
-from potlp_jax.learning.building_network import BuildingConfig, BuildingNetwork, EncodedMap, Params, map_channels
+from potlp_jax.learning.building_network import (
+    SQUARE,
+    BuildingConfig,
+    BuildingNetwork,
+    EncodedMap,
+    Params,
+    map_channels,
+)
 from potlp_jax.learning.exclusion import exclusive_chances
+from potlp_jax.learning.overlays import Overlay, imagined_overlay, painting_overlays
 from potlp_jax.learning.painting import Painting, paint
 from potlp_jax.learning.serialization import require_propositions
 from potlp_jax.planning.estimates import Estimates
@@ -38,6 +46,12 @@ class BuildingEstimator:
     def imagine(self, belief: BeliefMap) -> EncodedMap:
         """The network's first stage: what it makes of the map, also of squares that were not observed."""
         return BuildingNetwork(self.config).encode(self.params, map_channels(belief, self.memory))
+
+    def overlays(self, belief: BeliefMap) -> tuple[Overlay, ...]:
+        """The painting, and what the network makes of squares that were not observed."""
+        chances = jax.nn.sigmoid(self.imagine(belief).squares)
+        imagined = imagined_overlay(chances[..., 0], chances[..., 1:], belief, SQUARE)
+        return (*painting_overlays(self.memory), imagined)
 
     def __call__(self, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays) -> Estimates:
         """Estimates of every real (subgoal, class); padded pairs have P_S = 0.

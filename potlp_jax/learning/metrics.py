@@ -9,7 +9,9 @@
 - ROC-AUC: probability that a random success is given a larger p than a random failure, ties counting half.
 - Calibration error: mean of |mean p - mean y| over ``BINS`` bins of p of equal width, weighted by their samples.
 - Errors of R_S over successes (weight y) and of R_F over failures (weight 1 - y): MAE, RMSE, bias = mean of predicted
-  - true, and R^2 = 1 - squared error / squared error of the constant mean of these very samples.
+  - true, R^2 = 1 - squared error / squared error of the constant mean of these very samples, and the calibration error:
+  mean of |mean predicted - mean true| over ``BINS`` bins of the predicted cost with equally many samples each, as far
+  as ties allow, weighted by their weight.
 
 **Ablations.** A network that does not look answers as well with its pictures blacked out; one that does not heed the
 question answers as well with the vectors phi of other samples. Groups and labels stay those of the intact samples.
@@ -84,14 +86,35 @@ class Prior:
 
 
 @dataclass(frozen=True)
+class CostBin:
+    """Costs with low <= predicted <= high; equal predictions share a bin.
+
+    Attributes:
+        low, high: the least and the largest prediction.
+        samples: how many there are.
+        predicted, true: weighted means.
+        spread: weighted standard deviation of the true costs.
+    """
+
+    low: float
+    high: float
+    samples: int
+    predicted: float
+    true: float
+    spread: float
+
+
+@dataclass(frozen=True)
 class CostErrors:
-    """Errors of R_S or R_F over the samples where it is defined; NaN where there are none."""
+    """Errors of R_S or R_F over the samples where it is defined; NaN, and no bins, where there are none."""
 
     samples: int
     mae: float
     rmse: float
     bias: float
     r2: float
+    calibration_error: float
+    bins: tuple[CostBin, ...]
 
 
 @dataclass(frozen=True)
@@ -360,9 +383,10 @@ def cost_errors(
     """
     known = (share > 0) & np.isfinite(true)
     if not known.any():
-        return CostErrors(0, *[float("nan")] * 4)
-    weight, target = share[known], true[known].astype(np.float64)
-    error = said[known].astype(np.float64) - target
+        return CostErrors(0, *[float("nan")] * 5, bins=())
+    weight, target, answer = share[known], true[known].astype(np.float64), said[known].astype(np.float64)
+    error = answer - target
+    bins, weights = cost_bins(target, answer, weight)
     squared = float(np.average(error**2, weights=weight))
     variance = float(np.average((target - np.average(target, weights=weight)) ** 2, weights=weight))
     return CostErrors(
@@ -371,7 +395,43 @@ def cost_errors(
         rmse=squared**0.5,
         bias=float(np.average(error, weights=weight)),
         r2=_gain(squared, variance),
+        calibration_error=float(np.average([abs(bin.predicted - bin.true) for bin in bins], weights=weights)),
+        bins=bins,
     )
+
+
+def cost_bins(
+    true: Float64[np.ndarray, "N"], said: Float64[np.ndarray, "N"], weight: Float64[np.ndarray, "N"]
+) -> tuple[tuple[CostBin, ...], Float64[np.ndarray, " bins"]]:
+    """Up to ``BINS`` bins of the predicted cost with equally many samples each, as far as ties allow.
+
+    Args:
+        true, said: at least one of each.
+        weight: of each sample, positive.
+
+    Returns:
+        The bins by increasing cost, and the weight in each.
+    """
+    # Costs have long tails: of bins of equal width the last ones would be empty.
+    bounds = np.quantile(said, np.arange(1, BINS) / BINS, method="lower")
+    index = np.searchsorted(np.unique(bounds), said, side="left")
+    bins, weights = [], []
+    for number in np.unique(index):
+        inside = index == number
+        mean = np.average(true[inside], weights=weight[inside])
+        variance = np.average((true[inside] - mean) ** 2, weights=weight[inside])
+        bins.append(
+            CostBin(
+                low=float(said[inside].min()),
+                high=float(said[inside].max()),
+                samples=int(inside.sum()),
+                predicted=float(np.average(said[inside], weights=weight[inside])),
+                true=float(mean),
+                spread=float(variance**0.5),
+            )
+        )
+        weights.append(weight[inside].sum())
+    return tuple(bins), np.array(weights)
 
 
 def most_confident(samples: Samples, predictions: Predictions, count: int) -> dict[str, Int64[np.ndarray, " k"]]:

@@ -20,7 +20,8 @@ from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import make_trial, run_robot
-from potlp_jax.trials.record import LOG_PREFIX, NEVER_SEEN, Trial
+from potlp_jax.trials.record import LOG_PREFIX, NEVER_SEEN, Decision, Trial
+from potlp_jax.trials.replay import Views, recall_views
 from potlp_jax.trials.robot import Leg
 from potlp_jax.trials.rules import Knowledge, Stop, estimator_of
 from potlp_jax.world.camera import CameraConfig
@@ -102,7 +103,7 @@ def replay(
     key: PRNGKeyArray,
     config: TrialConfig | None = None,
     estimator: TrainedEstimator | Estimator | None = None,
-) -> tuple[Trial, dict[int, UInt8[np.ndarray, "rows columns 3"]]]:
+) -> tuple[Trial, Views]:
     """The decisions of a policy along a drive, as the record of a trial, up to where the task was decided.
 
     The policy decides; the robot goes where it was driven. No budget ends the trial, and its path is the one that was
@@ -117,7 +118,7 @@ def replay(
         estimator: what the policy asks. No shipped estimator was made for logs: ``potlp`` asks none but the one given.
 
     Returns:
-        The trial, and the panoramas that its decisions used, by number of the decision.
+        The trial, and what the robot saw and made of it at its decisions.
 
     Raises:
         LogError: the policy needs panoramas and the log has none, or it needs no log.
@@ -154,16 +155,20 @@ def replay(
     trial = make_trial(
         run, task, policy, config, asked, drive.world, first_seen, environment=environment, world_number=None
     )
-    return trial, _panoramas(drive, trial, config.camera)
+    return trial, _views(drive, trial, config, asked)
 
 
-def _panoramas(drive: Drive, trial: Trial, camera: CameraConfig) -> dict[int, UInt8[np.ndarray, "rows columns 3"]]:
-    """Those that decisions used."""
-    reader = PanoramaReader(drive, camera)
-    # In the order in which they were taken, for reading backward starts the log again.
-    numbers = sorted({number for decision in trial.decisions for number in decision.observations})
-    seen = {number: reader.panorama(trial.decisions[number].step) for number in numbers}
-    return {number: image for number, image in seen.items() if image is not None}
+def _views(drive: Drive, trial: Trial, config: TrialConfig, asked: TrainedEstimator | Estimator | None) -> Views:
+    # A reader of its own: asked for the decisions in their order, it does not start the log again for each.
+    reader = PanoramaReader(drive, config.camera)
+
+    def panorama_of(decision: Decision) -> UInt8[np.ndarray, "rows columns 3"]:
+        seen = reader.panorama(decision.step)
+        # The robot decided only where there is one (``LoggedRobot.advance``).
+        assert seen is not None
+        return seen
+
+    return recall_views(trial, asked, config, panorama_of)
 
 
 def from_first_picture(drive: Drive, camera: CameraConfig) -> Drive:

@@ -191,8 +191,8 @@ class Sweep:
 
     def rows(self, items: Iterable[Item], environment: str, policy: str) -> Iterator[Row]:
         """The rows of trials of one environment and policy, as they end."""
-        config = self.specification.config
-        asked = self._asked(environment, policy)
+        config = self.specification.config_of(policy)
+        asked = self.asked(environment, policy)
         for item, trial in self._trials(items, environment, policy):
             world = self._world(environment, item.world)
             # Made again, or from the cache: a batch returns arrays of its own and not the world.
@@ -203,8 +203,8 @@ class Sweep:
             world = self._world(environment, item.world)
             return Start(world, self._tasks[environment, item.task][1], self._key(item.world), name=item)
 
-        asked = self._asked(environment, policy)
-        for trial in run_batch(map(start, items), policy, self.specification.config, estimator=asked):
+        asked = self.asked(environment, policy)
+        for trial in run_batch(map(start, items), policy, self.specification.config_of(policy), estimator=asked):
             # A batch hands back the name that `start` gave, whatever it is.
             assert isinstance(trial.name, Item)
             yield trial.name, trial
@@ -217,11 +217,11 @@ class Sweep:
             task,
             item.policy,
             self._key(item.world),
-            self.specification.config,
+            self.specification.config_of(item.policy),
             environment=f"{item.environment}/{self.specification.split.value}",
             world_number=item.world,
             arrays=arrays,
-            estimator=self._asked(item.environment, item.policy),
+            estimator=self.asked(item.environment, item.policy),
         )
 
     def _make_world(self, environment: str, number: int) -> World:
@@ -250,7 +250,7 @@ class Sweep:
         name = self.specification.estimator
         return None if name is None else named_estimator(name)
 
-    def _asked(self, environment: str, policy: str) -> TrainedEstimator | Estimator | None:
+    def asked(self, environment: str, policy: str) -> TrainedEstimator | Estimator | None:
         """What a policy asks in the worlds of an environment; None where it asks nothing."""
         # Worlds of a family are alike in what decides whether an estimator serves them: the first stands for all.
         world = self._world(environment, self.specification.first_world)
@@ -260,7 +260,7 @@ class Sweep:
     def _estimator_identity(self) -> str | None:
         """Of all that policies ask, so that a store never mixes two. Raises EstimatorError where there is none."""
         environments = sorted({cell.environment for cell in self.specification.cells})
-        asked = [self._asked(*pair) for pair in itertools.product(environments, self.specification.policies)]
+        asked = [self.asked(*pair) for pair in itertools.product(environments, self.specification.policies)]
         return ", ".join(dict.fromkeys(identity_of(estimator) for estimator in asked if estimator is not None)) or None
 
 

@@ -1,6 +1,9 @@
 """Decisions of recorded trials, made again: from the world, the beliefs and the panoramas that the record implies."""
 
-from functools import partial
+import dataclasses
+import functools
+import logging
+from collections.abc import Callable, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +14,8 @@ from potlp_jax.codec import config_from_dict
 from potlp_jax.errors import EstimatorError, RecordError
 from potlp_jax.learning.estimator import TrainedEstimator, identity_of, shipped_estimators
 from potlp_jax.learning.labels import TrueMapEstimator
-from potlp_jax.learning.observing import observe_panorama
+from potlp_jax.learning.observing import ObservingEstimator, observe_panorama
+from potlp_jax.learning.overlays import Overlay, ShowsOverlays, overlays_of
 from potlp_jax.planning.estimates import Estimator, ask
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.problem import PlanningProblem
@@ -24,9 +28,26 @@ from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import LOG_PREFIX, Decision, Trial
 from potlp_jax.trials.robot import photograph
-from potlp_jax.trials.rules import asked_of
+from potlp_jax.trials.rules import asked_of, first_estimator
 from potlp_jax.world.camera import Disturbance
 from potlp_jax.world.grid import BeliefMap
+
+logger = logging.getLogger(__name__)
+
+Panorama = UInt8[np.ndarray, "rows columns 3"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Views:
+    """What the robot saw and what it made of it, by the number of the decision.
+
+    Attributes:
+        panoramas: those that decisions used, in the frame of the map.
+        overlays: what the estimator shows, of the map's shape; empty where it has nothing to show.
+    """
+
+    panoramas: Mapping[int, Panorama] = dataclasses.field(default_factory=dict)
+    overlays: Mapping[int, tuple[Overlay, ...]] = dataclasses.field(default_factory=dict)
 
 
 def replay_decision(
@@ -60,7 +81,7 @@ def replay_decision(
         jnp.asarray(decision.cell, jnp.int32),
         jnp.int32(decision.state),
         task.arrays,
-        _replayed_estimator(trial, index, estimator, config),
+        estimator_at(trial, index, estimator),
         config.decision,
     )
     # The decision's own key: no need to know how it came from the trial's.
@@ -69,34 +90,63 @@ def replay_decision(
     return problem, plan, tree
 
 
-def _replayed_estimator(
-    trial: Trial, index: int, estimator: TrainedEstimator | Estimator | None, config: TrialConfig
-) -> Estimator | None:
-    """The estimator with all that it had seen at a decision: the panoramas are taken again."""
+def estimator_at(trial: Trial, index: int, estimator: TrainedEstimator | Estimator | None = None) -> Estimator | None:
+    """What a decision of the policies ``oracle`` and ``potlp`` asked, with all that it had seen.
+
+    Args:
+        trial: from ``run_trial`` or ``load_trial``.
+        index: number of the decision.
+        estimator: as in ``replay_decision``.
+
+    Returns:
+        A pytree that can be called inside jit.
+
+    Raises:
+        EstimatorError: the estimator is not the trial's.
+        RecordError: its panoramas cannot be made again (``panorama_at``).
+    """
     if trial.policy != Policy.POTLP:
         return TrueMapEstimator(world=trial.world)
-    given = _estimator_of_record(trial, asked_of(Policy.POTLP, estimator))
-    if not isinstance(given, TrainedEstimator):
-        # A function of the belief alone: it has seen nothing that would have to be seen again.
-        return given
-    asked = given.start(*trial.world.shape, config.panoramas)
+    given = asked_of(Policy.POTLP, estimator)
+    found = _estimator_of_record(trial, given)
+    if found is None:
+        made_with = trial.versions.get("estimator")
+        wrong = "which is not one of those that are shipped" if given is None else f"not {identity_of(given)}"
+        raise EstimatorError(f"the trial was made with the estimator {made_with}, {wrong}: give that one")
+    config = config_from_dict(TrialConfig, trial.config, "trial record")
+    asked = _first(trial, found, config)
     # The decision's own panorama included: it is taken before the decision.
     for decision in trial.decisions[: index + 1]:
-        cell = jnp.asarray(decision.cell, jnp.int32)
-        asked = observe_panorama(asked, panorama_at(trial, decision, config), trial.belief_at(decision.step), cell)
+        asked = _after_looking(asked, trial, decision, lambda at: panorama_at(trial, at, config))
     return asked
 
 
-def _estimator_of_record(trial: Trial, given: TrainedEstimator | Estimator | None) -> TrainedEstimator | Estimator:
-    """The estimator that a trial was made with: the one given, or a shipped one. Raises EstimatorError for another."""
-    made_with = trial.versions.get("estimator")
+def _first(trial: Trial, estimator: TrainedEstimator | Estimator, config: TrialConfig) -> Estimator | None:
+    """What a trial's first decision asked, nothing seen yet."""
+    return first_estimator(Policy.POTLP, estimator, trial.world.shape, config.panoramas, None)
+
+
+def _after_looking(
+    asked: Estimator | None,
+    trial: Trial,
+    decision: Decision,
+    panorama_of: Callable[[Decision], UInt8[Array, "rows columns 3"] | Panorama],
+) -> Estimator | None:
+    """The estimator after the panorama of a decision; one that does not remember has seen nothing."""
+    if not isinstance(asked, ObservingEstimator):
+        return asked
+    cell, belief = jnp.asarray(decision.cell, jnp.int32), trial.belief_at(decision.step)
+    return observe_panorama(asked, jnp.asarray(panorama_of(decision)), belief, cell)
+
+
+def _estimator_of_record(
+    trial: Trial, given: TrainedEstimator | Estimator | None
+) -> TrainedEstimator | Estimator | None:
+    """The estimator that a trial was made with: the one given, or a shipped one; None where it is neither."""
     # Another estimator would answer otherwise, and the replay would explain a decision that was never taken.
-    candidates = shipped_estimators() if given is None else (given,)
-    for estimator in candidates:
-        if identity_of(estimator) == made_with:
-            return estimator
-    wrong = "which is not one of those that are shipped" if given is None else f"not {identity_of(given)}"
-    raise EstimatorError(f"the trial was made with the estimator {made_with}, {wrong}: give that one")
+    candidates: Sequence[TrainedEstimator | Estimator] = shipped_estimators() if given is None else (given,)
+    made_with = trial.versions.get("estimator")
+    return next((estimator for estimator in candidates if identity_of(estimator) == made_with), None)
 
 
 def panorama_at(trial: Trial, decision: Decision, config: TrialConfig | None = None) -> UInt8[Array, "rows columns 3"]:
@@ -126,15 +176,66 @@ def panorama_at(trial: Trial, decision: Decision, config: TrialConfig | None = N
     return photograph(trial.world, cell, jax.random.key(0), config.camera, config.disturbance)
 
 
-def panoramas_of(trial: Trial) -> dict[int, UInt8[np.ndarray, "rows columns 3"]]:
-    """What the camera saw at the decisions whose panoramas were used, by number; none where a policy takes none."""
+def views_of(trial: Trial, estimator: TrainedEstimator | Estimator | None = None) -> Views:
+    """The panoramas of a trial in simulation, and what its estimator has to show, made again.
+
+    Args:
+        trial: from ``run_trial`` or ``load_trial``.
+        estimator: the one of the trial, where its policy asks one; by default the shipped one that it names. What an
+            estimator shows that is neither is left out, with a warning in the log.
+
+    Returns:
+        The views; empty where the policy takes no panoramas.
+
+    Raises:
+        RecordError: the panoramas cannot be made again (``panorama_at``).
+    """
+    config = config_from_dict(TrialConfig, trial.config, "trial record")
+    made_with = trial.versions.get("estimator")
+    # Policies of the user's own may ask one too, which the record tells and the policy's name does not.
+    asked = None if made_with is None else _estimator_of_record(trial, asked_of(Policy.POTLP, estimator))
+    if made_with is not None and asked is None:
+        logger.warning(f"the trial was made with the estimator {made_with}: give that one to see what it shows")
+    return recall_views(trial, asked, config, lambda decision: panorama_at(trial, decision, config))
+
+
+def recall_views(
+    trial: Trial,
+    asked: TrainedEstimator | Estimator | None,
+    config: TrialConfig,
+    panorama_of: Callable[[Decision], UInt8[Array, "rows columns 3"] | Panorama],
+) -> Views:
+    """The views of a trial, its estimator shown every panorama once more.
+
+    Args:
+        trial: a trial in simulation, or along a log.
+        asked: the trial's estimator; None where there is none, or it is not known.
+        config: the trial's.
+        panorama_of: what the camera saw at a decision.
+
+    Returns:
+        The panoramas that were used and the overlays of the estimator, one entry for each decision, if it has any.
+    """
+
     # Several subgoals, and several decisions, share a panorama: each is rendered once.
-    numbers = sorted({number for decision in trial.decisions for number in decision.observations})
-    return {number: np.asarray(panorama_at(trial, trial.decisions[number])) for number in numbers}
+    @functools.cache
+    def look(number: int) -> Panorama:
+        return np.asarray(panorama_of(trial.decisions[number]))
+
+    estimator = None if asked is None else _first(trial, asked, config)
+    # One that does not say from which panorama it judges a subgoal has seen that of the decision.
+    own = isinstance(estimator, ObservingEstimator)
+    used = [decision.observations or ((decision.index,) if own else ()) for decision in trial.decisions]
+    overlays = {}
+    if isinstance(estimator, ShowsOverlays):
+        for decision in trial.decisions:
+            estimator = _after_looking(estimator, trial, decision, lambda at: look(at.index))
+            overlays[decision.index] = overlays_of(estimator, trial.belief_at(decision.step))
+    return Views({number: look(number) for number in sorted({n for numbers in used for n in numbers})}, overlays)
 
 
 # Compiled like the decision itself, so that rounding is the same and equal plans stay equal.
-@partial(jax.jit, static_argnames=("config",))
+@functools.partial(jax.jit, static_argnames=("config",))
 def _replayed_problem(
     belief: BeliefMap,
     cell: Int32[Array, "2"],

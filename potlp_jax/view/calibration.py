@@ -49,14 +49,32 @@ def probability_table(report: Report, title: str) -> Table:
 
 def cost_table(report: Report, title: str) -> Table:
     """The errors of R_S where it succeeded and of R_F where it failed, of all samples and of every group."""
-    names = [f"{cost}\n{name}" for cost in ("R_S", "R_F") for name in ("MAE", "RMSE", "bias", "R²")]
+    names = [f"{cost}\n{name}" for cost in ("R_S", "R_F") for name in ("MAE", "RMSE", "bias", "calib.", "R²")]
 
     def cells(errors: CostErrors) -> list[str]:
-        values = [_number(value, 1) for value in (errors.mae, errors.rmse, errors.bias)]
+        values = [_number(value, 1) for value in (errors.mae, errors.rmse, errors.bias, errors.calibration_error)]
         return [*values, _number(errors.r2, 2)]
 
     rows = [cells(figures.success_cost) + cells(figures.failure_cost) for _, figures in _rows(report)]
     return _group_table(f"{title}: costs", names, rows, report)
+
+
+def cost_bin_table(report: Report, title: str) -> Table:
+    """Predicted and true costs by bin of what was predicted, of all samples: R_S where it succeeded, R_F otherwise."""
+    table = Table(title=f"{title}: calibration of costs", title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column("predicted", no_wrap=True)
+    for name in ("number", "mean\npredicted", "mean\ntrue", "bias"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name, errors in (("R_S", report.overall.success_cost), ("R_F", report.overall.failure_cost)):
+        for number, entry in enumerate(errors.bins, start=1):
+            means = (entry.predicted, entry.true, entry.predicted - entry.true)
+            table.add_row(
+                f"{name} {_number(entry.low, 1)} to {_number(entry.high, 1)}",
+                f"{entry.samples}",
+                *(_number(value, 1) for value in means),
+                end_section=number == len(errors.bins),
+            )
+    return table
 
 
 def ablation_table(reports: Mapping[str, Report]) -> Table:
@@ -186,37 +204,86 @@ def _draw_skills(axes: Axes, reports: Mapping[str, Report]) -> None:
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, fontsize=8, frameon=False, borderpad=0)
 
 
-def draw_costs(samples: Samples, predictions: Predictions, overall: Figures, title: str) -> Figure:
-    """Predicted over true costs: R_S of attempts that succeed, R_F of those that fail.
+def draw_costs(samples: Samples, predictions: Predictions, report: Report, title: str) -> Figure:
+    """Predicted over true costs, calibration and bias by group: R_S of attempts that succeed, R_F of those that fail.
 
     Args:
         samples: the true costs.
         predictions: of the same samples, in the same order.
-        overall: the errors over all samples, which are written above the panels.
+        report: of these predictions.
         title: stands above.
 
     Returns:
-        Two panels of densities with the diagonal and the constant prediction.
+        Above, two panels of densities with the diagonal and the constant prediction. In the middle, mean true over mean
+        predicted costs by bin. Below, the bias of every group.
     """
-    figure = new_figure(11.5, 5.6)
-    figure.text(0.5, 0.975, title, ha="center", va="top", size=9, color=INK)
+    # Inches: the bias has a line for each group.
+    lines = 0.24 * len(_rows(report)) + 0.2
+    height = 10.9 + lines
+    figure = new_figure(11.5, height)
+    figure.text(0.5, 1 - 0.14 / height, title, ha="center", va="top", size=9, color=INK)
     unit = samples.metadata.unit
     panels = (
-        ("R_S of attempts that succeed", samples.success, samples.success_cost, predictions.success_cost),
-        ("R_F of attempts that fail", 1 - samples.success, samples.failure_cost, predictions.failure_cost),
+        ("R_S", "success_cost", "of attempts that succeed", samples.success),
+        ("R_F", "failure_cost", "of attempts that fail", 1 - samples.success),
     )
-    errors = (overall.success_cost, overall.failure_cost)
-    for column, ((name, share, true, said), figures) in enumerate(zip(panels, errors, strict=True)):
-        axes = figure.add_axes((0.06 + 0.49 * column, 0.1, 0.42, 0.77))
+    for column, (name, field, which, share) in enumerate(panels):
+        left = 0.06 + 0.49 * column
+        true, said, errors = getattr(samples, field), getattr(predictions, field), getattr(report.overall, field)
         # A share of successes strictly between 0 and 1 puts the sample into both panels, with that weight.
         known = (share > 0) & np.isfinite(true)
+        axes = figure.add_axes((left, (lines + 5.7) / height, 0.42, 4.4 / height))
         _draw_cost(axes, true[known], said[known], share[known], unit)
-        told = (
-            f"MAE {_number(figures.mae, 1)}, RMSE {_number(figures.rmse, 1)}, bias {_number(figures.bias, 1)}, "
-            f"R² {_number(figures.r2, 2)}"
-        )
-        axes.set_title(f"{name} ({figures.samples} samples; darker: more)\n{told}", size=9.5, color=INK)
+        axes.set_title(f"{name} {which} ({errors.samples} samples; darker: more)\n{_told(errors)}", size=9.5, color=INK)
+        _draw_cost_bins(figure.add_axes((left, (lines + 1.2) / height, 0.42, 3.6 / height)), name, errors, unit)
+        # The names of the groups take a third of the panel's width.
+        biases = figure.add_axes((left + 0.14, 0.55 / height, 0.28, lines / height))
+        _draw_biases(biases, name, field, report, unit)
     return figure
+
+
+def _told(errors: CostErrors) -> str:
+    return (
+        f"MAE {_number(errors.mae, 1)}, RMSE {_number(errors.rmse, 1)}, bias {_number(errors.bias, 1)}, "
+        f"R² {_number(errors.r2, 2)}"
+    )
+
+
+def _draw_cost_bins(axes: Axes, name: str, errors: CostErrors, unit: str) -> None:
+    """Mean true over mean predicted costs; bins that lie on the diagonal are calibrated."""
+    said, true = [entry.predicted for entry in errors.bins], [entry.true for entry in errors.bins]
+    # Of a mean. Samples of one world are dependent: the true error is larger, as the legend says.
+    spread = [2 * entry.spread / math.sqrt(entry.samples) for entry in errors.bins]
+    limit = 1.08 * max([1.0, *said, *(mean + error for mean, error in zip(true, spread, strict=True))])
+    axes.plot([0, limit], [0, limit], color=FAINT, linewidth=1.0, label="calibrated")
+    if said:
+        style = {"color": SERIES_COLOURS[0], "marker": "o", "markersize": 5, "linewidth": 1.5, "capsize": 2}
+        axes.errorbar(said, true, spread, **style, label="± 2 standard errors, as if independent")
+    axes.set(xlim=(0, limit), ylim=(0, limit))
+    axes.set_xlabel(f"mean predicted {name} of a bin [{unit}]", color=INK)
+    axes.set_ylabel(f"mean true {name} [{unit}]", color=INK)
+    axes.grid(color="#EEEEEE", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.legend(loc="upper left", fontsize=8.5, framealpha=0.9)
+    axes.set_title(
+        f"bins with equally many samples; calibration error {_number(errors.calibration_error, 1)} {unit}",
+        size=8,
+        color=INK,
+    )
+
+
+def _draw_biases(axes: Axes, name: str, field: str, report: Report, unit: str) -> None:
+    """The bias of every group; below 0 the cost is predicted too low."""
+    rows = [(part, getattr(figures, field)) for part, figures in _rows(report)]
+    axes.barh(range(len(rows)), [errors.bias for _, errors in rows], 0.62, color=SERIES_COLOURS[3])
+    axes.axvline(0, color=INK, linewidth=0.8)
+    for last in sorted(_last_rows(report))[:-1]:
+        axes.axhline(last + 0.5, color="#DDDDDD", linewidth=0.8)
+    axes.set_yticks(range(len(rows)), [f"{part} ({errors.samples})" for part, errors in rows], size=8)
+    axes.set(ylim=(len(rows) - 0.4, -0.6))
+    axes.set_xlabel(f"bias of {name}: mean of predicted − true [{unit}]", color=INK)
+    axes.grid(axis="x", color="#EEEEEE", linewidth=0.6)
+    axes.set_axisbelow(True)
 
 
 def _draw_cost(axes: Axes, true: np.ndarray, said: np.ndarray, share: np.ndarray, unit: str) -> None:

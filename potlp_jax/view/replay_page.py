@@ -5,7 +5,6 @@ import html
 import io
 import json
 import math
-from collections.abc import Mapping
 from importlib import resources
 from typing import Any
 
@@ -16,9 +15,11 @@ from PIL import Image
 from potlp_jax.task.task import Task
 from potlp_jax.task.words import state_words, transition_words
 from potlp_jax.trials.record import ActionRecord, Decision, Trial
+from potlp_jax.trials.replay import Views
 from potlp_jax.view.decisions import FIGURES, action_name, describe_move, figure_texts, rank_actions, task_of
 from potlp_jax.view.labels import map_extent, place_labels
-from potlp_jax.view.style import area_colour, state_colour
+from potlp_jax.view.overlays import LEAST_CHANCE, describe_overlay, pack_overlay
+from potlp_jax.view.style import IMAGINED_FREE, IMAGINED_WALL, area_colour, state_colour
 
 MAP_PIXELS: tuple[int, int] = (1100, 640)
 """Width and height of the map on a page, at most: with its controls and table it fits most screens."""
@@ -30,10 +31,10 @@ PIXELS_PER_INCH: int = 96
 _JPEG_QUALITY: int = 80
 
 
-def replay_page(trial: Trial, panoramas: Mapping[int, UInt8[np.ndarray, "rows columns 3"]]) -> str:
-    """A self-contained page. ``panoramas`` are by number of the decision at which they were taken; may be empty."""
+def replay_page(trial: Trial, views: Views) -> str:
+    """A self-contained page. ``views`` may be empty."""
     title = f"{trial.environment or 'trial'}: {trial.task_text}"
-    data = embed_json(replay_data(trial, panoramas))
+    data = embed_json(replay_data(trial, views))
     return f"""<!doctype html>
 <html lang="en">
 <head>
@@ -73,7 +74,7 @@ def _text(name: str) -> str:
     return resources.files("potlp_jax.view").joinpath("data", name).read_text("utf-8")
 
 
-def replay_data(trial: Trial, panoramas: Mapping[int, UInt8[np.ndarray, "rows columns 3"]]) -> dict[str, Any]:
+def replay_data(trial: Trial, views: Views) -> dict[str, Any]:
     """What ``mountReplay`` shows, JSON-able."""
     task = task_of(trial)
     letters = np.asarray(trial.world.letters)
@@ -101,7 +102,21 @@ def replay_data(trial: Trial, panoramas: Mapping[int, UInt8[np.ndarray, "rows co
         "states": list(trial.states),
         "figures": dict(FIGURES),
         "decisions": [_decision(trial, decision) for decision in trial.decisions],
-        "panoramas": {number: _jpeg(image) for number, image in panoramas.items()},
+        "panoramas": {number: _jpeg(image) for number, image in views.panoramas.items()},
+        **_overlays(views, (rows, columns)),
+    }
+
+
+def _overlays(views: Views, extent: tuple[int, int]) -> dict[str, Any]:
+    # Which overlays there are is the same at every decision.
+    first = next(iter(views.overlays.values()), ())
+    return {
+        "overlays": [describe_overlay(overlay, extent) for overlay in first],
+        "overlays_at": {
+            number: [pack_overlay(overlay, extent) for overlay in shown] for number, shown in views.overlays.items()
+        },
+        "least_chance": LEAST_CHANCE,
+        "imagined_colours": [IMAGINED_WALL, IMAGINED_FREE],
     }
 
 

@@ -61,6 +61,8 @@ ROBOT = "#FFD400"
 FREE_SEEN, WALL_SEEN = "#FFFFFF", "#4A4A4A"
 FREE_UNSEEN, WALL_UNSEEN = "#E4E4E4", "#C6C6C6"
 HATCH = "#B4B4B4"
+# Bluish, so that nobody takes what is imagined for known; light for free and dark for obstacles, as everywhere.
+IMAGINED_FREE, IMAGINED_WALL = "#DCE8F5", "#5C6F8C"
 
 # Okabe and Ito's green and vermilion, which readers with a red-green deficiency tell apart.
 RIGHT, WRONG = "#009E73", "#D55E00"

@@ -3,6 +3,10 @@
 // `data` is what view/replay_page.py writes. Steps and decisions count from 0, as in the record.
 
 const MARK_PIXELS = 7;
+// Chances of the legend of what is imagined.
+const CHANCES = [0, 0.05, 0.1, 0.25, 0.5, 1];
+// Of one chance alone: from pale to dark, so that lightness alone tells, on light and dark screens.
+const RAMP = ["#E3EAF3", "#5F93C8", "#08244F"];
 
 function mountReplay(root, data) {
   const seen = decodeIntegers(data.first_seen);
@@ -11,7 +15,8 @@ function mountReplay(root, data) {
   const scale = data.cell_pixels;
   const lane = keepRight(data.path, 0.24);
   const last = data.path.length - 1;
-  let step = 0;
+  const choices = overlayChoices(), pictures = new Map();
+  let step = 0, choice = choices[0];
 
   root.classList.add("replay");
   root.innerHTML = `
@@ -25,7 +30,12 @@ function mountReplay(root, data) {
       <button type="button" data-go="decision-on" title="Page Down">decision ▶</button>
       <span class="where" aria-live="polite"></span>
     </div>
-    <ul class="legend"></ul>
+    <div class="overlay" hidden>
+      <label>Map shows <select></select></label>
+      <ul class="legend scale"></ul>
+      <p class="reading" aria-live="polite"></p>
+    </div>
+    <ul class="legend names"></ul>
     <h2 class="decision"></h2>
     <p class="note"></p>
     <div class="scroll"><table class="actions"></table></div>
@@ -36,7 +46,9 @@ function mountReplay(root, data) {
   canvas.width = columns * scale;
   canvas.height = rows * scale;
   part(".facts").textContent = data.facts;
-  part(".legend").append(...legend());
+  part(".names").append(...legend());
+  part(".overlay").hidden = choices.length < 2;
+  part("select").append(...choices.map(({ name }) => new Option(name)));
   for (const [name, meaning] of Object.entries(data.figures)) {
     const term = document.createElement("dt"), text = document.createElement("dd");
     term.textContent = name;
@@ -48,13 +60,160 @@ function mountReplay(root, data) {
   function legend() {
     const entries = data.propositions.map((name, bit) => [name, data.area_colours[bit], "area"]);
     for (const state of new Set([...data.states].sort((a, b) => a - b))) entries.push([data.state_names[state], data.state_colours[state], "state"]);
-    return entries.map(([name, colour, kind]) => {
-      const item = document.createElement("li"), mark = document.createElement("i");
-      mark.className = kind;
-      mark.style.background = colour;
-      item.append(mark, name);
-      return item;
+    return entries.map(([name, colour, kind]) => legendItem(name, colour, kind));
+  }
+
+  function legendItem(name, colour, kind) {
+    const item = document.createElement("li"), mark = document.createElement("i");
+    mark.className = kind;
+    mark.style.background = colour;
+    item.append(mark, name);
+    return item;
+  }
+
+  // What the map can show: what is known, what the estimator painted, all that it imagines, or one of these chances.
+  function overlayChoices() {
+    const found = [{ name: "what is known" }];
+    data.overlays.forEach((overlay, number) => {
+      found.push({ name: overlay.name, overlay, number });
+      if (overlay.kind !== "imagined") return;
+      ["free space", ...data.propositions].forEach((name, entry) => found.push({ name: `${overlay.name}: ${name}`, overlay, number, entry }));
     });
+    return found;
+  }
+
+  function packed(decision) {
+    return decision && choice.overlay ? data.overlays_at[decision.index]?.[choice.number] : undefined;
+  }
+
+  // The chance of each entry (free, then the propositions) in each square.
+  function chancesOf(text) {
+    const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)), entries = data.propositions.length + 1;
+    return (row, column, entry) => bytes[(row * choice.overlay.columns + column) * entries + entry] / 255;
+  }
+
+  // Images in a page are decoded in their own time; once that is done the map is drawn again.
+  function picture(source) {
+    if (!pictures.has(source)) {
+      const image = new Image();
+      image.onload = show;
+      image.src = source;
+      pictures.set(source, image);
+    }
+    return pictures.get(source);
+  }
+
+  function isKnown(row, column) {
+    const first = seen[row * data.width + column];
+    return first >= 0 && first <= step;
+  }
+
+  function strength(chance) {
+    return chance < data.least_chance ? 0 : Math.sqrt(chance);
+  }
+
+  function drawOverlay(context, decision) {
+    const source = packed(decision);
+    if (source === undefined) return;
+    if (choice.overlay.kind === "painted") {
+      const image = picture(source);
+      context.imageSmoothingEnabled = false;
+      if (image.complete && image.naturalWidth) context.drawImage(image, 0, 0, columns * scale, rows * scale);
+    } else {
+      drawImagined(context, chancesOf(source));
+    }
+    drawRim(context);
+  }
+
+  function drawImagined(context, chance) {
+    const side = choice.overlay.side;
+    for (let row = 0; row < rows; row++) {
+      for (let column = 0; column < columns; column++) {
+        if (isKnown(row, column)) continue;
+        const of = (entry) => chance(Math.floor(row / side), Math.floor(column / side), entry);
+        const free = of(0), place = row + column;
+        const likely = data.propositions.map((_, bit) => bit).filter((bit) => strength(of(bit + 1)) > 0).sort((a, b) => of(b + 1) - of(a + 1));
+        if (choice.entry !== undefined) {
+          context.fillStyle = ramp(of(choice.entry), choice.entry);
+        } else {
+          const below = mixed(data.imagined_colours[0], data.imagined_colours[1], free), bit = likely[place % likely.length];
+          // Cells along a diagonal take turns, so that several propositions of one square show beside each other.
+          context.fillStyle = likely.length ? mixed(below, data.area_colours[bit], strength(of(bit + 1))) : below;
+        }
+        context.fillRect(column * scale, row * scale, scale, scale);
+      }
+    }
+  }
+
+  // Free space is likely or not, and a proposition rare: the former's chance is shown as it is.
+  function ramp(chance, entry) {
+    const along = 2 * (entry === 0 ? chance : strength(chance));
+    return along < 1 ? mixed(RAMP[0], RAMP[1], along) : mixed(RAMP[1], RAMP[2], along - 1);
+  }
+
+  // A line between what is known and what is not: an overlay may have the colours of either.
+  function drawRim(context) {
+    context.beginPath();
+    for (let row = 0; row < rows; row++) {
+      for (let column = 0; column < columns; column++) {
+        if (column + 1 < columns && isKnown(row, column) !== isKnown(row, column + 1)) {
+          context.moveTo((column + 1) * scale, row * scale);
+          context.lineTo((column + 1) * scale, (row + 1) * scale);
+        }
+        if (row + 1 < rows && isKnown(row, column) !== isKnown(row + 1, column)) {
+          context.moveTo(column * scale, (row + 1) * scale);
+          context.lineTo((column + 1) * scale, (row + 1) * scale);
+        }
+      }
+    }
+    context.strokeStyle = "#222222";
+    context.lineWidth = 1;
+    context.stroke();
+  }
+
+  function showScale() {
+    const items = [], { overlay, entry } = choice;
+    if (overlay?.kind === "painted") items.push("Colours as the camera saw them; within the line the map is known.");
+    if (overlay?.kind === "imagined" && entry === undefined) {
+      items.push(legendItem("free", data.imagined_colours[1], "area"), legendItem("obstacle", data.imagined_colours[0], "area"));
+      items.push("A proposition's colour is the stronger the more likely it holds there:");
+      for (const chance of CHANCES.slice(1)) items.push(legendItem(percent(chance), mixed(data.imagined_colours[1], data.area_colours[0], strength(chance)), "area"));
+    }
+    if (entry !== undefined) for (const chance of CHANCES) items.push(legendItem(percent(chance), ramp(chance, entry), "area"));
+    part(".scale").replaceChildren(...items.map((item) => {
+      if (typeof item !== "string") return item;
+      const text = document.createElement("li");
+      text.textContent = item;
+      return text;
+    }));
+  }
+
+  // In words too: where each proposition is most likely, of the squares with a cell that is not known.
+  function showReading(decision, at) {
+    const source = packed(decision);
+    if (source === undefined || choice.overlay.kind !== "imagined") {
+      part(".reading").textContent = choice.overlay && source === undefined ? "Nothing is painted or imagined before the first decision." : "";
+      return;
+    }
+    const chance = chancesOf(source), side = choice.overlay.side;
+    if (at) {
+      const square = at.map((number) => Math.floor(number / side));
+      const all = ["free", ...data.propositions].map((name, entry) => `${name} ${percent(chance(...square, entry))}`);
+      part(".reading").textContent = isKnown(...at) ? `Row ${at[0]}, column ${at[1]} is known.` : `Row ${at[0]}, column ${at[1]}: ${all.join(", ")}`;
+      return;
+    }
+    const best = data.propositions.map(() => [0, null]);
+    for (let row = 0; row < rows; row++) {
+      for (let column = 0; column < columns; column++) {
+        if (isKnown(row, column)) continue;
+        best.forEach((found, bit) => {
+          const here = chance(Math.floor(row / side), Math.floor(column / side), bit + 1);
+          if (here > found[0]) best[bit] = [here, [row, column]];
+        });
+      }
+    }
+    const told = best.map(([most, cell], bit) => (cell ? `${data.propositions[bit]} ${percent(most)} near row ${cell[0]}, column ${cell[1]}` : null));
+    part(".reading").textContent = `Most likely where nothing was observed: ${told.filter((text) => text).join("; ") || "nothing"}`;
   }
 
   function colour(name) {
@@ -77,14 +236,13 @@ function mountReplay(root, data) {
     for (let row = 0; row < rows; row++) {
       for (let column = 0; column < columns; column++) {
         const index = row * data.width + column;
-        const known = seen[index] >= 0 && seen[index] <= step;
+        const known = isKnown(row, column);
         context.fillStyle = occupied[index] ? (known ? paint.wall : paint.unseenWall) : known ? paint.free : paint.unseen;
         context.fillRect(column * scale, row * scale, scale, scale);
       }
     }
     for (const [row, column, letter] of data.letters) {
-      const index = row * data.width + column;
-      const known = seen[index] >= 0 && seen[index] <= step;
+      const known = isKnown(row, column);
       const bits = data.propositions.map((_, bit) => bit).filter((bit) => (letter >> bit) & 1);
       bits.forEach((bit, place) => {
         context.globalAlpha = known ? 1 : 0.35;
@@ -201,6 +359,14 @@ function mountReplay(root, data) {
       figure.append(image, text);
       views.append(figure);
     });
+    const own = data.panoramas[decision.index];
+    if (decision.observations.length || !own) return;
+    const figure = document.createElement("figure"), image = document.createElement("img"), text = document.createElement("figcaption");
+    image.src = own;
+    image.alt = "panorama of the decision";
+    text.textContent = "seen from where the robot decided; the middle looks to the right on the map";
+    figure.append(image, text);
+    views.append(figure);
   }
 
   // Columns run from -pi to pi of the bearing (world/camera.py).
@@ -212,6 +378,7 @@ function mountReplay(root, data) {
     slider.value = step;
     const number = decisionNumber(), decision = data.decisions[number], context = canvas.getContext("2d");
     drawCells(context);
+    drawOverlay(context, decision);
     drawNames(context);
     drawPath(context);
     drawPlan(context, decision);
@@ -225,6 +392,7 @@ function mountReplay(root, data) {
     part(".key").hidden = !decision || !decision.actions.length;
     showActions(decision);
     showViews(decision);
+    showReading(decision);
   }
 
   function go(where) {
@@ -243,6 +411,17 @@ function mountReplay(root, data) {
     if (button) go(button.dataset.go);
   });
   slider.addEventListener("input", () => { step = Number(slider.value); show(); });
+  part("select").addEventListener("change", (event) => {
+    choice = choices[event.target.selectedIndex];
+    showScale();
+    show();
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    const box = canvas.getBoundingClientRect();
+    const cell = [((event.clientY - box.top) / box.height) * rows, ((event.clientX - box.left) / box.width) * columns].map(Math.floor);
+    if (cell[0] >= 0 && cell[0] < rows && cell[1] >= 0 && cell[1] < columns) showReading(data.decisions[decisionNumber()], cell);
+  });
+  canvas.addEventListener("pointerleave", () => showReading(data.decisions[decisionNumber()]));
   const keys = { ArrowLeft: "step-back", ArrowRight: "step-on", PageUp: "decision-back", PageDown: "decision-on", Home: "start", End: "end" };
   root.tabIndex = -1;
   root.addEventListener("keydown", (event) => {
@@ -281,4 +460,14 @@ async function rolled(source, fraction) {
   const shift = -Math.round(fraction * image.width), context = canvas.getContext("2d");
   for (const turn of [-1, 0, 1]) context.drawImage(image, shift + turn * image.width, 0);
   return canvas.toDataURL("image/png");
+}
+
+// Between two colours, "#rrggbb" or "rgb(r, g, b)", by a share of the second.
+function mixed(first, second, share) {
+  const [from, to] = [first, second].map((colour) => (colour[0] === "#" ? [1, 3, 5].map((at) => parseInt(colour.slice(at, at + 2), 16)) : colour.match(/\d+/g).map(Number)));
+  return `rgb(${from.map((value, part) => Math.round(value + (to[part] - value) * share)).join(", ")})`;
+}
+
+function percent(chance) {
+  return `${Math.round(100 * chance)} %`;
 }

@@ -1,0 +1,106 @@
+"""How much of the attainable savings estimates could bring, and which estimate costs what.
+
+    python -m eval.limit --out out/limit                             # fire-fighting, 16 test worlds a task
+    python -m eval.limit --out out/limit --estimator FILE --report docs/results/limit
+    python -m eval.limit --out out/limit --environment delivery --arms true-chances true-costs potlp oracle
+    python -m eval.limit --out out/limit --report docs/results/limit --as-it-is
+
+Beside known map and baseline the planner runs with the answers of the true map (``oracle``), of an ideal observer, of a
+trained estimator (``potlp``), and with one part of the trained estimator's answers replaced by the truth
+(``true-chances``: P_S, ``true-costs``: R_S and R_F). Rows are appended to ``trials.jsonl``; the same command goes on
+where it was stopped, also with another estimator or more worlds. ``--report`` writes NAME.json and NAME.md.
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from potlp_jax.cache import enable_compilation_cache
+
+# Before jax is imported, so that XLA says nothing about the programs that it loads.
+enable_compilation_cache()
+
+from eval.limit.arms import REFERENCES, Arm, Experiment, key_of, missing_rows  # noqa: E402
+from eval.limit.report import markdown, page, results_of  # noqa: E402
+from potlp_jax.environments.firefighting import Firefighting  # noqa: E402
+from potlp_jax.environments.registry import make  # noqa: E402
+from potlp_jax.environments.splits import Split  # noqa: E402
+from potlp_jax.learning.estimator import named_estimator  # noqa: E402
+
+ROWS = "trials.jsonl"
+
+
+def read_rows(file: Path) -> list[dict[str, Any]]:
+    """Rows written so far; a line that was cut off by a kill is left out, and its trial runs again."""
+    rows = []
+    for line in file.read_text("utf-8").splitlines() if file.exists() else []:
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return rows
+
+
+def run(file: Path, experiment: Experiment, arms: Sequence[Arm], worlds: int) -> None:
+    """Append what is missing."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    for row in missing_rows(experiment, arms, worlds, read_rows(file)):
+        with file.open("a", encoding="utf-8") as stream:
+            # A new line first: the last one may have been cut off by a kill.
+            stream.write(f"\n{json.dumps(row)}\n")
+        print(f"task {row['task']} world {row['world']} {row['arm']}: {row['outcome']}, {row['cost']:.1f}", flush=True)
+
+
+def own_rows(file: Path, experiment: Experiment, arms: Sequence[Arm]) -> list[dict[str, Any]]:
+    """The rows of these arms with this estimator."""
+    return [
+        row
+        for row in read_rows(file)
+        if Arm(row["arm"]) in arms
+        and row["task"] in experiment.tasks
+        and key_of(row) == experiment.key(row["task"], row["world"], Arm(row["arm"]))
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder of the rows")
+    parser.add_argument("--environment", default=Firefighting.name)
+    parser.add_argument("--tasks", nargs="+", help="default: all that the family has by number")
+    parser.add_argument("--split", type=Split, default=Split.TEST)
+    parser.add_argument("--worlds", type=int, default=16, help="per task")
+    parser.add_argument("--estimator", help="file or name of the trained estimator; default: the shipped one")
+    parser.add_argument("--buildings", type=int, default=16, help="that the ideal observer draws at a decision")
+    parser.add_argument("--arms", nargs="+", type=Arm, choices=list(Arm), metavar="ARM", help="default: all there are")
+    parser.add_argument("--report", type=Path, help="without suffix: where the results and the page go")
+    parser.add_argument("--as-it-is", action="store_true", help="report what is finished, run nothing")
+    options = parser.parse_args()
+    generator = make(options.environment)
+    experiment = Experiment(
+        generator=generator,
+        split=options.split,
+        tasks=tuple(options.tasks or generator.tasks),
+        given=None if options.estimator is None else named_estimator(options.estimator),
+        buildings=options.buildings,
+    )
+    known = [arm for arm in Arm if arm is not Arm.IDEAL_OBSERVER or isinstance(generator, Firefighting)]
+    chosen = known if options.arms is None else options.arms
+    if not set(chosen) <= set(known):
+        parser.error(f"{generator.name}: only fire-fighting buildings have an ideal observer")
+    file, arms = options.out / ROWS, [arm for arm in Arm if arm in (*chosen, *REFERENCES)]
+    if not options.as_it_is:
+        run(file, experiment, arms, options.worlds)
+    formulas = {name: experiment.padded[name][0].text for name in experiment.tasks}
+    results = results_of(own_rows(file, experiment, arms), formulas)
+    print(markdown(results))
+    print("\n".join(results["problems"]))
+    if options.report is not None:
+        data = options.report.with_suffix(".json")
+        data.write_text(json.dumps(results, indent=1) + "\n", "utf-8")
+        options.report.with_suffix(".md").write_text(page(results, data), "utf-8")
+
+
+if __name__ == "__main__":
+    main()

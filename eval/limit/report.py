@@ -1,0 +1,238 @@
+"""The page of results: shares of the attainable savings, and what each true answer brings."""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from eval.limit.arms import Arm
+from eval.provenance import lines_of
+from eval.savings import policy_row
+from potlp_jax.codec import finite_or_null
+from potlp_jax.sweep.rows import provenance
+from potlp_jax.sweep.statistics import UNRELIABLE, Comparison, TrialResult, attainable_interval, attainable_share
+from potlp_jax.trials.record import Outcome
+
+TITLES = {
+    Arm.KNOWN_MAP: "known map",
+    Arm.ORACLE: "oracle",
+    Arm.IDEAL_OBSERVER: "ideal observer",
+    Arm.TRUE_CHANCES: "PO-TLP, true P_S",
+    Arm.TRUE_COSTS: "PO-TLP, true R_S and R_F",
+    Arm.POTLP: "PO-TLP",
+    Arm.BASELINE: "baseline",
+}
+
+
+def results_of(rows: Sequence[Mapping[str, Any]], formulas: Mapping[str, str]) -> dict[str, Any]:
+    """What a page needs: a comparison for each task over the worlds that all arms have finished.
+
+    Args:
+        rows: of one environment, one split and one estimator.
+        formulas: of the tasks, by their names.
+
+    Returns:
+        JSON-able values.
+    """
+    arms = [arm for arm in Arm if any(row["arm"] == arm for row in rows)]
+    return {
+        "environment": rows[0]["environment"],
+        "split": rows[0]["split"],
+        "identities": {arm.value: next(row["identity"] for row in rows if row["arm"] == arm) for arm in arms},
+        "tables": {task: _table(formula, _pairs(rows, task, arms), arms) for task, formula in formulas.items()},
+        "decisions": {arm.value: _seconds(rows, arm) for arm in arms},
+        "audited": len(rows),
+        "problems": [f"{row['task']} {row['world']} {row['arm']}: {text}" for row in rows for text in row["problems"]],
+        "commits": sorted({row["commit"] for row in rows}),
+        "provenance": provenance(),
+    }
+
+
+def _pairs(rows: Sequence[Mapping[str, Any]], task: str, arms: Sequence[Arm]) -> list[dict[str, Mapping[str, Any]]]:
+    """The rows of each world by arm, of the worlds that have all."""
+    by_world: dict[int, dict[str, Mapping[str, Any]]] = defaultdict(dict)
+    for row in rows:
+        if row["task"] == task:
+            by_world[row["world"]][row["arm"]] = row
+    return [found for _, found in sorted(by_world.items()) if len(found) == len(arms)]
+
+
+def _table(formula: str, pairs: Sequence[Mapping[str, Mapping[str, Any]]], arms: Sequence[Arm]) -> dict[str, Any]:
+    results = {
+        arm.value: [
+            TrialResult(**{name: pair[arm][name] for name in ("cost", "outcome", "budget", "status")}) for pair in pairs
+        ]
+        for arm in arms
+    }
+    # Every world of the generator is another building.
+    comparison = Comparison.from_results(results)
+    return {
+        "task": formula,
+        "world_numbers": [pair[Arm.BASELINE]["world"] for pair in pairs],
+        **comparison.to_dict(),
+        "gains": finite_or_null(_gains(results)) if Arm.POTLP in arms else {},
+    }
+
+
+def _gains(results: Mapping[str, Sequence[TrialResult]]) -> dict[str, dict[str, float]]:
+    """By arm: how much larger its share is than PO-TLP's in the same worlds, with a paired 95 % interval."""
+    kept = [
+        all(trial.outcome == Outcome.SATISFIED.value and not trial.status & UNRELIABLE for trial in trials)
+        for trials in zip(*results.values(), strict=True)
+    ]
+    costs = {arm: np.array([trial.cost for trial in trials])[kept] for arm, trials in results.items()}
+    baseline, known_map = costs[Arm.BASELINE], costs[Arm.KNOWN_MAP]
+    found = {}
+    for arm in results:
+        # A share whose numerator is what PO-TLP pays more than the arm, so that worlds are resampled for both at once.
+        instead = baseline - (costs[Arm.POTLP] - costs[arm])
+        low, high = attainable_interval(instead, baseline, known_map)
+        found[arm] = {"gain": attainable_share(instead, baseline, known_map), "low": low, "high": high}
+    return found
+
+
+def _seconds(rows: Sequence[Mapping[str, Any]], arm: Arm) -> dict[str, float]:
+    own = [row for row in rows if row["arm"] == arm]
+    number = sum(row["decisions"] for row in own)
+    # The median over trials: compilation falls to the first.
+    per_decision = [row["seconds"] / max(row["decisions"], 1) for row in own]
+    return {"trials": len(own), "decisions": number / len(own), "seconds": float(np.median(per_decision))}
+
+
+def page(results: Mapping[str, Any], data: Path) -> str:
+    """The text of the page, with the line of how it was made below each table; ``data`` is the file of the results."""
+    lines = "\n".join(
+        [*_head(results), *_shares(results, data.name), *_gain_lines(results, data.name), *_foot(results)]
+    )
+    return lines_of(lines + "\n", data.parent)
+
+
+def markdown(results: Mapping[str, Any]) -> str:
+    """The tables alone."""
+    return "\n".join([*_share_table(results), "", *_gain_table(results)])
+
+
+def _head(results: Mapping[str, Any]) -> Iterator[str]:
+    yield "# The limit of estimates"
+    yield ""
+    yield (
+        "**Question.** How much of the attainable savings could PO-TLP keep if its estimates used all that the robot "
+        "has seen? And which of the estimates costs what?"
+    )
+    yield ""
+    yield f"**Answer.** {_answer(results)}"
+    yield ""
+
+
+def _answer(results: Mapping[str, Any]) -> str:
+    """One sentence for each task, on the limit and on PO-TLP."""
+    sentences = []
+    for name, table in results["tables"].items():
+        shares = {entry["policy"]: entry["attainable_share"] for entry in table["satisfied"]["rows"]}
+        ideal = shares.get(Arm.IDEAL_OBSERVER)
+        limit = "" if ideal is None else f"the ideal observer reaches {100 * ideal:.0f} %, "
+        gains = {
+            arm: table["gains"][arm]["gain"] for arm in (Arm.TRUE_CHANCES, Arm.TRUE_COSTS) if arm in table["gains"]
+        }
+        told = " and ".join(
+            f"true {'P_S' if arm is Arm.TRUE_CHANCES else 'R_S and R_F'} {'add' if gain >= 0 else 'take'} "
+            f"{100 * abs(gain):.0f} points"
+            for arm, gain in gains.items()
+        )
+        sentences.append(f"Task {name}: {limit}PO-TLP {100 * shares[Arm.POTLP]:.0f} %{'; ' + told if told else ''}.")
+    return " ".join(sentences)
+
+
+def _shares(results: Mapping[str, Any], data: str) -> Iterator[str]:
+    yield "## Shares of the attainable savings"
+    yield ""
+    yield (
+        "The same worlds for all, the same planner for all but known map and baseline; 95 % intervals draw whole "
+        "buildings. The columns stand in the order of what the estimates know:"
+    )
+    yield ""
+    yield "- **oracle**: the true labels of the building;"
+    yield (
+        "- **ideal observer**: the means of the true labels over buildings drawn from the exact posterior of the "
+        "generator, given every mapped cell and letter, and the tiles and the smoke (above a density of 0.01) of every "
+        "floor cell that has been in line of sight at a decision, at any distance. It knows how buildings are drawn; "
+        "what it does not know, nobody can. The planner takes attempts to be independent of each other (Eq. 3), also "
+        "here. R_S and R_F are means over the buildings in which the attempt succeeds and over those in which it fails;"
+    )
+    yield "- **true P_S**: the trained estimator's R_S and R_F with the true labels' P_S, 0 or 1;"
+    yield (
+        "- **true R_S and R_F**: the trained estimator's P_S, with the true labels' R_S of attempts that succeed in "
+        "the building and their R_F of those that fail; an attempt that succeeds has no true R_F, one that fails no "
+        "true R_S, and there the estimator's own is kept;"
+    )
+    yield "- **PO-TLP**: the trained estimator alone."
+    yield ""
+    yield from _share_table(results)
+    yield ""
+    yield f"<!-- made: {data} -->"
+    yield ""
+
+
+def _share_table(results: Mapping[str, Any]) -> Iterator[str]:
+    arms = [arm for arm in Arm if arm.value in results["identities"]]
+    shown = [arm for arm in arms if arm not in (Arm.KNOWN_MAP, Arm.BASELINE)]
+    yield f"| task | worlds | known map, cost | {' | '.join(TITLES[arm] for arm in shown)} | baseline, cost |"
+    yield "|" + "---|" * (len(shown) + 4)
+    for name, table in results["tables"].items():
+        found = {entry["policy"]: policy_row(entry) for entry in table["satisfied"]["rows"]}
+        shares = " | ".join(
+            f"{100 * row.attainable_share:.1f} % ({100 * row.attainable_low:.0f} to {100 * row.attainable_high:.0f})"
+            for row in (found[arm] for arm in shown)
+        )
+        costs = [f"{found[arm].mean_cost:.1f}" for arm in (Arm.KNOWN_MAP, Arm.BASELINE)]
+        yield f"| {name} | {table['satisfied']['pairs']} | {costs[0]} | {shares} | {costs[1]} |"
+
+
+def _gain_lines(results: Mapping[str, Any], data: str) -> Iterator[str]:
+    yield "## What better answers bring"
+    yield ""
+    yield (
+        "Points of the share that each kind of answer has more than PO-TLP in the same worlds, with paired 95 % "
+        "intervals. The parts need not add up: an answer is worth more where the others are right."
+    )
+    yield ""
+    yield from _gain_table(results)
+    yield ""
+    yield f"<!-- made: {data} -->"
+    yield ""
+
+
+def _gain_table(results: Mapping[str, Any]) -> Iterator[str]:
+    shown = [arm for arm in (Arm.TRUE_CHANCES, Arm.TRUE_COSTS, Arm.ORACLE, Arm.IDEAL_OBSERVER)]
+    shown = [arm for arm in shown if arm.value in results["identities"]]
+    yield f"| task | {' | '.join(TITLES[arm] for arm in shown)} |"
+    yield "|" + "---|" * (len(shown) + 1)
+    for name, table in results["tables"].items():
+        cells = " | ".join(_gain(table["gains"][arm]) for arm in shown)
+        yield f"| {name} | {cells} |"
+
+
+def _gain(entry: Mapping[str, float | None]) -> str:
+    gain, low, high = (np.nan if entry[name] is None else 100 * float(entry[name] or 0) for name in entry)
+    return f"{gain:+.1f} ({low:+.0f} to {high:+.0f})"
+
+
+def _foot(results: Mapping[str, Any]) -> Iterator[str]:
+    yield f"Worlds of the split {results['split']}, the first of each task in which it is possible. Tasks:"
+    yield ""
+    yield from (f"- {name}: `{table['task']}`" for name, table in results["tables"].items())
+    yield ""
+    trained = results["identities"].get(Arm.POTLP)
+    drawn = results["identities"].get(Arm.IDEAL_OBSERVER)
+    yield (
+        f"The trained estimator is `{trained}`{f'; the ideal observer draws {drawn} a decision' if drawn else ''}. "
+        f"{results['audited']} trials were audited: {len(results['problems'])} problems."
+    )
+    yield ""
+    yield from (
+        f"- {TITLES[Arm(name)]}: {entry['decisions']:.1f} decisions a trial, {entry['seconds']:.2f} s each with the "
+        "way to the next"
+        for name, entry in results["decisions"].items()
+    )

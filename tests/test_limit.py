@@ -1,0 +1,444 @@
+"""The limit of estimates: the posterior over buildings, mixed estimators, and what the report makes of rows."""
+
+import dataclasses
+import functools
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+from eval.limit.__main__ import read_rows, run
+from eval.limit.arms import Arm, key_of, missing_rows
+from eval.limit.buildings import (
+    SIGNS,
+    SMOKE_SEEN,
+    Evidence,
+    code_of,
+    draw_buildings,
+    draw_noise,
+    posterior,
+    prior_of,
+)
+from eval.limit.observer import ideal_observer, mean_labels, mixed
+from eval.limit.report import page, results_of
+from eval.provenance import lines_of
+from potlp_jax.environments.firefighting import (
+    Firefighting,
+    FirefightingConfig,
+    Room,
+    Shares,
+    building_of,
+    hallway_columns,
+    hallway_rows,
+    layout_of,
+    room_columns,
+)
+from potlp_jax.environments.splits import world_key
+from potlp_jax.learning.labels import true_labels
+from potlp_jax.learning.observing import observe_panorama
+from potlp_jax.planning.estimates import Estimates
+from potlp_jax.planning.policies import Policy, direct_move
+from potlp_jax.planning.situation import assess
+from potlp_jax.trials.batch import Start, run_batch
+from potlp_jax.trials.loop import run_trial
+from potlp_jax.trials.record import Outcome
+from potlp_jax.types import Status
+from potlp_jax.world.frontiers import FrontierConfig
+from potlp_jax.world.grid import BeliefMap
+from potlp_jax.world.sensing import SensorConfig, observe, visible
+
+CONFIG = FirefightingConfig(
+    room_width=4, room_height=9, hallway_length=8, hallway_width=1, hallway_spacing=3, smoke_reach=0.5
+)
+FAMILY = Firefighting(CONFIG)
+WIDE_PATCHES = Firefighting(dataclasses.replace(CONFIG, patch_radius=1, room_width=6))
+SENSOR = SensorConfig(range_cells=6.0)
+FRONTIERS = FrontierConfig(max_subgoals=6)
+assess_jit = jax.jit(assess, static_argnames="config")
+draw = jax.jit(draw_buildings)
+chances_of = jax.jit(posterior)
+answers = jax.jit(lambda estimator, belief, subgoals, task: estimator(belief, subgoals, task))
+BITS = {name: 1 << index for index, name in enumerate(Firefighting.propositions)}
+NO_PANORAMA = jnp.zeros((1, 1, 3), jnp.uint8)
+
+
+def _explored(family, index, places):
+    """A world, its layout, an observer and a belief after looking around from some places, the start first."""
+    world, layout = family.generate_with_layout(world_key("training", index, family.name))
+    observer = ideal_observer(family, world, layout, jax.random.key(index), 64)
+    belief = BeliefMap.unobserved(world)
+    free = np.argwhere(~np.asarray(world.occupied))
+    others = free[np.random.default_rng(index).integers(len(free), size=places - 1)] if places > 1 else []
+    for cell in [np.asarray(world.start), *others]:
+        at = jnp.asarray(cell, jnp.int32)
+        belief = observe(belief, world, at, SENSOR)
+        observer = observe_panorama(observer, NO_PANORAMA, belief, at)
+    return world, layout, observer, belief
+
+
+def _glimpsed(family, index):
+    """As ``_explored``, of a robot that knows its room and a part of the other, and has seen floors of a hallway."""
+    world, layout, observer, _ = _explored(family, index, 1)
+    revealed = BeliefMap.revealed(world)
+    rows, columns = np.indices(world.shape)
+    first, last = room_columns(family.config, layout.robot_room)
+    hallways = slice(*hallway_columns(family.config))
+    known = ((columns >= first) & (columns < last)) | (rows < 3)
+    known[1:, hallways] = False
+    belief = dataclasses.replace(
+        revealed,
+        cells=jnp.where(known, revealed.cells, jnp.int8(BeliefMap.UNKNOWN)),
+        letters=jnp.where(known, revealed.letters, 0),
+    )
+    middle = slice(*hallway_rows(family.config, 1))
+    in_sight = np.zeros(world.shape, bool)
+    in_sight[middle, hallways] = [True, True, True, *[False] * 5]
+    in_sight &= ~np.asarray(world.occupied)
+    signs = jnp.where(in_sight, observer.truth & SIGNS, 0).astype(jnp.uint8)
+    return world, layout, dataclasses.replace(observer, memory=Evidence(in_sight=in_sight, signs=signs)), belief
+
+
+def _agree(built, belief, evidence):
+    """Whether a building contradicts nothing, cell by cell."""
+    mapped, in_sight = ~np.asarray(belief.unknown), np.asarray(evidence.in_sight)
+    signs = np.where(built.green, 2, 0) | np.where(built.smoke > SMOKE_SEEN, 4, 0)
+    return bool(
+        (built.occupied == np.asarray(belief.occupied))[mapped].all()
+        and (built.letters == np.asarray(belief.letters))[mapped].all()
+        and (signs == np.asarray(evidence.signs))[in_sight].all()
+    )
+
+
+@pytest.mark.parametrize("family", [FAMILY, WIDE_PATCHES, Firefighting.toy()], ids=["cell", "patch", "toy"])
+@pytest.mark.parametrize("places", [1, 4])
+def test_drawn_buildings_agree_with_all_that_was_seen(family, places):
+    for index in range(3):
+        world, _, observer, belief = _explored(family, index, places)
+        occupied, letters = draw(observer.prior, belief, observer.memory, observer.noise)
+        mapped = ~np.asarray(belief.unknown)
+        np.testing.assert_array_equal(np.asarray(occupied)[:, mapped], np.tile(world.occupied[mapped], (64, 1)))
+        np.testing.assert_array_equal(np.asarray(letters)[:, mapped], np.tile(world.letters[mapped], (64, 1)))
+        # Each is a building of the generator, with one patch of each kind.
+        side = 2 * family.config.patch_radius + 1
+        for name in ("extinguisher", "exit"):
+            assert (((np.asarray(letters) & BITS[name]) > 0).sum(axis=(1, 2)) == side**2).all()
+        # What the camera alone has shown: the drawn ones have the same tiles and the same smoke there.
+        drawn = np.asarray(chances_of(observer.prior, belief, observer.memory)) > 0
+        seen = np.asarray(observer.memory.in_sight)
+        signs = np.asarray(observer.prior.codes)[drawn][:, seen] & SIGNS
+        np.testing.assert_array_equal(signs, np.tile(np.asarray(observer.truth)[seen] & SIGNS, (drawn.sum(), 1)))
+
+
+def test_the_camera_shows_floors_in_line_of_sight_beyond_the_range_of_the_map():
+    world, layout, observer, belief = _explored(FAMILY, 0, 1)
+    far = np.asarray(visible(world.occupied, world.start, SensorConfig(range_cells=99.0)) & ~world.occupied)
+    np.testing.assert_array_equal(np.asarray(observer.memory.in_sight), far)
+    assert (far & np.asarray(belief.unknown)).any()
+    signs = code_of(building_of(CONFIG, layout)) & SIGNS
+    np.testing.assert_array_equal(np.asarray(observer.memory.signs), np.where(far, signs, 0))
+
+
+def test_of_a_building_that_is_wholly_mapped_there_is_one():
+    for index in range(4):
+        world, layout, observer, _ = _explored(FAMILY, index, 1)
+        occupied, letters = draw(observer.prior, BeliefMap.revealed(world), observer.memory, observer.noise)
+        np.testing.assert_array_equal(np.asarray(occupied), np.tile(world.occupied, (64, 1, 1)))
+        np.testing.assert_array_equal(np.asarray(letters), np.tile(world.letters, (64, 1, 1)))
+        chances = chances_of(observer.prior, BeliefMap.revealed(world), observer.memory)
+        own = code_of(building_of(CONFIG, layout))
+        assert np.isclose(chances[np.all(np.asarray(observer.prior.codes) == own, axis=(1, 2))].sum(), 1.0)
+
+
+@functools.cache
+def _rejected(family, room, rounds=20_000):
+    """Layouts drawn as the generator draws them, of robots in one room."""
+    rng, found = np.random.default_rng(5), []
+    for _ in range(rounds):
+        shares = Shares(*rng.random(len(Shares._fields)))._replace(side=0.0 if room is Room.LEFT else 0.5)
+        found.append(building_of(family.config, layout_of(family.config, shares)))
+    return found
+
+
+@pytest.mark.parametrize("family", [FAMILY, WIDE_PATCHES], ids=["cell", "patch"])
+def test_the_prior_has_the_generators_probabilities(family):
+    prior = prior_of(family.config, Room.LEFT)
+    assert np.isclose(np.asarray(prior.probability).sum(), 1.0)
+    drawn = _rejected(family, Room.LEFT, 4000)
+    expected = {}
+    for code, probability in zip(np.asarray(prior.codes), np.asarray(prior.probability), strict=True):
+        expected[code.tobytes()] = expected.get(code.tobytes(), 0.0) + float(probability)
+    counts = dict.fromkeys(expected, 0)
+    for built in drawn:
+        counts[code_of(built).tobytes()] += 1
+    for code, probability in expected.items():
+        assert abs(counts[code] - 4000 * probability) < 5 * np.sqrt(4000 * probability), probability
+
+
+@pytest.mark.parametrize(("family", "index"), [(FAMILY, 5), (WIDE_PATCHES, 0)], ids=["cell", "patch"])
+def test_draws_are_those_of_rejection(family, index):
+    # Of the wide patches a part of the extinguisher has been seen, and may lie in more than one place.
+    world, layout, observer, belief = _glimpsed(family, index)
+    kept = [built for built in _rejected(family, layout.robot_room, 4000) if _agree(built, belief, observer.memory)]
+    assert len(kept) > 60
+    noise = draw_noise(jax.random.key(3), 2000, world.shape)
+    occupied, letters = (np.asarray(array) for array in draw(observer.prior, belief, observer.memory, noise))
+    for bit in BITS.values():
+        expected = np.mean([built.letters & bit > 0 for built in kept], axis=0)
+        error = np.sqrt(np.maximum(expected * (1 - expected), 1 / len(kept)) / len(kept))
+        assert (np.abs((letters & bit > 0).mean(axis=0) - expected) < 5 * error + 0.01).all()
+    walls = np.mean([built.occupied for built in kept], axis=0)
+    assert np.abs(occupied.mean(axis=0) - walls).max() < 5 * 0.5 / np.sqrt(len(kept))
+
+
+def test_answers_are_the_mean_labels_of_rejected_buildings():
+    world, layout, observer, belief = _glimpsed(FAMILY, 5)
+    kept = [built for built in _rejected(FAMILY, layout.robot_room, 4000) if _agree(built, belief, observer.memory)]
+    kept = kept[:200]
+    task = FAMILY.task("3")
+    state = task.arrays.initial
+    subgoals = assess_jit(belief, world.start, state, task.arrays, config=FRONTIERS).subgoals
+
+    @jax.jit
+    def labels(occupied, letters):
+        def label(building):
+            given = dataclasses.replace(world, occupied=building[0], letters=building[1])
+            return true_labels(given, belief, subgoals, task.arrays)
+
+        return jax.lax.map(label, (occupied, letters))
+
+    slow = labels(jnp.stack([built.occupied for built in kept]), jnp.stack([built.letters for built in kept]))
+    found = answers(observer, belief, subgoals, task.arrays)
+    real = np.asarray(subgoals.mask)[:, None] & np.asarray(task.arrays.class_mask)[None]
+    assert real.sum() > 3
+    assert int(found.status) == 0
+    success, costs, failures = (
+        np.asarray(getattr(slow, name)) for name in ("success_probability", "success_cost", "failure_cost")
+    )
+    chance = success.mean(axis=0)
+    assert 0.05 < chance[real].mean() < 0.95
+    np.testing.assert_allclose(found.success_probability[real], chance[real], atol=5 * 0.5 / np.sqrt(len(kept)))
+    for values, weight, answer in ((costs, success, found.success_cost), (failures, 1 - success, found.failure_cost)):
+        enough = real & (weight.sum(axis=0) > 20)
+        assert enough.any()
+        mean = (values * weight).sum(axis=0)[enough] / weight.sum(axis=0)[enough]
+        error = np.sqrt(((values - values.mean(axis=0)) ** 2).mean(axis=0)[enough] / weight.sum(axis=0)[enough])
+        assert (np.abs(np.asarray(answer)[enough] - mean) < 5 * error + 0.3).all()
+
+
+def test_means_are_of_those_that_succeed_and_of_those_that_fail():
+    labels = Estimates(
+        success_probability=jnp.array([[[1.0, 0.0, 1.0]], [[0.0, 0.0, 1.0]]]),
+        success_cost=jnp.array([[[8.0, 1.0, 4.0]], [[1.0, 1.0, 6.0]]]),
+        failure_cost=jnp.array([[[3.0, 5.0, 2.0]], [[7.0, 9.0, 4.0]]]),
+    )
+    means = mean_labels(labels)
+    np.testing.assert_allclose(means.success_probability, [[0.5, 0.0, 1.0]])
+    np.testing.assert_allclose(means.success_cost, [[8.0, 1.0, 5.0]])
+    np.testing.assert_allclose(means.failure_cost, [[7.0, 7.0, 3.0]])
+
+
+def test_what_no_building_explains_is_invalid():
+    world, _, observer, belief = _explored(FAMILY, 0, 1)
+    # Walls everywhere: no building of the generator.
+    belief = dataclasses.replace(belief, cells=jnp.full(world.shape, BeliefMap.OCCUPIED, jnp.int8))
+    evidence = Evidence(in_sight=jnp.zeros(world.shape, bool), signs=jnp.zeros(world.shape, jnp.uint8))
+    assert not np.asarray(chances_of(observer.prior, belief, evidence)).any()
+    task = FAMILY.task("3").arrays
+    subgoals = assess_jit(belief, world.start, task.initial, task, config=FRONTIERS).subgoals
+    assert Status.INVALID in Status(int(answers(observer, belief, subgoals, task).status))
+
+
+@struct.dataclass(kw_only=True)
+class Counting:
+    """Answers with how many panoramas it has seen, times a factor."""
+
+    memory: jax.Array
+    factor: jax.Array
+
+    def encode(self, panorama):
+        return jnp.int32(1)
+
+    def remember(self, seen, belief, cell):
+        return dataclasses.replace(self, memory=self.memory + seen)
+
+    def __call__(self, belief, subgoals, task):
+        value = jnp.broadcast_to(
+            self.factor * self.memory.astype(jnp.float32), (subgoals.mask.shape[0], task.class_mask.shape[0])
+        )
+        return Estimates(
+            success_probability=value / (1.0 + value), success_cost=value, failure_cost=2 * value, status=jnp.uint32(4)
+        )
+
+
+def _counting(factor):
+    return Counting(memory=jnp.int32(0), factor=jnp.float32(factor))
+
+
+@struct.dataclass(kw_only=True)
+class Decided:
+    """Observes nothing; the first class is impossible, the last one certain, of the others nobody knows."""
+
+    def __call__(self, belief, subgoals, task):
+        shape = (subgoals.mask.shape[0], task.class_mask.shape[0])
+        chance = jnp.full(shape, 0.5).at[:, 0].set(0.0).at[:, -1].set(1.0)
+        return Estimates(
+            success_probability=chance, success_cost=jnp.full(shape, 50.0), failure_cost=jnp.full(shape, 9.0)
+        )
+
+
+def _answers(estimator):
+    world, _, _, belief = _explored(FAMILY, 0, 1)
+    task = FAMILY.task("3").arrays
+    subgoals = assess_jit(belief, world.start, task.initial, task, config=FRONTIERS).subgoals
+    for _ in range(3):
+        estimator = observe_panorama(estimator, NO_PANORAMA, belief, world.start)
+    return estimator(belief, subgoals, task)
+
+
+def test_a_mixture_takes_each_part_from_the_right_one():
+    found = _answers(mixed(_counting(1.0), _counting(10.0)))
+    np.testing.assert_allclose(found.success_probability, 3 / 4)
+    np.testing.assert_allclose(found.success_cost, 30.0)
+    np.testing.assert_allclose(found.failure_cost, 60.0)
+    assert int(found.status) == 4
+
+
+def test_costs_that_the_second_cannot_have_are_the_firsts():
+    found = _answers(mixed(_counting(1.0), Decided()))
+    np.testing.assert_allclose(found.success_probability, 3 / 4)
+    np.testing.assert_allclose(found.success_cost[:, 0], 3.0)
+    np.testing.assert_allclose(found.success_cost[:, 1:], 50.0)
+    np.testing.assert_allclose(found.failure_cost[:, :-1], 9.0)
+    np.testing.assert_allclose(found.failure_cost[:, -1:], 6.0)
+    other = _answers(mixed(Decided(), _counting(1.0)))
+    np.testing.assert_allclose(other.success_probability[:, 0], 0.0)
+    np.testing.assert_allclose(other.success_cost, 3.0)
+
+
+def test_a_mixture_is_a_pytree_that_goes_through_batches():
+    # Each slot has the memories of both parts, and they count on their own.
+    task = FAMILY.task("4")
+    worlds = [FAMILY.generate(world_key("training", index, FAMILY.name)) for index in range(2)]
+    estimator = mixed(_counting(0.5), _counting(4.0))
+    starts = [Start(world, task.arrays, jax.random.key(0), name=name) for name, world in enumerate(worlds)]
+    together = {trial.name: trial for trial in run_batch(starts, by_count, slots=2, estimator=estimator)}
+    for name, world in enumerate(worlds):
+        alone = run_trial(world, task, by_count, jax.random.key(0), estimator=estimator)
+        assert alone.outcome is Outcome.SATISFIED
+        assert len(alone.decisions) > 2
+        assert [tuple(cell) for cell in together[name].path.tolist()] == list(alone.path)
+
+
+def by_count(situation, estimates, key, config, intention):
+    """The baseline's move in the first decisions; later one that does without frontiers, as the estimates say."""
+    few = jnp.max(estimates.failure_cost) < 20.0
+    moves = [direct_move(situation, policy, config) for policy in (Policy.BASELINE, Policy.OPTIMISTIC)]
+    return jax.tree.map(lambda one, other: jnp.where(few, one, other), *moves)
+
+
+class Worlds:
+    """An experiment without trials: the task is possible in worlds of even number."""
+
+    tasks = ("1", "2")
+
+    def __init__(self, identity=""):
+        self.identity, self.ran = identity, []
+
+    def key(self, task, number, arm):
+        return ("toy", "test", task, number, arm.value, self.identity if arm.asks_trained else "")
+
+    def row(self, task, number, arm):
+        self.ran.append((task, number, arm))
+        names = ("environment", "split", "task", "world", "arm", "identity")
+        possible = number % 2 == 0
+        outcome = Outcome.SATISFIED if possible else Outcome.INFEASIBLE
+        return dict(zip(names, self.key(task, number, arm), strict=True)) | {"outcome": outcome.value, "cost": 1.0}
+
+
+def test_a_run_goes_on_where_it_was_stopped(tmp_path):
+    file = tmp_path / "out" / "trials.jsonl"
+    arms = [Arm.POTLP]
+    whole = list(missing_rows(Worlds(), arms, 2, []))
+    assert {(row["task"], row["world"]) for row in whole if row["arm"] == Arm.POTLP} == {
+        (task, number) for task in ("1", "2") for number in (0, 2)
+    }
+    assert {row["world"] for row in whole if row["arm"] == Arm.KNOWN_MAP} == {0, 1, 2}
+    file.parent.mkdir()
+    # Cut off in the middle of a line.
+    text = "".join(json.dumps(row) + "\n" for row in whole[:5])
+    file.write_text(text + json.dumps(whole[5])[:20])
+    rest = Worlds()
+    run(file, rest, arms, 2)
+    assert [key_of(row) for row in read_rows(file)] == [key_of(row) for row in whole]
+    assert len(rest.ran) == len(whole) - 5
+    run(file, rest, arms, 2)
+    assert len(rest.ran) == len(whole) - 5
+    # Another estimator: what asks it runs again, and nothing else.
+    other = Worlds("another")
+    run(file, other, arms, 2)
+    assert {arm for *_, arm in other.ran} == {Arm.POTLP}
+
+
+def _row(arm, world, cost, **changes):
+    return {
+        "environment": "firefighting",
+        "split": "test",
+        "task": "1",
+        "world": world,
+        "arm": arm.value,
+        "identity": "net 1" if arm.asks_trained else "",
+        "outcome": "satisfied",
+        "cost": cost,
+        "budget": 1000.0,
+        "status": 0,
+        "decisions": 10,
+        "fallbacks": 0,
+        "seconds": 5.0,
+        "problems": [],
+        "versions": {},
+        "commit": "1" * 40,
+        **changes,
+    }
+
+
+COSTS = {Arm.KNOWN_MAP: 100.0, Arm.TRUE_CHANCES: 120.0, Arm.TRUE_COSTS: 210.0, Arm.POTLP: 180.0, Arm.BASELINE: 200.0}
+
+
+def test_shares_and_what_each_part_brings(tmp_path):
+    rows = [_row(arm, world, cost) for world in range(4) for arm, cost in COSTS.items()]
+    # A world in which an arm is missing is compared for none; an impossible one has a row of the known map alone.
+    rows += [_row(Arm.POTLP, 9, 1.0), _row(Arm.KNOWN_MAP, 8, 1.0, outcome="infeasible")]
+    results = results_of(rows, {"1": "F a"})
+    table = results["tables"]["1"]
+    assert table["world_numbers"] == [0, 1, 2, 3]
+    shares = {row["policy"]: row["attainable_share"] for row in table["satisfied"]["rows"]}
+    assert {arm: round(share, 9) for arm, share in shares.items()} == {
+        "known-map": 1.0,
+        "true-chances": 0.8,
+        "true-costs": -0.1,
+        "potlp": 0.2,
+        "baseline": 0.0,
+    }
+    assert np.isclose(table["gains"]["true-chances"]["gain"], 0.6)
+    assert np.isclose(table["gains"]["true-chances"]["low"], 0.6)
+    assert np.isclose(table["gains"]["true-costs"]["gain"], -0.3)
+    data = tmp_path / "limit.json"
+    data.write_text(json.dumps(results))
+    text = page(results, data)
+    assert "true P_S add 60 points and true R_S and R_F take 30 points" in text
+    assert lines_of(text, tmp_path) == text
+    assert text.count("<!-- made: limit.json -->\n*Made by") == 2
+    assert page(json.loads(data.read_text()), data) == text
+
+
+def test_a_trial_that_does_not_end_is_in_no_gain():
+    rows = [_row(arm, world, cost) for world in range(3) for arm, cost in COSTS.items()]
+    rows += [
+        _row(arm, 3, 7 * cost, outcome="budget" if arm is Arm.POTLP else "satisfied") for arm, cost in COSTS.items()
+    ]
+    table = results_of(rows, {"1": "F a"})["tables"]["1"]
+    assert table["satisfied"]["pairs"] == 3
+    assert np.isclose(table["gains"]["true-chances"]["gain"], 0.6)
