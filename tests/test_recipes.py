@@ -112,7 +112,7 @@ def test_a_small_recipe_makes_an_estimator_and_continues(tmp_path):
 
 def test_rounds_drive_with_what_was_fitted_and_learn_from_all_records(tmp_path):
     building = {"kind": "building", "widths": [4, 4, 6], "blocks": [0, 0, 1], "decoder": 4, "head": 8, "condition": 4}
-    rounds = [{"worlds": 2, "validation_worlds": 2, "views_per_world": 2, "drives": 2, "epochs": 1}]
+    rounds = [{"worlds": 2, "validation_worlds": 2, "views_per_world": 2, "drives": 2, "epochs": 1, "explored": 2}]
     small = {**SMALL, "fit": {**SMALL["fit"], "network": building}, "rounds": rounds}
     (tmp_path / "small.yaml").write_text(json.dumps(small))
     recipe = read_recipe(tmp_path / "small.yaml")
@@ -123,10 +123,11 @@ def test_rounds_drive_with_what_was_fitted_and_learn_from_all_records(tmp_path):
     assert read_metadata(first / "training").collection["driver"] == "explorer"
     assert (driven.collection["driver"], driven.collection["first_world"]) == ("potlp", 4)
     assert driven.collection["estimator"] == read_estimator(first / ESTIMATOR).identity
-    assert set(read_dataset(last / "training").world_of) == {0, 1}
+    assert read_metadata(last / "explored").collection["first_world"] == 6
     _, config, _, metadata = load_estimator(last / ESTIMATOR)
     assert architecture_of(config).name == "building"
-    views = [len(read_dataset(folder / "training").images) for folder in (first, last)]
+    data = (first / "training", last / "training", last / "explored")
+    views = [len(read_dataset(folder).images) for folder in data]
     assert metadata["panoramas"] == sum(views)
     # The scales of costs stay those of the first fit, with which its parameters mean something.
     assert config == load_estimator(first / ESTIMATOR)[1]

@@ -10,7 +10,7 @@ rounds:                         # optional: PO-TLP drives with what was fitted, 
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -36,12 +36,15 @@ class Round:
     Attributes:
         worlds, validation_worlds: how many further worlds of the splits it drives through. The validation data of the
             round are its own alone: they are of the states that the estimator meets.
+        explored: how many further worlds are recorded as at first. Drives cost much more than exploration, and more
+            buildings keep a network from learning those that it has seen by heart.
         views_per_world, drives: as in ``CollectConfig``.
         epochs: passes over all records of training so far.
     """
 
     worlds: int
     validation_worlds: int
+    explored: int = 0
     views_per_world: int = 24
     drives: int = 2
     epochs: int = 4
@@ -118,15 +121,16 @@ def follow(
     """
     # Each stage has a folder; that of the last one is ``out`` itself.
     folders = [*(out / f"round-{number}" for number in range(len(recipe.rounds))), out]
-    worlds = {Split.TRAINING: 0, Split.VALIDATION: 0}
     records: list[Samples] = []
     trained = None
-    for number, folder in enumerate(folders):
-        stage = _stage(recipe, number, worlds, folders[number - 1] / ESTIMATOR)
-        for split, count in stage.worlds.items():
-            _collect_of(recipe, stage, split, folder / split.value, processes, partial(tell, split))
-            worlds[split] += count
-        records.append(read_dataset(folder / Split.TRAINING.value))
+    for number, (folder, stage) in enumerate(zip(folders, _stages(recipe, folders), strict=True)):
+        for part in stage.parts:
+            config = dataclasses.replace(part.config, first_world=part.first)
+            generator, tell_of = make(recipe.environment), partial(tell, part.split)
+            collect(
+                generator, recipe.environment, part.split, part.worlds, folder / part.name, config, processes, tell_of
+            )
+        records += [read_dataset(folder / part.name) for part in stage.parts if part.split == Split.TRAINING]
         validation = read_dataset(folder / Split.VALIDATION.value)
         initial = folders[number - 1] / ESTIMATOR if number else None
         trained = fit(joined(records), validation, folder, stage.fit, display, initial)
@@ -135,34 +139,45 @@ def follow(
 
 
 @dataclasses.dataclass(frozen=True)
+class _Part:
+    """One collection: its folder's name, the split, the first world and how many, and what is recorded."""
+
+    name: str
+    split: Split
+    first: int
+    worlds: int
+    config: CollectConfig
+
+
+@dataclasses.dataclass(frozen=True)
 class _Stage:
     """What is collected and fitted at one time: at first, or in a round."""
 
-    worlds: Mapping[Split, int]
-    first: Mapping[Split, int]
-    collect: CollectConfig
+    parts: tuple[_Part, ...]
     fit: FitConfig
 
 
-def _stage(recipe: Recipe, number: int, first: Mapping[Split, int], estimator: Path) -> _Stage:
-    """Stage ``number``; from the second on ``estimator`` is what the one before made."""
-    if number == 0:
-        counts = {split: recipe.worlds(split) for split in first}
-        return _Stage(counts, dict(first), recipe.collect, recipe.fit)
-    chosen = recipe.rounds[number - 1]
-    drives = dataclasses.replace(
-        recipe.collect,
-        driver=Policy.POTLP.value,
-        estimator=str(estimator),
-        drives=chosen.drives,
-        views_per_world=chosen.views_per_world,
-    )
-    counts = {Split.TRAINING: chosen.worlds, Split.VALIDATION: chosen.validation_worlds}
-    return _Stage(counts, dict(first), drives, dataclasses.replace(recipe.fit, epochs=chosen.epochs))
+def _stages(recipe: Recipe, folders: Sequence[Path]) -> Iterator[_Stage]:
+    """The stages in order; worlds are counted through all of them, so that none is recorded twice."""
+    splits: tuple[Split, ...] = (Split.TRAINING, Split.VALIDATION)
+    next_world = dict.fromkeys(splits, recipe.collect.first_world)
 
+    def part(name: str, split: Split, worlds: int, config: CollectConfig) -> _Part:
+        first = next_world[split]
+        next_world[split] += worlds
+        return _Part(name, split, first, worlds, config)
 
-def _collect_of(
-    recipe: Recipe, stage: _Stage, split: Split, folder: Path, processes: int, tell: Callable[[Collected], None]
-) -> None:
-    config = dataclasses.replace(stage.collect, first_world=stage.first[split])
-    collect(make(recipe.environment), recipe.environment, split, stage.worlds[split], folder, config, processes, tell)
+    yield _Stage(tuple(part(split.value, split, recipe.worlds(split), recipe.collect) for split in splits), recipe.fit)
+    for number, chosen in enumerate(recipe.rounds):
+        driven = dataclasses.replace(
+            recipe.collect,
+            driver=Policy.POTLP.value,
+            estimator=str(folders[number] / ESTIMATOR),
+            drives=chosen.drives,
+            views_per_world=chosen.views_per_world,
+        )
+        counts = {Split.TRAINING: chosen.worlds, Split.VALIDATION: chosen.validation_worlds}
+        parts = [part(split.value, split, counts[split], driven) for split in splits]
+        if chosen.explored:
+            parts.append(part("explored", Split.TRAINING, chosen.explored, recipe.collect))
+        yield _Stage(tuple(parts), dataclasses.replace(recipe.fit, epochs=chosen.epochs))
