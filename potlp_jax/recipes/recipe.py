@@ -160,7 +160,7 @@ class _Stage:
 def _stages(recipe: Recipe, folders: Sequence[Path]) -> Iterator[_Stage]:
     """The stages in order; worlds are counted through all of them, so that none is recorded twice."""
     splits: tuple[Split, ...] = (Split.TRAINING, Split.VALIDATION)
-    next_world = dict.fromkeys(splits, recipe.collect.first_world)
+    next_world: dict[Split, int] = dict.fromkeys(splits, recipe.collect.first_world)
 
     def part(name: str, split: Split, worlds: int, config: CollectConfig) -> _Part:
         first = next_world[split]
