@@ -72,6 +72,8 @@ class CollectConfig(RecordingConfig):
         estimator: what the policy asks, by name or file (``named_estimator``); empty for a policy that asks none.
         drives: tasks that a policy pursues in a world, each from the start; the views are divided among them, and what
             one leaves over is the next one's.
+        pursued: tasks that the wandering robot pursues in a world, in turn. One alone shapes what is known of the
+            building as a trial does: who avoids a fire all the time sees what lies behind it and never goes there.
     """
 
     first_world: int = 0
@@ -81,6 +83,7 @@ class CollectConfig(RecordingConfig):
     driver: Literal["explorer", "baseline", "potlp"] = "explorer"
     estimator: str = ""
     drives: int = 3
+    pursued: int = 12
 
 
 @dataclasses.dataclass(frozen=True)
@@ -233,12 +236,15 @@ def _collect_world(recorder: Recorder, world: World, index: int, tasks: TaskDist
         return np.asarray(_image(world, jnp.asarray(pose.cell, jnp.int32), key, config))
 
     recorder.add_world(world, index)
+    # Half of the questions are of the tasks that are pursued: they are asked in the states that pursuing them leads to.
+    pursued = pool[: config.pursued if config.driver == "explorer" else config.drives]
+    asked = [*pool, *pursued * (len(pool) // len(pursued))]
     recorded = 0
     drives, count = _drives(world, index, pool, rng, config)
     for number, poses in enumerate(drives, start=1):
         # What the drives before left over is for those that follow.
         most = config.views_per_world * number // count - recorded
-        recorded += record_views(recorder, world, poses, pool, rng, photograph, most=most)
+        recorded += record_views(recorder, world, poses, asked, rng, photograph, most=most)
 
 
 def _drives(
@@ -246,7 +252,7 @@ def _drives(
 ) -> tuple[Iterable[Iterable[Pose]], int]:
     """The drives through a world, and their number."""
     if config.driver == "explorer":
-        return [Explorer(world, pool, rng, config.explorer).poses()], 1
+        return [Explorer(world, pool[: config.pursued], rng, config.explorer).poses()], 1
     tasks, key = pool[: config.drives], jax.random.fold_in(jax.random.key(config.seed), index)
     asked = named_estimator(config.estimator) if config.estimator else None
     settings = dataclasses.replace(trial_config_for(world), camera=config.camera, disturbance=config.disturbance)
