@@ -38,6 +38,7 @@ class Round:
             round are its own alone: they are of the states that the estimator meets.
         explored: how many further worlds are recorded as at first. Drives cost much more than exploration, and more
             buildings keep a network from learning those that it has seen by heart.
+        pursued: as in ``CollectConfig``, where it explores.
         views_per_world, drives: as in ``CollectConfig``.
         epochs: passes over all records of training so far.
     """
@@ -45,6 +46,7 @@ class Round:
     worlds: int
     validation_worlds: int
     explored: int = 0
+    pursued: int = CollectConfig.pursued
     views_per_world: int = 24
     drives: int = 2
     epochs: int = 4
@@ -179,5 +181,6 @@ def _stages(recipe: Recipe, folders: Sequence[Path]) -> Iterator[_Stage]:
         counts = {Split.TRAINING: chosen.worlds, Split.VALIDATION: chosen.validation_worlds}
         parts = [part(split.value, split, counts[split], driven) for split in splits]
         if chosen.explored:
-            parts.append(part("explored", Split.TRAINING, chosen.explored, recipe.collect))
+            explored = dataclasses.replace(recipe.collect, pursued=chosen.pursued)
+            parts.append(part("explored", Split.TRAINING, chosen.explored, explored))
         yield _Stage(tuple(parts), dataclasses.replace(recipe.fit, epochs=chosen.epochs))
