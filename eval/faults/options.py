@@ -36,7 +36,7 @@ _LINES: tuple[tuple[str, ...], ...] = (
     ("collect", "firefighting", "--worlds", "2", "--split", "training", "--out", "out", "--set", "seed=4"),
     ("collect", "--recipe", "recipe.yaml", "--processes", "1", "--out", "out"),
     ("fit", "dataset", "--validation", "dataset", "--out", "out", "--epochs", "2", "--minutes", "0.5"),
-    ("fit", "--recipe", "firefighting", "--out", "out", "--set", "training.patience=10", "--fovea", "0"),
+    ("fit", "--recipe", "firefighting", "--out", "out", "--set", "training.patience=10", "--epochs", "3"),
     ("estimator", "info", "estimator.npz", "--json"),
     ("map", "inspect", "map.yaml", "--resolution", "0.2", "--radius", "0.1", "--start", "0.5,0.5"),
     ("map", "clean", "map.yaml", "--out", "clean.yaml", "--radius", "0.1"),
