@@ -414,6 +414,7 @@ def test_shares_and_what_each_part_brings(tmp_path):
     results = results_of(rows, {"1": "F a"})
     table = results["tables"]["1"]
     assert table["world_numbers"] == [0, 1, 2, 3]
+    assert table["costs"]["potlp"] == [180.0] * 4
     shares = {row["policy"]: row["attainable_share"] for row in table["satisfied"]["rows"]}
     assert {arm: round(share, 9) for arm, share in shares.items()} == {
         "known-map": 1.0,

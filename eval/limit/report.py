@@ -71,6 +71,7 @@ def _table(formula: str, pairs: Sequence[Mapping[str, Mapping[str, Any]]], arms:
     return {
         "task": formula,
         "world_numbers": [pair[Arm.BASELINE]["world"] for pair in pairs],
+        "costs": {arm.value: [pair[arm]["cost"] for pair in pairs] for arm in arms},
         **comparison.to_dict(),
         "gains": finite_or_null(_gains(results)) if Arm.POTLP in arms else {},
     }
