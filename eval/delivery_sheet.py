@@ -1,10 +1,11 @@
 """Floors of the delivery task from above, and what a robot sees of them: ``python -m eval.delivery_sheet --out FILE``.
 
-Generated floors are training worlds. ``--plans`` draws real floor plans, a file or a folder, in their place.
+Generated floors are training worlds, as many of each of the environments. ``--plans`` draws real floor plans, a file or
+a folder, in their place.
 """
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,9 +16,10 @@ from matplotlib.figure import Figure
 from scipy import ndimage
 
 from eval.contact_sheet import Cell, draw_plan, mark_bearings
-from potlp_jax.environments.campus.delivery import Delivery
+from potlp_jax.environments.campus.floor_generator import FloorGenerator
 from potlp_jax.environments.campus.floor_plans import FloorPlanConfig, FloorPlans
 from potlp_jax.environments.campus.furnishing import PEOPLE, Floor, Kind, Placement
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.view.style import INK, new_figure
 from potlp_jax.world.camera import CameraConfig
@@ -46,13 +48,15 @@ class View(NamedTuple):
     cell: Cell
 
 
-def generated(count: int) -> Iterator[Furnished]:
-    """The first training worlds."""
-    generator = Delivery()
-    for index in range(count):
-        yield Furnished(
-            f"floor {index}", *generator.generate_with_layout(world_key(Split.TRAINING, index, generator.name))
-        )
+def generated(environments: Sequence[str], count: int) -> Iterator[Furnished]:
+    """The first training worlds of each."""
+    for environment in environments:
+        generator = make(environment)
+        if not isinstance(generator, FloorGenerator):
+            raise SystemExit(f"{environment} draws no floors: name delivery, parcels or a campus")
+        for index in range(count // len(environments)):
+            drawn = generator.generate_with_layout(world_key(Split.TRAINING, index, generator.name))
+            yield Furnished(f"{environment} {index}", *drawn)
 
 
 def planned(path: Path, count: int) -> Iterator[Furnished]:
@@ -124,10 +128,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="the picture's file: .png, .jpg, .pdf")
     parser.add_argument("--floors", type=int, default=12, help="how many floors")
+    parser.add_argument("--environments", nargs="+", default=["delivery"], help="families of generated floors")
     parser.add_argument("--plans", type=Path, help="a floor plan or a folder of them")
     arguments = parser.parse_args()
     count = arguments.floors
-    shown = list(generated(count) if arguments.plans is None else planned(arguments.plans, count))
+    shown = list(
+        generated(arguments.environments, count) if arguments.plans is None else planned(arguments.plans, count)
+    )
     draw_sheet(shown, list(choose_views(shown[0])), arguments.out)
 
 

@@ -128,8 +128,15 @@ def draw_panoramas(file: Path) -> list[Trial]:
 
 def draw_delivery(file: Path) -> list[Trial]:
     """Generated floors from above, and what a robot sees of them."""
-    shown = list(delivery_sheet.generated(12))
+    shown = list(delivery_sheet.generated(["delivery"], 12))
     delivery_sheet.draw_sheet(shown, list(delivery_sheet.choose_views(shown[0])), file)
+    return []
+
+
+def draw_campus(file: Path) -> list[Trial]:
+    """Generated campus buildings of all sizes from above."""
+    families = ["campus-small", "campus-medium", "campus-large"]
+    delivery_sheet.draw_sheet(list(delivery_sheet.generated(families, 12)), [], file)
     return []
 
 
@@ -140,6 +147,7 @@ PICTURES: dict[str, Callable[[Path], list[Trial]]] = {
     "report.png": photograph_report,
     "panoramas.jpg": draw_panoramas,
     "delivery.jpg": draw_delivery,
+    "campus.jpg": draw_campus,
 }
 """Files and what makes them; each returns the trials that it shows."""
 

@@ -1,5 +1,6 @@
 """Generated academic floors: who is where, what is lit, that all can be reached, how different floors are."""
 
+import dataclasses
 import heapq
 import itertools
 import math
@@ -28,6 +29,8 @@ from potlp_jax.task.shipped import shipped_tasks
 from potlp_jax.task.task import Task
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import Outcome
+from potlp_jax.world.grid import world_digest
+from potlp_jax.world.settings import NO_SETTINGS
 
 GENERATOR = Delivery()
 FLOORS = 80
@@ -308,3 +311,18 @@ def test_impossible_furnishings_are_refused(floors):
 def test_floors_without_rooms_are_refused():
     with pytest.raises(WorldError, match="had the rooms that delivery needs"):
         Delivery(DeliveryConfig(smallest=(36, 48), largest=(40, 56), outdoors=1.0)).generate(_key(0))
+
+
+@pytest.mark.parametrize(
+    ("name", "digests"),
+    [
+        ("delivery", ("59528ef547b1cae1", "01d9aff45eee9fc7", "bdfb1f479f643ef2")),
+        ("parcels", ("60ecb88a37b9773e", "4672f5fc31158cd9", "212f79d6b20bc4fd")),
+    ],
+)
+def test_worlds_stay_what_published_results_refer_to(name, digests):
+    """The shipped estimators learned from these worlds, and results name them by their numbers."""
+    splits = (Split.TRAINING, Split.VALIDATION, Split.TEST)
+    worlds = [make(name).generate(world_key(split, index, name)) for index, split in enumerate(splits)]
+    # Settings of trials are no part of what is drawn.
+    assert tuple(world_digest(dataclasses.replace(world, settings=NO_SETTINGS)) for world in worlds) == digests

@@ -8,13 +8,12 @@ import pytest
 
 from potlp_jax.codec import with_settings
 from potlp_jax.environments.campus.delivery import Delivery, DeliveryConfig
-from potlp_jax.environments.campus.furnishing import PARCELS, Floor, FurnishConfig, Kind, furnish
+from potlp_jax.environments.campus.furnishing import NARROW_DOORS, PARCELS, Floor, FurnishConfig, Kind, furnish
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.ros.mapped_rooms import (
     MappedRooms,
     MappedRoomsConfig,
 )
-from potlp_jax.environments.ros.ros_map import NARROW_DOORS
 from potlp_jax.environments.splits import world_key
 from potlp_jax.errors import MapError, MapWarning, SpecificationError, WorldError
 from potlp_jax.sweep.specification import specification_from_dict

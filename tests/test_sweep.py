@@ -30,10 +30,17 @@ from potlp_jax.errors import ConfigurationError, StoreError, SweepError
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.rows import path_text, read_path
 from potlp_jax.sweep.runner import RESULTS, Sweep, _Workers, run_sweep
-from potlp_jax.sweep.specification import read_specification, specification_from_dict
+from potlp_jax.sweep.specification import (
+    configuration_hash,
+    own_settings,
+    read_specification,
+    specification_from_dict,
+    specification_from_store,
+)
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store, process_start
 from potlp_jax.task.task import Task
 from potlp_jax.trials.loop import run_trial
+from potlp_jax.trials.rules import trial_key
 from potlp_jax.types import Status
 from potlp_jax.view.report_page import Cell, Shown, report_page
 from potlp_jax.view.style import policy_styles
@@ -82,9 +89,51 @@ def test_settings_reach_every_depth():
     assert specification.config.budget_factor == _specification().config.budget_factor
 
 
+OWN = {"baseline": {"replan_distance": 9, "decision": {"frontiers": {"min_size": 5}}}}
+
+
+def test_a_policy_may_have_settings_of_its_own():
+    specification = _specification(settings={"replan_distance": 7, "budget_factor": 3}, policy_settings=OWN)
+    own, common = specification.config_of("baseline"), specification.config_of("optimistic")
+    assert (own.replan_distance, own.decision.frontiers.min_size, own.budget_factor) == (9.0, 5, 3.0)
+    assert common == specification.config
+    assert (common.replan_distance, common.decision.frontiers.min_size) == (7.0, 2)
+    data = json.loads(json.dumps(specification.to_dict()))
+    assert specification_from_store(data) == specification
+    assert own_settings(data) == {
+        "baseline": "decision.frontiers.min_size was 2, is 5, replan_distance was 7.0, is 9.0"
+    }
+    assert "policy_settings" not in _specification().to_dict()
+
+
+def test_trials_of_a_policy_have_its_settings_and_a_sweep_with_others_is_another(tmp_path):
+    sweep = Sweep(_specification(policy_settings={"baseline": {"replan_distance": 2}}), tmp_path)
+    while sweep.step():
+        pass
+    hashes = {row.item.policy: row.configuration for row in sweep.store.rows()}
+    common = configuration_hash(sweep.specification.config)
+    assert hashes["optimistic"] == hashes["known-map"] == common
+    assert hashes["baseline"] == configuration_hash(sweep.specification.config_of("baseline")) != common
+    (row,) = [row for row in sweep.store.rows() if row.item.policy == "baseline" and row.item.world == 5]
+    world, task = make("toy").generate(world_key("validation", 5, "toy")), make("toy").task(2)
+    config = dataclasses.replace(sweep.specification.config, replan_distance=2.0)
+    alone = run_trial(world, task, "baseline", trial_key(5), config)
+    np.testing.assert_array_equal(read_path(row.path), alone.path)
+    assert list(sweep.trial(row.item).path) == list(alone.path)
+    told = _potlp("sweep", "show", tmp_path)
+    assert "settings of baseline: replan_distance was 4.0, is 2.0" in told.stdout
+    with pytest.raises(StoreError, match=r"specification: policy_settings was .*, is null"):
+        Sweep(_specification(), tmp_path)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"policy_settings": ["baseline"]}, "policy_settings: give settings by policy"),
+        ({"policy_settings": {"potlp": {}}}, "policy_settings: 'potlp' is none of the policies: known-map, baseline"),
+        ({"policy_settings": {"baseline": {"replan": 3}}}, "policy_settings: baseline: unknown field 'replan'"),
+        ({"policy_settings": {"baseline": {"sensor": {}}}}, "baseline: sensor is the same for all policies"),
+        ({"policy_settings": {"baseline": {"budget_factor": 2}}}, "baseline: budget_factor is the same for all"),
         ({"worlds": 0}, "worlds: give a whole number of at least 1, found 0"),
         ({"worlds": True}, "worlds"),
         ({"polices": ["baseline"]}, "unknown entry 'polices'"),

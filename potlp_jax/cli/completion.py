@@ -19,6 +19,8 @@ TASKS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "delivery": ("1",),
         "parcels": ("1", "2"),
         "rooms": ("1", "2"),
+        **dict.fromkeys(("campus-small", "campus-medium", "campus-large"), ("1",)),
+        **dict.fromkeys(("campus-small-parcels", "campus-medium-parcels", "campus-large-parcels"), ("1", "2")),
     }
 )
 """Numbers of the tasks of the environments that need no file."""

@@ -124,6 +124,8 @@ def _facts(facts: dict[str, Any], rows: "Sequence[Row]") -> list[tuple[str, str]
     def all_of(values: Sequence[str]) -> str:
         return "; ".join(sorted({value for value in values if value})) or "-"
 
+    from potlp_jax.sweep.specification import own_settings
+
     specification = facts["specification"]
     versions = [", ".join(f"{name} {number}" for name, number in sorted(row.versions.items())) for row in rows]
     return [
@@ -136,6 +138,7 @@ def _facts(facts: dict[str, Any], rows: "Sequence[Row]") -> list[tuple[str, str]
         ("trials", f"{len(rows)}, {sum(row.seconds for row in rows) / 3600:.2f} hours of one core"),
         ("estimator", facts["estimator"] or "-"),
         ("settings", all_of([row.configuration for row in rows])),
+        *((f"settings of {policy}", told) for policy, told in own_settings(specification).items()),
         ("seed", str(specification["seed"])),
         ("versions", all_of(versions)),
         ("commit", all_of([row.commit for row in rows])),

@@ -93,6 +93,7 @@ def show(folder: SweepFolder, json: Json = False) -> None:
     """Show the tables of what is finished."""
     from potlp_jax.cli.inputs import open_store
     from potlp_jax.sweep.results import read_results
+    from potlp_jax.sweep.specification import own_settings
 
     with open_store(folder) as store:
         results = read_results(store)
@@ -101,6 +102,8 @@ def show(folder: SweepFolder, json: Json = False) -> None:
         return
     for cell in results.cells:
         print_cell(console(), cell, results.specification["split"])
+    for policy, told in own_settings(results.specification).items():
+        console().print(f"settings of {policy}: {told}")
 
 
 def run_reported(specification: "Specification", folder: Path, processes: int | None) -> None:

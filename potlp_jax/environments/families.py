@@ -13,6 +13,12 @@ NAMED: Mapping[str, str] = MappingProxyType(
         "delivery": "potlp_jax.environments.campus.delivery:Delivery",
         "parcels": "potlp_jax.environments.campus.delivery:Delivery.parcels",
         "rooms": "potlp_jax.environments.rooms:Rooms",
+        "campus-small": "potlp_jax.environments.campus.campus:Campus.small",
+        "campus-medium": "potlp_jax.environments.campus.campus:Campus.medium",
+        "campus-large": "potlp_jax.environments.campus.campus:Campus.large",
+        "campus-small-parcels": "potlp_jax.environments.campus.campus:Campus.small_parcels",
+        "campus-medium-parcels": "potlp_jax.environments.campus.campus:Campus.medium_parcels",
+        "campus-large-parcels": "potlp_jax.environments.campus.campus:Campus.large_parcels",
     }
 )
 """``module:attribute`` of the class (or function without arguments) that makes each family's generator."""

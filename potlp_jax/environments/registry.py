@@ -10,10 +10,11 @@ def make(name: str) -> Generator:
     """The generator of a family of worlds, as named on the command line.
 
     Args:
-        name: ``toy``, ``firefighting``, ``delivery``, ``parcels``, ``rooms``; ``map:FILE.yaml`` for a ROS map,
-            ``parcels:FILE.yaml`` for deliveries to its rooms, or ``floorplan:FILE.xml`` for delivery worlds on a real
-            floor plan (or on those of a folder); for an environment of your own ``module:attribute``, or the name of
-            an entry point in the group ``potlp_jax.environments``: a ``Generator``, or what makes one when called.
+        name: ``toy``, ``firefighting``, ``delivery``, ``parcels``, ``rooms``, or another of ``families.NAMED``;
+            ``map:FILE.yaml`` for a ROS map, ``parcels:FILE.yaml`` for deliveries to its rooms, or
+            ``floorplan:FILE.xml`` for delivery worlds on a real floor plan (or on those of a folder); for an
+            environment of your own ``module:attribute``, or the name of an entry point in the group
+            ``potlp_jax.environments``: a ``Generator``, or what makes one when called.
 
     Raises:
         PluginError: there is no such family, or a foreign one cannot be imported.

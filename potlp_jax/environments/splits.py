@@ -65,7 +65,7 @@ def check_split(split: Split, family: str) -> None:
     if split not in usable_splits(family):
         raise WorldError(
             f"{family}: real buildings are test data, and {split} worlds cannot be drawn from them; "
-            f"use the split {Split.TEST}, and {Split.TRAINING} worlds of a generator (delivery, parcels)"
+            f"use the split {Split.TEST}, and {Split.TRAINING} worlds of a generator (delivery, parcels, campus-medium)"
         )
 
 

@@ -191,7 +191,7 @@ class Sweep:
 
     def rows(self, items: Iterable[Item], environment: str, policy: str) -> Iterator[Row]:
         """The rows of trials of one environment and policy, as they end."""
-        config = self.specification.config
+        config = self.specification.config_of(policy)
         asked = self.asked(environment, policy)
         for item, trial in self._trials(items, environment, policy):
             world = self._world(environment, item.world)
@@ -204,7 +204,7 @@ class Sweep:
             return Start(world, self._tasks[environment, item.task][1], self._key(item.world), name=item)
 
         asked = self.asked(environment, policy)
-        for trial in run_batch(map(start, items), policy, self.specification.config, estimator=asked):
+        for trial in run_batch(map(start, items), policy, self.specification.config_of(policy), estimator=asked):
             # A batch hands back the name that `start` gave, whatever it is.
             assert isinstance(trial.name, Item)
             yield trial.name, trial
@@ -217,7 +217,7 @@ class Sweep:
             task,
             item.policy,
             self._key(item.world),
-            self.specification.config,
+            self.specification.config_of(item.policy),
             environment=f"{item.environment}/{self.specification.split.value}",
             world_number=item.world,
             arrays=arrays,

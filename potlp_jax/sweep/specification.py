@@ -10,6 +10,8 @@
     settings:                      # any field of TrialConfig; the other fields are what the environment calls for
       replan_distance: 4
       decision: {search: {simulations: 300}}
+    policy_settings:               # of single policies, beyond ``settings``: how they decide, nothing of the trial
+      baseline: {decision: {frontiers: {min_size: 2}}}
 
 ``known-map`` and ``baseline`` always run: savings are measured between them.
 """
@@ -22,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from potlp_jax import plugins
-from potlp_jax.codec import config_from_dict, json_copy, read_settings, settings_file, with_settings
+from potlp_jax.codec import config_from_dict, differences, json_copy, read_settings, settings_file, with_settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
 from potlp_jax.errors import PluginError, SpecificationError, TaskError, WorldError
@@ -50,8 +52,9 @@ class Specification:
         worlds: worlds per cell in which the task is possible.
         split, first_world: from which worlds they are taken, in increasing order.
         estimator: a name (``learning.estimator.named_estimator``); None for the shipped one.
-        config: settings of every trial.
+        config: settings of every trial whose policy has none of its own.
         seed: of the trials' keys (not of the worlds).
+        policy_configs: settings of the trials of single policies, in the order of the policies.
     """
 
     cells: tuple[Cell, ...]
@@ -62,10 +65,15 @@ class Specification:
     estimator: str | None = None
     config: TrialConfig = TrialConfig()
     seed: int = 0
+    policy_configs: tuple[tuple[str, TrialConfig], ...] = ()
+
+    def config_of(self, policy: str) -> TrialConfig:
+        """The settings of a policy's trials."""
+        return dict(self.policy_configs).get(policy, self.config)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able; equal specifications give equal dictionaries."""
-        return {
+        data = {
             "cells": [dataclasses.asdict(cell) for cell in self.cells],
             "policies": list(self.policies),
             "worlds": self.worlds,
@@ -75,6 +83,9 @@ class Specification:
             "settings": dataclasses.asdict(self.config),
             "seed": self.seed,
         }
+        # Left out where there are none: the same trials as ever are the same sweep as ever.
+        own = {policy: dataclasses.asdict(config) for policy, config in self.policy_configs}
+        return data | {"policy_settings": own} if own else data
 
 
 def specification_from_store(data: Mapping[str, Any]) -> Specification:
@@ -88,7 +99,17 @@ def specification_from_store(data: Mapping[str, Any]) -> Specification:
         estimator=data["estimator"],
         config=config_from_dict(TrialConfig, data["settings"], "settings"),
         seed=data["seed"],
+        policy_configs=tuple(
+            (policy, config_from_dict(TrialConfig, settings, f"policy_settings: {policy}"))
+            for policy, settings in data.get("policy_settings", {}).items()
+        ),
     )
+
+
+def own_settings(data: Mapping[str, Any]) -> dict[str, str]:
+    """By policy, in which settings it differs from those of the sweep, in words; ``data``: of ``to_dict``."""
+    own = data.get("policy_settings", {})
+    return {policy: ", ".join(differences(data["settings"], settings)) for policy, settings in own.items()}
 
 
 def configuration_hash(config: TrialConfig) -> str:
@@ -110,7 +131,10 @@ def read_specification(given: str | Path) -> Specification:
 
 
 _REQUIRED = ("environments", "tasks", "policies", "worlds")
-_OPTIONAL = ("split", "first_world", "estimator", "settings", "seed")
+_OPTIONAL = ("split", "first_world", "estimator", "settings", "seed", "policy_settings")
+
+_OF_THE_POLICY = ("decision", "replan_distance", "panoramas")
+"""Fields of ``TrialConfig`` in which policies of one sweep may differ: the others say what the trial is."""
 
 
 def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = Path()) -> Specification:
@@ -147,6 +171,7 @@ def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = 
     for cell in cells:
         if cells.count(cell) > 1:
             raise SpecificationError(f"{where}: {cell.environment} with {cell.task!r} is there twice")
+    config = with_settings(_common_config(environments, where), data.get("settings", {}), f"{where}: settings")
     estimator = data.get("estimator")
     if estimator is not None and not isinstance(estimator, str):
         raise SpecificationError(f"{where}: estimator: give a file or module:attribute, found {estimator!r}")
@@ -157,8 +182,9 @@ def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = 
         split=split,
         first_world=_number(data, "first_world", 0, where, default=0),
         estimator=None if estimator is None else _estimator(estimator, folder),
-        config=with_settings(_common_config(environments, where), data.get("settings", {}), f"{where}: settings"),
+        config=config,
         seed=_number(data, "seed", 0, where, default=0),
+        policy_configs=_policy_configs(data.get("policy_settings", {}), policies, config, f"{where}: policy_settings"),
     )
 
 
@@ -191,6 +217,27 @@ def _policies(names: list[Any], where: str) -> tuple[str, ...]:
         # Functions keep the name that was given: workers find them by it.
         found.append(policy.value if isinstance(policy, Policy) else name)
     return tuple(dict.fromkeys(found))
+
+
+def _policy_configs(
+    given: Any, policies: Sequence[str], config: TrialConfig, where: str
+) -> tuple[tuple[str, TrialConfig], ...]:
+    """The settings of the policies that have their own."""
+    if not isinstance(given, Mapping):
+        raise SpecificationError(f"{where}: give settings by policy, found {short(given)}")
+    for policy, settings in given.items():
+        if policy not in policies:
+            raise SpecificationError(f"{where}: {policy!r} is none of the policies: {', '.join(policies)}")
+        # Policies are compared in the same trials: what the robot sees, or may spend, is not theirs to choose.
+        for field in settings if isinstance(settings, Mapping) else ():
+            if hasattr(config, str(field)) and field not in _OF_THE_POLICY:
+                raise SpecificationError(
+                    f"{where}: {policy}: {field} is the same for all policies; set it in settings (a policy may have "
+                    f"its own {', '.join(_OF_THE_POLICY)})"
+                )
+    return tuple(
+        (policy, with_settings(config, given[policy], f"{where}: {policy}")) for policy in policies if policy in given
+    )
 
 
 def _estimator(name: str, folder: Path) -> str:

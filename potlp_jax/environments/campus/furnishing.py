@@ -81,6 +81,11 @@ MANY_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 64}}
 """Settings of trials: from a hallway one sees 18 to 27 doors at a time, in the mean of a trial; and up to 28 panoramas
 still showed a frontier at a time (docs/estimator.md, "Panoramas")."""
 
+NARROW_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 96, "min_size": 1}}, "panoramas": 128})
+"""Settings of trials where a door may be as narrow as one cell, as after resampling the map of a real building: a
+frontier is to be dropped only where it is smaller than any passage (docs/model.md section 6). Slivers that stay open
+are remembered: up to 59 panoramas still showed a frontier at a time (docs/estimator.md, "Panoramas")."""
+
 _WALL_COLOURS = {
     Kind.HALLWAY: (208, 204, 194),
     Kind.OTHER: (160, 152, 150),
@@ -107,12 +112,14 @@ class Floor:
         doors: the cells of doors.
         kinds: the kind of each room, by its number.
         resolution: side of a cell in metres.
+        closed: numbers of the rooms whose doors are closed: nobody is in them, and they cannot be entered.
     """
 
     rooms: Int32[np.ndarray, "H W"]
     doors: Bool[np.ndarray, "H W"]
     kinds: tuple[Kind, ...]
     resolution: float
+    closed: frozenset[int] = frozenset()
 
     @property
     def occupied(self) -> Bool[np.ndarray, "H W"]:
@@ -126,8 +133,8 @@ class Floor:
         return np.append(np.array(self.kinds, np.int32), np.int32(NO_ROOM))[self.rooms]
 
     def rooms_of(self, kind: Kind) -> list[int]:
-        """Numbers of the rooms of a kind."""
-        return [number for number, found in enumerate(self.kinds) if found is kind]
+        """Numbers of the rooms of a kind that can be entered."""
+        return [number for number, found in enumerate(self.kinds) if found is kind and number not in self.closed]
 
 
 @dataclasses.dataclass(frozen=True)

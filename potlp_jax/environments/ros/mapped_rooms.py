@@ -24,12 +24,20 @@ from jaxtyping import PRNGKeyArray
 
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.campus.delivery import PARCELS_FAMILY, scaled_to
-from potlp_jax.environments.campus.furnishing import NO_ROOM, PARCELS, Floor, FurnishConfig, Kind, Placement, furnish
+from potlp_jax.environments.campus.furnishing import (
+    NARROW_DOORS,
+    NO_ROOM,
+    PARCELS,
+    Floor,
+    FurnishConfig,
+    Kind,
+    Placement,
+    furnish,
+)
 from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.ros.cleaning import CleanMap, clean_map, warn_of_cut_off
 from potlp_jax.environments.ros.map_files import load_map
 from potlp_jax.environments.ros.places import Region, load_regions
-from potlp_jax.environments.ros.ros_map import NARROW_DOORS
 from potlp_jax.environments.splits import PARCELS_PREFIX
 from potlp_jax.errors import MapError, MapWarning
 from potlp_jax.world.grid import World

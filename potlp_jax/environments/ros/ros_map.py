@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Int32, PRNGKeyArray
 
 from potlp_jax.environments.base import Generator, host_generators
+from potlp_jax.environments.campus.furnishing import NARROW_DOORS
 from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.ros.cleaning import clean_map, warn_of_cut_off
 from potlp_jax.environments.ros.map_files import OccupancyMap, load_map
 from potlp_jax.environments.ros.places import Places, load_places, place_letters
 from potlp_jax.errors import MapError
 from potlp_jax.world.grid import World, make_world
-from potlp_jax.world.settings import Settings
 
 PREFIX = "map:"
 
@@ -41,12 +41,6 @@ class RosMapConfig:
     places: str | Places | None = None
     resolution: float = 0.2
     radius: float = 0.1
-
-
-NARROW_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 96, "min_size": 1}}, "panoramas": 128})
-"""Settings of trials: after resampling, a door of a real building may be as narrow as one cell, and a frontier is to be
-dropped only where it is smaller than any passage (docs/model.md section 6). Slivers that stay open are remembered: up
-to 59 panoramas still showed a frontier at a time (docs/estimator.md, "Panoramas")."""
 
 
 class RosMap(Generator):

@@ -1,0 +1,1 @@
+"""What generated floors are like beside real ones: ``python -m eval.floor_statistics --help``."""
