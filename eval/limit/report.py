@@ -143,7 +143,8 @@ def _answer(results: Mapping[str, Any]) -> str:
             for arm, gain in gains.items()
         )
         sentences.append(f"Task {name}: {limit}PO-TLP {100 * shares[Arm.POTLP]:.0f} %{'; ' + told if told else ''}.")
-    return " ".join(sentences)
+    counts = [table["satisfied"]["pairs"] for table in results["tables"].values()]
+    return f"In {min(counts)} to {max(counts)} {results['split']} worlds a task: {' '.join(sentences)}"
 
 
 def _shares(results: Mapping[str, Any], data: str) -> Iterator[str]:
@@ -227,6 +228,9 @@ def _interval(low: float, high: float, form: str) -> str:
 
 
 def _foot(results: Mapping[str, Any]) -> Iterator[str]:
+    yield "**Command.** The same command goes on where it was stopped, and with more worlds or another estimator."
+    yield ""
+    yield from ("```sh", "python -m eval.limit --out out/limit --report docs/results/limit", "```", "")
     yield f"Worlds of the split {results['split']}, the first of each task in which it is possible. Tasks:"
     yield ""
     yield from (f"- {name}: `{table['task']}`" for name, table in results["tables"].items())
