@@ -10,8 +10,9 @@ Every policy runs in the same worlds with every combination of
 - the replanning distance: cells after which a changed map is worth a new decision (``replan_distance``),
 - the commitment of policies that search: by what fraction another action must be cheaper (``commitment``).
 
-A trial that is not satisfied is charged its budget, as in sweeps. The best setting has the least mean cost; it is
-chosen if the 95 % interval of its difference to the default, paired by world, lies below 0, and the default otherwise.
+A trial that is not satisfied is charged its budget, as in sweeps. The best setting has the least mean cost in the
+worlds of the default. It is chosen if the 95 % interval of its difference to the default, paired by world, lies below
+0; otherwise the default is.
 Rows are appended to ``rows.jsonl`` as trials end, and the same command goes on. ``--report`` writes NAME.json and the
 page NAME.md; the former holds ``policy_settings`` of each family as a sweep's file takes them.
 """
@@ -228,48 +229,53 @@ def charged(row: Row) -> float:
 
 
 def compare(rows: Sequence[Row], possible: set[tuple[str, int]]) -> dict[str, Any]:
-    """The settings of one policy in one family, best first.
+    """The settings of one policy in one family, each against the default in the worlds that both have finished.
 
     Args:
         rows: of the policy, with all settings.
         possible: tasks and worlds in which the known map suffices to satisfy the task.
 
     Returns:
-        JSON-able: ``settings`` with mean costs and differences to the default, ``best``, ``chosen``, ``worlds``.
+        JSON-able: ``settings``, by difference to the default; the ``default``; the ``best`` of those that have finished
+        what the default has; the one that is ``chosen``; the default's ``trials`` and ``worlds``.
     """
-    costs: dict[Setting, dict[tuple[str, int], float]] = {}
+    found: dict[Setting, dict[tuple[str, int], Row]] = {}
     for row in rows:
-        costs.setdefault(_setting(row), {})[row["task"], row["world"]] = charged(row)
+        if (row["task"], row["world"]) in possible:
+            found.setdefault(_setting(row), {})[row["task"], row["world"]] = row
     default = next(_setting(row) for row in rows if row["is_default"])
-    pairs = sorted(possible.intersection(*costs.values()))
-    unsatisfied = {setting: 0 for setting in costs}
-    for row in rows:
-        if (row["task"], row["world"]) in pairs:
-            unsatisfied[_setting(row)] += row["outcome"] != Outcome.SATISFIED
-    found = []
-    for setting, own in costs.items():
-        differences = np.array([own[pair] - costs[default][pair] for pair in pairs])
-        low, high = interval(differences, np.array([world for _, world in pairs]))
-        found.append(
-            {
-                "setting": list(setting),
-                "mean_cost": float(np.mean([own[pair] for pair in pairs])),
-                "difference": float(differences.mean()),
-                "low": low,
-                "high": high,
-                "unsatisfied": unsatisfied[setting],
-            }
-        )
+    compared = [_against(setting, own, found[default]) for setting, own in found.items()]
     # Equal costs: the default, which nobody has to explain.
-    found.sort(key=lambda entry: (entry["mean_cost"], entry["setting"] != list(default)))
-    best = found[0]
+    compared.sort(key=lambda entry: (entry["difference"], entry["setting"] != list(default)))
+    trials = len(found[default])
+    best = next(entry for entry in compared if entry["trials"] == trials)
     return {
         "default": list(default),
         "best": best["setting"],
         "chosen": best["setting"] if best["high"] < 0 else list(default),
+        "trials": trials,
+        "worlds": len({world for _, world in found[default]}),
+        "settings": compared,
+    }
+
+
+def _against(
+    setting: Setting, own: Mapping[tuple[str, int], Row], default: Mapping[tuple[str, int], Row]
+) -> dict[str, Any]:
+    """The figures of a setting in the worlds that it shares with the default."""
+    pairs = sorted(own.keys() & default.keys())
+    costs = np.array([charged(own[pair]) for pair in pairs])
+    usual = np.array([charged(default[pair]) for pair in pairs])
+    low, high = interval(costs - usual, np.array([world for _, world in pairs]))
+    return {
+        "setting": list(setting),
         "trials": len(pairs),
-        "worlds": len({world for _, world in pairs}),
-        "settings": found,
+        "mean_cost": float(costs.mean()),
+        "default_cost": float(usual.mean()),
+        "difference": float((costs - usual).mean()),
+        "low": low,
+        "high": high,
+        "unsatisfied": sum(own[pair]["outcome"] != Outcome.SATISFIED for pair in pairs),
     }
 
 
@@ -334,7 +340,8 @@ def chosen_settings(file: Path, family: str) -> dict[str, Any]:
 
 def page(found: Mapping[str, Any], name: str) -> str:
     """The page of results; ``name``: of the JSON file beside it."""
-    return "\n".join([*_introduction(), *_chosen_table(found), "", f"<!-- made: {name} -->", "", *_tables(found, name)])
+    lines = [*_introduction(), *_chosen_table(found), "", f"<!-- made: {name} -->", "", *_tables(found, name)]
+    return "\n".join(lines).rstrip() + "\n"
 
 
 def _introduction() -> list[str]:
@@ -361,8 +368,8 @@ def _chosen_table(found: Mapping[str, Any]) -> Iterator[str]:
     yield "|---|---|---|---|---|---|---|"
     for family, entry in found["families"].items():
         for policy, compared in entry["policies"].items():
-            best = compared["settings"][0]
-            chosen = "best" if compared["chosen"] == compared["best"] != compared["default"] else "default"
+            best = next(row for row in compared["settings"] if row["setting"] == compared["best"])
+            chosen = "default" if compared["chosen"] == compared["default"] else "best"
             yield (
                 f"| {family} | {policy} | {compared['worlds']} | {_told(compared['default'], policy)} | "
                 f"{_told(compared['best'], policy)} | {_difference(best, compared)} | {chosen} |"
@@ -374,17 +381,18 @@ def _tables(found: Mapping[str, Any], name: str) -> Iterator[str]:
         for policy, compared in entry["policies"].items():
             yield f"## {family}: {policy}"
             yield ""
-            tasks, estimators = ", ".join(entry["tasks"]), ", ".join(entry["estimators"])
-            yield f"Tasks {tasks} in {compared['worlds']} worlds, {compared['trials']} trials for each setting."
-            if policy in SEARCHING and estimators:
-                yield f"Estimator: {estimators}."
+            yield f"Tasks {', '.join(entry['tasks'])} in {compared['worlds']} worlds."
+            if any(row["trials"] < compared["trials"] for row in compared["settings"]):
+                yield "A setting with fewer trials than the default is not finished, and cannot be chosen yet."
+            if policy in SEARCHING and entry["estimators"]:
+                yield f"Estimator: {', '.join(entry['estimators'])}."
             yield ""
-            yield "| setting | mean cost | difference to the default (95 %) | not satisfied |"
-            yield "|---|---|---|---|"
+            yield "| setting | trials | mean cost | difference to the default (95 %) | not satisfied |"
+            yield "|---|---|---|---|---|"
             for row in compared["settings"]:
                 yield (
-                    f"| {_told(row['setting'], policy)} | {row['mean_cost']:.1f} | {_difference(row, compared)} | "
-                    f"{row['unsatisfied']} |"
+                    f"| {_told(row['setting'], policy)} | {row['trials']} | {row['mean_cost']:.1f} | "
+                    f"{_difference(row, compared)} | {row['unsatisfied']} |"
                 )
             yield ""
             yield f"<!-- made: {name} -->"
@@ -400,8 +408,7 @@ def _told(setting: Sequence[Any], policy: str) -> str:
 def _difference(row: Mapping[str, Any], compared: Mapping[str, Any]) -> str:
     if row["setting"] == compared["default"]:
         return "the default"
-    usual = next(entry["mean_cost"] for entry in compared["settings"] if entry["setting"] == compared["default"])
-    percent = 100 * row["difference"] / usual
+    percent = 100 * row["difference"] / row["default_cost"]
     return f"{row['difference']:+.1f} ({row['low']:+.1f} to {row['high']:+.1f}), {percent:+.1f} %"
 
 

@@ -65,16 +65,21 @@ def test_a_better_setting_is_chosen_and_one_that_may_be_luck_is_not():
 
 
 def test_only_pairs_count_and_a_trial_without_success_costs_its_budget():
-    default, other = (2, 4.0, 0.15), (4, 4.0, 0.15)
-    rows = [_row(default, 0, 10.0), _row(default, 1, 10.0), _row(default, 2, 10.0), _row(other, 0, 12.0)]
-    rows += [_row(other, 1, 3.0, outcome="stuck")]
-    found = compare(rows, {("1", 0), ("1", 1), ("1", 2)})
-    assert found["trials"] == 2
-    entry = next(entry for entry in found["settings"] if entry["setting"] == list(other))
-    assert entry["mean_cost"] == pytest.approx((12.0 + 100.0) / 2)
-    assert entry["unsatisfied"] == 1
+    default, other, early = (2, 4.0, 0.15), (4, 4.0, 0.15), (1, 4.0, 0.15)
+    rows = [_row(default, world, 10.0 + world) for world in range(3)]
+    rows += [_row(other, 0, 12.0), _row(other, 1, 3.0, outcome="stuck"), _row(other, 2, 12.0), _row(other, 3, 0.0)]
+    rows += [_row(early, 0, 1.0)]
+    found = compare(rows, {("1", world) for world in range(4)})
+    entries = {tuple(entry["setting"]): entry for entry in found["settings"]}
+    assert entries[other]["trials"] == found["trials"] == 3
+    assert entries[other]["mean_cost"] == pytest.approx((12.0 + 100.0 + 12.0) / 3)
+    assert entries[other]["difference"] == pytest.approx((2.0 + 89.0 + 0.0) / 3)
+    assert entries[other]["unsatisfied"] == 1
+    # Far better where it was tried, but not tried everywhere.
+    assert entries[early]["difference"] == pytest.approx(-9.0)
+    assert found["best"] == found["chosen"] == list(default)
     # Where the task is impossible nobody is judged.
-    assert compare(rows, {("1", 0)})["settings"][0]["mean_cost"] == pytest.approx(10.0)
+    assert compare(rows, {("1", 0)})["best"] == list(early)
 
 
 def test_worlds_are_resampled_with_all_of_their_tasks():

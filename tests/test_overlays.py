@@ -221,9 +221,12 @@ const shown = [];
 const select = document.querySelector("select");
 const context = document.querySelector("canvas").getContext("2d");
 const colours = () => {
-  const found = new Set(), pixels = context.getImageData(0, 0, context.canvas.width, context.canvas.height).data;
-  for (let i = 0; i < pixels.length; i += 4) found.add(`${pixels[i]},${pixels[i + 1]},${pixels[i + 2]}`);
-  return [...found];
+  const found = {}, pixels = context.getImageData(0, 0, context.canvas.width, context.canvas.height).data;
+  for (let i = 0; i < pixels.length; i += 4) {
+    const colour = `${pixels[i]},${pixels[i + 1]},${pixels[i + 2]}`;
+    found[colour] = (found[colour] ?? 0) + 1;
+  }
+  return found;
 };
 const choose = (index) => { select.selectedIndex = index; select.dispatchEvent(new Event("change")); };
 const note = () => shown.push({
@@ -265,6 +268,8 @@ def test_a_browser_shows_what_was_painted_and_imagined(trial, views, tmp_path):
     hazard = (1 - weight) * below + weight * np.array(rgb(area_colour(1)))
     drawn = np.array([list(map(int, colour.split(","))) for colour in imagined["colours"]])
     assert np.min(np.max(np.abs(drawn - hazard), axis=1)) <= 2
+    # Known floor stays as it is, but for the line around what is known.
+    assert imagined["colours"]["255,255,255"] > 0.7 * known["colours"]["255,255,255"]
     assert re.search(rf"{trial.propositions[1]} 50 % near row \d+, column \d+", imagined["reading"])
     assert trial.propositions[0] not in imagined["reading"]
     assert known["scale"] == known["reading"] == ""
