@@ -177,9 +177,9 @@ def test_the_prior_has_the_generators_probabilities(family):
         assert abs(counts[code] - 4000 * probability) < 5 * np.sqrt(4000 * probability), probability
 
 
-@pytest.mark.parametrize(("family", "index"), [(FAMILY, 5), (WIDE_PATCHES, 0)], ids=["cell", "patch"])
+@pytest.mark.parametrize(("family", "index"), [(FAMILY, 5), (WIDE_PATCHES, 0), (WIDE_PATCHES, 4)])
 def test_draws_are_those_of_rejection(family, index):
-    # Of the wide patches a part of the extinguisher has been seen, and may lie in more than one place.
+    # Of the wide patches a part of the extinguisher has been seen, or of the exit, and may lie in more than one place.
     world, layout, observer, belief = _glimpsed(family, index)
     kept = [built for built in _rejected(family, layout.robot_room, 4000) if _agree(built, belief, observer.memory)]
     assert len(kept) > 60
@@ -414,6 +414,7 @@ def test_shares_and_what_each_part_brings(tmp_path):
     results = results_of(rows, {"1": "F a"})
     table = results["tables"]["1"]
     assert table["world_numbers"] == [0, 1, 2, 3]
+    assert table["costs"]["potlp"] == [180.0] * 4
     shares = {row["policy"]: row["attainable_share"] for row in table["satisfied"]["rows"]}
     assert {arm: round(share, 9) for arm, share in shares.items()} == {
         "known-map": 1.0,
@@ -428,10 +429,14 @@ def test_shares_and_what_each_part_brings(tmp_path):
     data = tmp_path / "limit.json"
     data.write_text(json.dumps(results))
     text = page(results, data)
-    assert "true P_S add 60 points and true R_S and R_F take 30 points" in text
+    assert "true P_S add 60.0 points and true R_S and R_F take 30.0 points" in text
     assert lines_of(text, tmp_path) == text
     assert text.count("<!-- made: limit.json -->\n*Made by") == 2
     assert page(json.loads(data.read_text()), data) == text
+    assert "| 20.0 % (20 to 20) |" in text
+    assert "| +60.0 (+60 to +60) |" in text
+    # One building has no interval.
+    assert "| 20.0 % (no interval) |" in page(results_of(rows[:5], {"1": "F a"}), data)
 
 
 def test_a_trial_that_does_not_end_is_in_no_gain():

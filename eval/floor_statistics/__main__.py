@@ -97,7 +97,7 @@ def _shares(floors: Sequence[Floor]) -> dict[str, float]:
     campus = [floor for floor in floors if isinstance(floor, CampusFloor)]
     counts = Counter(f"outline: {floor.outline}" for floor in campus)
     counts.update(str(part) for floor in campus for part in floor.parts)
-    return {name: counts[name] / len(campus) for name in sorted(counts)}
+    return {name: counts[name] / len(campus) for name in sorted(counts, key=str.lower)}
 
 
 def draw(folder: Path, file: Path) -> None:

@@ -71,6 +71,7 @@ def _table(formula: str, pairs: Sequence[Mapping[str, Mapping[str, Any]]], arms:
     return {
         "task": formula,
         "world_numbers": [pair[Arm.BASELINE]["world"] for pair in pairs],
+        "costs": {arm.value: [pair[arm]["cost"] for pair in pairs] for arm in arms},
         **comparison.to_dict(),
         "gains": finite_or_null(_gains(results)) if Arm.POTLP in arms else {},
     }
@@ -138,11 +139,12 @@ def _answer(results: Mapping[str, Any]) -> str:
         }
         told = " and ".join(
             f"true {'P_S' if arm is Arm.TRUE_CHANCES else 'R_S and R_F'} {'add' if gain >= 0 else 'take'} "
-            f"{100 * abs(gain):.0f} points"
+            f"{100 * abs(gain):.1f} points"
             for arm, gain in gains.items()
         )
         sentences.append(f"Task {name}: {limit}PO-TLP {100 * shares[Arm.POTLP]:.0f} %{'; ' + told if told else ''}.")
-    return " ".join(sentences)
+    counts = [table["satisfied"]["pairs"] for table in results["tables"].values()]
+    return f"In {min(counts)} to {max(counts)} {results['split']} worlds a task: {' '.join(sentences)}"
 
 
 def _shares(results: Mapping[str, Any], data: str) -> Iterator[str]:
@@ -183,7 +185,7 @@ def _share_table(results: Mapping[str, Any]) -> Iterator[str]:
     for name, table in results["tables"].items():
         found = {entry["policy"]: policy_row(entry) for entry in table["satisfied"]["rows"]}
         shares = " | ".join(
-            f"{100 * row.attainable_share:.1f} % ({100 * row.attainable_low:.0f} to {100 * row.attainable_high:.0f})"
+            f"{100 * row.attainable_share:.1f} % ({_interval(row.attainable_low, row.attainable_high, '.0f')})"
             for row in (found[arm] for arm in shown)
         )
         costs = [f"{found[arm].mean_cost:.1f}" for arm in (Arm.KNOWN_MAP, Arm.BASELINE)]
@@ -195,7 +197,8 @@ def _gain_lines(results: Mapping[str, Any], data: str) -> Iterator[str]:
     yield ""
     yield (
         "Points of the share that each kind of answer has more than PO-TLP in the same worlds, with paired 95 % "
-        "intervals. The parts need not add up: an answer is worth more where the others are right."
+        "intervals. The parts need not add up, and one part alone can do harm: the true cost of an attempt that "
+        "succeeds is compared with what the estimator believes of one that does not."
     )
     yield ""
     yield from _gain_table(results)
@@ -215,11 +218,19 @@ def _gain_table(results: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _gain(entry: Mapping[str, float | None]) -> str:
-    gain, low, high = (np.nan if entry[name] is None else 100 * float(entry[name] or 0) for name in entry)
-    return f"{gain:+.1f} ({low:+.0f} to {high:+.0f})"
+    gain, low, high = (np.nan if value is None else float(value) for value in entry.values())
+    return f"{100 * gain:+.1f} ({_interval(low, high, '+.0f')})"
+
+
+def _interval(low: float, high: float, form: str) -> str:
+    """In per cent; there is none where too many resamples hold nothing to be saved."""
+    return "no interval" if np.isnan(low) else f"{100 * low:{form}} to {100 * high:{form}}"
 
 
 def _foot(results: Mapping[str, Any]) -> Iterator[str]:
+    yield "**Command.** The same command goes on where it was stopped, and with more worlds or another estimator."
+    yield ""
+    yield from ("```sh", "python -m eval.limit --out out/limit --report docs/results/limit", "```", "")
     yield f"Worlds of the split {results['split']}, the first of each task in which it is possible. Tasks:"
     yield ""
     yield from (f"- {name}: `{table['task']}`" for name, table in results["tables"].items())
