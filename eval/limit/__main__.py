@@ -7,8 +7,8 @@
 
 Beside known map and baseline the planner runs with the answers of the true map (``oracle``), of an ideal observer, of a
 trained estimator (``potlp``), and with one part of the trained estimator's answers replaced by the truth
-(``true-chances``: P_S, ``true-costs``: R_S and R_F). Rows are appended to ``trials.jsonl``; the same command goes on
-where it was stopped, also with another estimator or more worlds. ``--report`` writes NAME.json and NAME.md.
+(``true-chances``: P_S, ``true-costs``: R_S and R_F). Rows are appended to a file of JSON lines; the same command goes
+on where it was stopped, also with another estimator or more worlds. ``--report`` writes NAME.json and NAME.md.
 """
 
 import argparse
