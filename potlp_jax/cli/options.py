@@ -114,8 +114,8 @@ RecipeName = Annotated[
     typer.Option(
         "--recipe",
         "-r",
-        help="What makes an estimator: the name of a shipped recipe ([cyan]firefighting[/cyan], "
-        "[cyan]firefighting-building[/cyan], [cyan]delivery[/cyan], [cyan]parcels[/cyan]) or a file of your own.",
+        help="What makes an estimator: the name of a shipped recipe ([cyan]firefighting[/cyan], [cyan]delivery[/cyan], "
+        "[cyan]parcels[/cyan]) or a file of your own.",
         autocompletion=complete_recipe,
     ),
 ]

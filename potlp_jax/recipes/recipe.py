@@ -38,8 +38,7 @@ class Round:
             round are its own alone: they are of the states that the estimator meets.
         explored: how many further worlds are recorded as at first. Drives cost much more than exploration, and more
             buildings keep a network from learning those that it has seen by heart.
-        pursued: as in ``CollectConfig``, where it explores.
-        views_per_world, drives: as in ``CollectConfig``.
+        views_per_world, drives, pursued: as in ``CollectConfig``.
         epochs: passes over all records of training so far.
     """
 
@@ -181,6 +180,7 @@ def _stages(recipe: Recipe, folders: Sequence[Path]) -> Iterator[_Stage]:
         counts = {Split.TRAINING: chosen.worlds, Split.VALIDATION: chosen.validation_worlds}
         parts = [part(split.value, split, counts[split], driven) for split in splits]
         if chosen.explored:
-            explored = dataclasses.replace(recipe.collect, pursued=chosen.pursued)
+            changes = {"pursued": chosen.pursued, "views_per_world": chosen.views_per_world}
+            explored = dataclasses.replace(recipe.collect, **changes)
             parts.append(part("explored", Split.TRAINING, chosen.explored, explored))
         yield _Stage(tuple(parts), dataclasses.replace(recipe.fit, epochs=chosen.epochs))
