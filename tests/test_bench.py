@@ -144,9 +144,9 @@ def test_phases_of_perception_and_decision(scene):
     decision = DecisionConfig(frontiers=FrontierConfig(max_subgoals=2), search=QUICK)
     rows = measure_perception(scene, trained, decision, repeats=1)
     phases = [row.phase for row in rows]
-    assert phases[:4] == ["render", "first stage", "remember", "distances to subgoals"]
+    assert phases[:3] == ["render", "encode", "remember"]
     # What `measure_decision` measures, whatever the estimator.
-    assert phases[4:] == ["assess", "estimates", "travel", "search", "path", "whole"]
+    assert phases[3:] == ["assess", "estimates", "travel", "search", "path", "whole"]
     for row in rows:
         assert json.loads(json.dumps(as_dict(row), allow_nan=False))["run_s"] > 0
 
