@@ -49,7 +49,7 @@ def test_shipped_firefighting_tasks_share_the_papers_propositions():
 
 
 def test_shipped_task_that_does_not_exist():
-    with pytest.raises(TaskError, match=r"no shipped task 'x'; there are: delivery-1, .*, toy-2"):
+    with pytest.raises(TaskError, match=r"no shipped task 'x'; there are: campus-large-1, .*, toy-2"):
         Task.shipped("x")
 
 
