@@ -381,5 +381,9 @@ def test_hoa_needs_no_spot():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     # Those found in any order have a state for each set that has been found.
     fire = {f"firefighting-{number}": states for number, states in zip("1234", (4, 4, 5, 3), strict=True)}
-    rooms = {"parcels-1": 2**2, "parcels-2": 3, "rooms-1": 2**3, "rooms-2": 4}
-    assert done.stdout.strip() == str({"delivery-1": 2**3, **fire, **rooms, "toy-1": 2, "toy-2": 3})
+    parcels, rooms = {"parcels-1": 2**2, "parcels-2": 3}, {"rooms-1": 2**3, "rooms-2": 4}
+    campus = {}
+    for size in ("large", "medium", "small"):
+        campus |= {f"campus-{size}-1": 2**3, **{f"campus-{size}-{name}": found for name, found in parcels.items()}}
+    expected = {**campus, "delivery-1": 2**3, **fire, **parcels, **rooms, "toy-1": 2, "toy-2": 3}
+    assert done.stdout.strip() == str(expected)
