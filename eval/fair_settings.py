@@ -22,7 +22,7 @@ import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float64
@@ -134,7 +134,7 @@ class Trials:
         )
         with self._file.open("a", encoding="utf-8") as file:
             for trial in run_batch(starts, named_policy(policy), config, estimator=asked):
-                row = rows[trial.name]  # type: ignore[index]
+                row = rows[cast(tuple[str, int], trial.name)]
                 world = self._world(row["world"])
                 found = {
                     "outcome": str(trial.outcome),

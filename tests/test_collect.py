@@ -259,3 +259,17 @@ def test_the_explorer_sees_much_of_the_building_and_walks_through_known_cells(co
             assert after.travelled <= limit + math.sqrt(2)
             # The robot entered the cell knowing that it is free.
             assert bool(after.belief.free[after.cell])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"pursued": 0}, "pursued is 0; give at least 1"),
+        ({"drives": 0}, "drives is 0"),
+        ({"first_world": -4}, "numbered from 0"),
+        ({"estimator": "firefighting"}, "the driver explorer asks no estimator"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(changes, message):
+    with pytest.raises(DatasetError, match=message):
+        CollectConfig(**changes)

@@ -77,6 +77,10 @@ def test_images_that_are_none_or_of_another_size_are_refused():
     view = encode_view(*_view(world, 2))
     with pytest.raises(DatasetError, match="a map of the dataset"):
         decode_view(dataclasses.replace(view, cells=view.cells[:40]), encode_world(world), SHAPE)
+    with pytest.raises(
+        DatasetError, match=r"a world of \(7, 9\) cells is larger than the data set's arrays of \(7, 8\)"
+    ):
+        decode_view(view, encode_world(world), (7, 8))
     other = cv2.imencode(".png", np.zeros((3, 3), np.uint8))[1].tobytes()
     with pytest.raises(DatasetError, match=r"has \(3, 3\) cells; its world has \(7, 9\)"):
         decode_view(dataclasses.replace(view, letters=other), encode_world(world), SHAPE)

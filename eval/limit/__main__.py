@@ -17,17 +17,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from eval.limit.arms import REFERENCES, Arm, Experiment, key_of, missing_rows
+from eval.limit.report import markdown, page, results_of
 from potlp_jax.cache import enable_compilation_cache
-
-# Before jax is imported, so that XLA says nothing about the programs that it loads.
-enable_compilation_cache()
-
-from eval.limit.arms import REFERENCES, Arm, Experiment, key_of, missing_rows  # noqa: E402
-from eval.limit.report import markdown, page, results_of  # noqa: E402
-from potlp_jax.environments.firefighting import Firefighting  # noqa: E402
-from potlp_jax.environments.registry import make  # noqa: E402
-from potlp_jax.environments.splits import Split  # noqa: E402
-from potlp_jax.learning.estimator import named_estimator  # noqa: E402
+from potlp_jax.environments.firefighting import Firefighting
+from potlp_jax.environments.registry import make
+from potlp_jax.environments.splits import Split
+from potlp_jax.learning.estimator import named_estimator
 
 ROWS = "trials.jsonl"
 
@@ -65,6 +61,7 @@ def own_rows(file: Path, experiment: Experiment, arms: Sequence[Arm]) -> list[di
 
 
 def main() -> None:
+    enable_compilation_cache()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of the rows")
     parser.add_argument("--environment", default=Firefighting.name)

@@ -74,6 +74,8 @@ def fit(
         fail("give a DATASET and --validation, or a recipe with --recipe")
     if initial is not None and not datasets:
         fail("--initial goes on from an estimator with a DATASET; a recipe makes one from nothing")
+    if initial is not None and any(word.startswith("network") for word in settings or []):
+        fail("--initial keeps the network of its estimator as it is: leave out --set network")
     given = None if recipe is None else read_recipe(recipe)
     config = with_settings(
         fitting.FitConfig() if given is None else given.fit, settings_from_words(settings or []), "--set"

@@ -104,9 +104,11 @@ def decode_view(view: EncodedView, world: EncodedWorld, shape: tuple[int, int]) 
         shape: rows and columns of the arrays; what the map does not fill is occupied and never seen.
 
     Raises:
-        DatasetError: an image is damaged, or of another size than the world.
+        DatasetError: an image is damaged, or of another size than the world, or the world is larger than the arrays.
     """
     extent = world.rows, world.columns
+    if extent[0] > shape[0] or extent[1] > shape[1]:
+        raise DatasetError(f"a world of {extent} cells is larger than the data set's arrays of {shape}")
 
     def padded(image: bytes, value: int) -> np.ndarray:
         return _padded(_decoded(image, extent), shape, value)

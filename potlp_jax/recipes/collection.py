@@ -85,6 +85,16 @@ class CollectConfig(RecordingConfig):
     drives: int = 3
     pursued: int = 12
 
+    def __post_init__(self) -> None:
+        for name in ("drives", "pursued", "tasks_per_world", "worlds_per_shard"):
+            if getattr(self, name) < 1:
+                raise DatasetError(f"{name} is {getattr(self, name)}; give at least 1")
+        if self.first_world < 0:
+            raise DatasetError(f"first_world is {self.first_world}; worlds are numbered from 0")
+        # An estimator that nobody asks would be named in the data set all the same.
+        if self.estimator and self.driver != "potlp":
+            raise DatasetError(f"the driver {self.driver} asks no estimator: give driver=potlp, or no estimator")
+
 
 @dataclasses.dataclass(frozen=True)
 class Collected:
@@ -226,7 +236,7 @@ def _collect_shard(job: _Job) -> int:
 
 
 def _collect_world(recorder: Recorder, world: World, index: int, tasks: TaskDistribution, job: _Job) -> None:
-    """Wander through one world and record views in which a subgoal can be seen."""
+    """Drive through one world and record views."""
     config = job.config
     rng, pool = draws_of_world(config, job.split, index, tasks)
 
