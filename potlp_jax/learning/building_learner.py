@@ -13,12 +13,14 @@ from jaxtyping import Array, Bool, Float32, Int8, Int32, PRNGKeyArray, UInt8
 from potlp_jax.codec import KIND
 from potlp_jax.learning.augmentation import Augmentation, draw_gains, draw_mirrors
 from potlp_jax.learning.batches import Choice
-from potlp_jax.learning.building_network import SQUARE, BuildingConfig, BuildingNetwork, Params, map_channels
+from potlp_jax.learning.building_network import BuildingConfig, BuildingNetwork, Params, map_channels
 from potlp_jax.learning.data_figures import camera_geometry, cost_scales, image_shape
 from potlp_jax.learning.dataset import Samples
+from potlp_jax.learning.imagined_paths import outlook, prospects, scenery
 from potlp_jax.learning.map_images import DecodedView, decode_view
 from potlp_jax.learning.network import Answers
 from potlp_jax.learning.painting import Painting
+from potlp_jax.learning.squares import Squares, true_squares
 from potlp_jax.world.grid import BeliefMap
 
 
@@ -33,6 +35,9 @@ class BuildingInputs:
         true_cells, true_letters: of the buildings, ``UNKNOWN`` where nobody knows.
         subgoals: cells of the subgoals that are asked about; any where there are fewer.
         subgoal_of: which of them each of the ``K`` samples asks about.
+        lane_subgoals, lane_stays: the ``L`` pairs of a subgoal's cell and a ``phi_stay`` that are asked about; any where
+            there are fewer.
+        lane_of: which of them each sample asks about.
         real: True for views, False for what fills the batch up.
     """
 
@@ -44,6 +49,9 @@ class BuildingInputs:
     true_letters: Int32[Array, "*G H W"]
     subgoals: Int32[Array, "*G S 2"]
     subgoal_of: Int32[Array, "*G K"]
+    lane_subgoals: Int32[Array, "*G L 2"]
+    lane_stays: Int8[Array, "*G L P"]
+    lane_of: Int32[Array, "*G K"]
     real: Bool[Array, "*G"]
 
 
@@ -69,7 +77,9 @@ class BuildingLearner:
         def stacked(name: str) -> Array:
             return jnp.asarray(np.stack([getattr(view, name) for view in views]))
 
-        subgoals, subgoal_of = _distinct(samples.cells[choice.index], samples.most_subgoals)
+        cells, stays = samples.cells[choice.index], samples.phi_stay[choice.index]
+        subgoals, subgoal_of = _distinct(cells, samples.most_subgoals)
+        lanes, lane_of = _distinct(np.concatenate([cells, stays], axis=-1), min(samples.most_lanes, cells.shape[1]))
         return BuildingInputs(
             cells=stacked("cells"),
             letters=stacked("letters"),
@@ -79,6 +89,9 @@ class BuildingLearner:
             true_letters=stacked("true_letters"),
             subgoals=jnp.asarray(subgoals),
             subgoal_of=jnp.asarray(subgoal_of),
+            lane_subgoals=jnp.asarray(lanes[:, :, :2]),
+            lane_stays=jnp.asarray(lanes[:, :, 2:].astype(np.int8)),
+            lane_of=jnp.asarray(lane_of),
             real=jnp.arange(len(views)) < len(choice.views),
         )
 
@@ -95,27 +108,31 @@ class BuildingLearner:
     ) -> tuple[Answers, Float32[Array, " G"]]:
         """The network's answers, and the cross-entropy of what it says of the squares."""
         network = BuildingNetwork(self.config)
-        encoded = network.encode(params, jax.vmap(self._channels)(inputs.cells, inputs.letters, inputs.painting))
+        belief = self._belief(inputs)
+        encoded = network.encode(params, jax.vmap(map_channels)(belief, inputs.painting))
         places = network.places(params, encoded, inputs.subgoals)
         asked = jnp.take_along_axis(places, inputs.subgoal_of[:, :, None], axis=1)
-        answers = network.answer(params, asked, network.modulation(params, phi_stay, phi_go))
+        imagined = jax.tree.map(jax.nn.sigmoid, encoded.squares)
+        lanes = outlook(jax.vmap(scenery)(belief, imagined), inputs.lane_subgoals, inputs.lane_stays)
+        of_pairs = jax.vmap(lambda lane, index: jax.tree.map(lambda array: array[index], lane))(lanes, inputs.lane_of)
+        answers = network.answer(
+            params, asked, prospects(of_pairs, phi_go), network.modulation(params, phi_stay, phi_go)
+        )
         loss = jax.vmap(_squares_loss, in_axes=(0, 0, 0, None))(
             encoded.squares, inputs.true_cells, inputs.true_letters, len(self.config.propositions)
         )
         return answers, jnp.where(inputs.real, loss, jnp.float32(0))
 
-    def _channels(
-        self, cells: Int8[Array, "H W"], letters: Int32[Array, "H W"], painting: Painting
-    ) -> Float32[Array, "H W K"]:
-        belief = BeliefMap(
-            cells=cells,
-            letters=letters,
-            # Neither enters the channels.
-            resolution=jnp.float32(1),
-            extent=jnp.asarray(cells.shape, jnp.int32),
+    def _belief(self, inputs: BuildingInputs) -> BeliefMap:
+        views = inputs.cells.shape[0]
+        return BeliefMap(
+            cells=inputs.cells,
+            letters=inputs.letters,
+            # Not read.
+            resolution=jnp.ones(views, jnp.float32),
+            extent=inputs.extent,
             propositions=self.config.propositions,
         )
-        return map_channels(belief, painting)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -153,10 +170,10 @@ def _decoded(samples: Samples, view: np.integer) -> DecodedView:
 
 
 def _distinct(
-    cells: Int32[np.ndarray, "G K 2"], most: int
-) -> tuple[Int32[np.ndarray, "G S 2"], Int32[np.ndarray, "G K"]]:
-    """The distinct cells of each row, at most ``most`` and padded to so many, and which of them each entry is."""
-    found = [np.unique(row, axis=0, return_inverse=True) for row in cells]
+    asked: Int32[np.ndarray, "G K N"], most: int
+) -> tuple[Int32[np.ndarray, "G S N"], Int32[np.ndarray, "G K"]]:
+    """The distinct vectors of each row, at most ``most`` and padded to so many, and which of them each entry is."""
+    found = [np.unique(row, axis=0, return_inverse=True) for row in asked]
     distinct = np.stack([np.pad(row, ((0, most - len(row)), (0, 0))) for row, _ in found])
     return distinct.astype(np.int32), np.stack([index.reshape(-1) for _, index in found]).astype(np.int32)
 
@@ -171,7 +188,12 @@ def _mirrored(inputs: BuildingInputs, mirrored: Bool[Array, "2"]) -> BuildingInp
     cells, letters, painting, true_cells, true_letters = jax.tree.map(
         lambda array: array[places[0]][:, places[1]], maps
     )
-    subgoals = jnp.where(mirrored[None, :], inputs.extent[None, :] - 1 - inputs.subgoals, inputs.subgoals)
+
+    def turned(places: Int32[Array, "N 2"]) -> Int32[Array, "N 2"]:
+        there = jnp.where(mirrored[None, :], inputs.extent[None, :] - 1 - places, places)
+        # Places that are not asked about may lie outside of the map then.
+        return jnp.clip(there, 0, inputs.extent[None, :] - 1)
+
     return dataclasses.replace(
         inputs,
         cells=cells,
@@ -179,8 +201,8 @@ def _mirrored(inputs: BuildingInputs, mirrored: Bool[Array, "2"]) -> BuildingInp
         painting=painting,
         true_cells=true_cells,
         true_letters=true_letters,
-        # Places that are not asked about may lie outside of the map then.
-        subgoals=jnp.clip(subgoals, 0, inputs.extent[None, :] - 1),
+        subgoals=turned(inputs.subgoals),
+        lane_subgoals=turned(inputs.lane_subgoals),
     )
 
 
@@ -193,45 +215,15 @@ def _with_gains(painting: Painting, gains: Float32[Array, "G 3"]) -> Painting:
 
 
 def _squares_loss(
-    logits: Float32[Array, "rows columns P1"],
-    true_cells: Int8[Array, "H W"],
-    true_letters: Int32[Array, "H W"],
-    propositions: int,
+    logits: Squares, true_cells: Int8[Array, "H W"], true_letters: Int32[Array, "H W"], propositions: int
 ) -> Float32[Array, ""]:
     """Cross-entropy of what is said of one map's squares: mean over squares, summed over what is said of each."""
-    known, targets = square_targets(true_cells, true_letters, propositions)
+    known, truth = true_squares(true_cells, true_letters, propositions)
     rows, columns = known.shape
     # The network pads maps to whole squares of its coarsest scale, of which nothing is asked.
-    entropy = optax.sigmoid_binary_cross_entropy(logits[:rows, :columns], targets)
-    return jnp.sum(jnp.where(known[:, :, None], entropy, 0.0)) / jnp.maximum(jnp.sum(known), 1).astype(jnp.float32)
-
-
-def square_targets(
-    true_cells: Int8[Array, "H W"], true_letters: Int32[Array, "H W"], propositions: int
-) -> tuple[Bool[Array, "rows columns"], Float32[Array, "rows columns P1"]]:
-    """What is true of the squares.
-
-    Args:
-        true_cells, true_letters: of the building.
-        propositions: their number.
-
-    Returns:
-        Which squares have a cell that is known; and of each square the share of its known cells that are free, and
-        for each proposition whether a known cell has it.
-    """
-    known = true_cells != BeliefMap.UNKNOWN
-    free = true_cells == BeliefMap.FREE
-    letters = jnp.stack([(true_letters >> bit) & 1 for bit in range(propositions)], axis=-1) > 0
-    number = _in_squares(known[:, :, None]).sum(axis=2)
-    share = _in_squares(free[:, :, None]).sum(axis=2) / jnp.maximum(number, 1)
-    holds = jnp.any(_in_squares(letters & known[:, :, None]), axis=2)
-    return number[:, :, 0] > 0, jnp.concatenate([share, holds.astype(jnp.float32)], axis=-1).astype(jnp.float32)
-
-
-def _in_squares(array: Array) -> Array:
-    """``[H, W, channels]`` to ``[rows, columns, cells of a square, channels]``; what is missing of a square is 0."""
-    height, width, channels = array.shape
-    array = jnp.pad(array, ((0, -height % SQUARE), (0, -width % SQUARE), (0, 0)))
-    rows, columns = array.shape[0] // SQUARE, array.shape[1] // SQUARE
-    array = array.reshape(rows, SQUARE, columns, SQUARE, channels)
-    return jnp.moveaxis(array, 2, 1).reshape(rows, columns, SQUARE * SQUARE, channels)
+    said = jax.tree.map(lambda array: array[:rows, :columns], logits)
+    entropy = jax.tree.map(optax.sigmoid_binary_cross_entropy, said, truth)
+    # By which side one comes to a proposition is asked where it holds.
+    approach = jnp.sum(truth.holds * jnp.sum(entropy.approach, axis=-1), axis=-1)
+    of_square = entropy.free + jnp.sum(entropy.holds, axis=-1) + jnp.sum(entropy.passages, axis=-1) + approach
+    return jnp.sum(jnp.where(known, of_square, 0.0)) / jnp.maximum(jnp.sum(known), 1).astype(jnp.float32)

@@ -29,17 +29,16 @@ from flax import struct
 from jaxtyping import Array, Float32, Int8, Int32, PRNGKeyArray
 
 from potlp_jax.errors import NetworkError
+from potlp_jax.learning.imagined_paths import PROSPECTS
 from potlp_jax.learning.network import Answers, require_phi
 from potlp_jax.learning.painting import Painting
+from potlp_jax.learning.squares import SQUARE, Squares, numbers_per_square, split
 from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.frontiers import frontier_cells
 from potlp_jax.world.grid import BeliefMap
 
 Params = Any
 """Parameters of the network: nested dictionaries of float32 arrays."""
-
-SQUARE: int = 4
-"""Side in cells of the squares about which the network says what lies in them."""
 
 # The logit of P_S, and R_S and R_F before they are made positive.
 _OUTPUTS = 3
@@ -125,14 +124,13 @@ class EncodedMap:
         close: features of squares of 2 cells.
         scales: features of squares of ``SQUARE`` cells, then of twice the side, and so on.
         whole: of the building as a whole.
-        squares: logits, for each square of ``SQUARE`` cells: that it is free (on average over its cells), and that a
-            cell with each proposition lies in it.
+        squares: logits of what ``Squares`` holds.
     """
 
     close: Float32[Array, "*B h w F"]
     scales: tuple[Array, ...]
     whole: Float32[Array, "*B G"]
-    squares: Float32[Array, "*B rows columns P1"]
+    squares: Squares
 
 
 def map_channels(belief: BeliefMap, painting: Painting) -> Float32[Array, "H W K"]:
@@ -207,7 +205,8 @@ class _Encoder(nn.Module):
             x = x + _activated(_convolution(width, 0.5)(x))
             decoded.append(x)
         # Small, so that training starts near even odds.
-        squares = _dense(1 + len(config.propositions), 0.01)(x)
+        propositions = len(config.propositions)
+        squares = split(_dense(numbers_per_square(propositions), 0.01)(x), propositions)
         return EncodedMap(close=scales[0], scales=tuple(reversed(decoded)), whole=whole, squares=squares)
 
     def _down(self, x: Array) -> list[Array]:
@@ -252,8 +251,8 @@ class _Head(nn.Module):
     config: BuildingConfig
 
     @nn.compact
-    def __call__(self, place: Array, modulation: Array) -> Array:
-        x = place
+    def __call__(self, place: Array, prospects: Array, modulation: Array) -> Array:
+        x = place + _activated(_dense(self.config.head, 2.0)(prospects))
         for layer in range(_MODULATED):
             scale, shift = modulation[..., layer, 0, :], modulation[..., layer, 1, :]
             x = _activated(_dense(self.config.head, 2.0)(x) * (1 + scale) + shift)
@@ -270,10 +269,9 @@ class _Network(nn.Module):
         self.modulation = _Modulation(self.config)
         self.head = _Head(self.config)
 
-    def __call__(self, channels: Array, cells: Array, phi: Array) -> tuple[Array, Array]:
-        encoded = self.encode(channels)
-        places = self.place_of(_read_at(encoded, cells))
-        return self.answer(places[..., :, None, :], self.modulate(phi)[..., None, :, :, :, :]), encoded.squares
+    def __call__(self, channels: Array, cells: Array, prospects: Array, phi: Array) -> Array:
+        places = self.place_of(_read_at(self.encode(channels), cells))
+        return self.answer(places, prospects, self.modulate(phi))
 
     def encode(self, channels: Array) -> EncodedMap:
         rows, columns = channels.shape[-3:-1]
@@ -287,8 +285,8 @@ class _Network(nn.Module):
     def modulate(self, phi: Array) -> Array:
         return self.modulation(phi)
 
-    def answer(self, places: Array, modulation: Array) -> Array:
-        return self.head(places, modulation)
+    def answer(self, places: Array, prospects: Array, modulation: Array) -> Array:
+        return self.head(places, prospects, modulation)
 
 
 def _read_at(encoded: EncodedMap, cells: Int32[Array, "*B S 2"]) -> Float32[Array, "*B S F"]:
@@ -325,7 +323,8 @@ class BuildingNetwork:
         side, propositions = self.config.side, len(self.config.propositions)
         channels = jnp.zeros((side, side, channel_count(self.config)))
         initial = jax.jit(_Network(self.config).init)
-        return initial(key, channels, jnp.zeros((1, 2), jnp.int32), jnp.zeros((1, 2 * propositions)))["params"]
+        asked = jnp.zeros((1, 2), jnp.int32), jnp.zeros((1, PROSPECTS)), jnp.zeros((1, 2 * propositions))
+        return initial(key, channels, *asked)["params"]
 
     def encode(self, params: Params, channels: Float32[Array, "*B H W K"]) -> EncodedMap:
         """The first stage, of ``map_channels``."""
@@ -348,10 +347,14 @@ class BuildingNetwork:
         return self._apply(params, "modulate", phi)
 
     def answer(
-        self, params: Params, places: Float32[Array, "*P U"], modulation: Float32[Array, "*M layers 2 U"]
+        self,
+        params: Params,
+        places: Float32[Array, "*P U"],
+        prospects: Float32[Array, "*Q N"],
+        modulation: Float32[Array, "*M layers 2 U"],
     ) -> Answers:
         """The second stage; equally many leading dimensions, which are broadcast against each other."""
-        logit, success, failure = jnp.moveaxis(self._apply(params, "answer", places, modulation), -1, 0)
+        logit, success, failure = jnp.moveaxis(self._apply(params, "answer", places, prospects, modulation), -1, 0)
         # Softplus keeps costs positive; a success costs at least one step of the grid.
         return Answers(
             success_logit=logit,
@@ -378,7 +381,7 @@ def building_operations(config: BuildingConfig, height: int, width: int) -> tupl
     decoded = [max(config.decoder, width * 3 // 4) for width in config.widths[1:-1]]
     for level, (o, below) in enumerate(zip(decoded, [*decoded[1:], config.widths[-1]], strict=True), start=1):
         first += 2 * areas[level] * (config.widths[level] * o + 9 * o * o) + 2 * areas[level + 1] * below * o
-    first += 2 * areas[1] * decoded[0] * (1 + len(config.propositions)) + 2 * 3 * config.widths[-1] ** 2
+    first += 2 * areas[1] * decoded[0] * numbers_per_square(len(config.propositions)) + 2 * 3 * config.widths[-1] ** 2
     read = (2 * _CLOSE + 1) ** 2 * config.widths[0] + (2 * _NEAR + 1) ** 2 * sum(decoded) + config.widths[-1] + 2
     place = sum(2 * i * o for i, o in itertools.pairwise((read, config.head, config.head)))
-    return first, place, 2 * (_MODULATED * config.head**2 + config.head * _OUTPUTS)
+    return first, place, 2 * config.head * (PROSPECTS + _MODULATED * config.head + _OUTPUTS)

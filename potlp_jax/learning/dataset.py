@@ -203,7 +203,15 @@ class Samples:
     @functools.cached_property
     def most_subgoals(self) -> int:
         """Subgoals that are asked about in one view, at most."""
-        distinct = np.unique(np.column_stack([self.view_of, self.cells]), axis=0)
+        return self._most_in_a_view(self.cells)
+
+    @functools.cached_property
+    def most_lanes(self) -> int:
+        """Pairs of a subgoal and a ``phi_stay`` that are asked about in one view, at most."""
+        return self._most_in_a_view(self.cells, self.phi_stay)
+
+    def _most_in_a_view(self, *columns: Int32[np.ndarray, "N _"] | Int8[np.ndarray, "N _"]) -> int:
+        distinct = np.unique(np.column_stack([self.view_of, *columns]), axis=0)
         return int(np.unique(distinct[:, 0], return_counts=True)[1].max(initial=1))
 
 

@@ -1,0 +1,407 @@
+"""Paths through the building that a network imagines: how likely a goal is beyond a subgoal, and how far it is.
+
+A network that says what unobserved squares hold (``learning.squares``) knows nearly all that P_S, R_S and R_F depend
+on, but a path is hard to learn. So it is computed: from each subgoal, for each set of propositions to stay away from,
+the cheapest way to every square through what is not observed, as docs/model.md section 6 has it on cells. A step may be
+closed, with the chance that the network gives; the chances are added up along the way (its **obstacles**, the expected
+number of closed steps) and weigh as a detour of ``_DETOUR`` cells each. Where the network is sure, a way with less than
+one half of an obstacle is open. What comes out is not an estimate yet: steps are not independent, and the head of the
+network learns what the numbers are worth.
+
+No gradient passes: what is imagined is learned from what the buildings are, not from what would suit the answers.
+"""
+
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float32, Int8, Int32
+
+from potlp_jax.learning.squares import EAST, NORTH, PASSAGES, SIDES, SOUTH, SQUARE, WEST, Squares, in_squares
+from potlp_jax.world.frontiers import frontier_cells
+from potlp_jax.world.grid import BeliefMap
+
+OF_WAY: int = 3
+"""Numbers that describe a way whatever is looked for; see ``_of_way``."""
+
+OF_GOAL: int = 7
+"""Numbers that describe a way to a proposition; see ``_of_goal``."""
+
+PROSPECTS: int = OF_WAY + OF_GOAL + 1
+"""Numbers that the head of a network is told of a pair of a subgoal and a class (``prospects``)."""
+
+# Which numbers of a way to a proposition are costs, and not chances.
+_IS_COST = (False, False, False, False, True, False, True)
+# A step that is surely closed counts as a detour of so many cells: more than there is to go round in most buildings.
+_DETOUR = 600.0
+# Lengths in cells of the way through a square: straight, around a corner, and from a side to somewhere inside.
+_STRAIGHT, _CORNER, _INSIDE = 4.0, 2.8, 2.0
+# From this share of cells on that nobody has seen, of those that are not known to be occupied, a square is a part of
+# what is not observed; with fewer a path through it would mostly cross what is.
+_HIDDEN = 0.6
+# Squares around a subgoal by which a path does not come back into what is observed: its own frontier.
+_OWN = 2
+# Below this many obstacles a way is likely open.
+_OPEN = 0.5
+# A square as free as this can be walked in.
+_ROOMY = 0.3
+# Below this there is nothing to divide by.
+_LITTLE = 1e-3
+# Sweeps go on while a way is found that is so much cheaper, in cells: nothing is gained by less.
+_GAIN = 2.0
+# Costs enter the head in this unit of cells, as a logarithm.
+_UNIT = 10.0
+
+
+@struct.dataclass(kw_only=True)
+class Ways:
+    """Cheapest ways to places.
+
+    Attributes:
+        cost: length in cells plus ``_DETOUR`` times the obstacles; infinite where no way leads.
+        obstacles: along the way; 0 where no way leads.
+    """
+
+    cost: Float32[Array, "..."]
+    obstacles: Float32[Array, "..."]
+
+    @property
+    def length(self) -> Float32[Array, "..."]:
+        """In cells; 0 where no way leads."""
+        return jnp.where(jnp.isfinite(self.cost), self.cost - _DETOUR * self.obstacles, 0.0)
+
+    def chance(self, most: float = 1.0) -> Float32[Array, "..."]:
+        """1 without obstacles, 0 from ``most`` obstacles on and where no way leads."""
+        return jnp.where(jnp.isfinite(self.cost), jnp.maximum(1 - self.obstacles / most, 0.0), 0.0)
+
+
+@struct.dataclass(kw_only=True)
+class _SideWays:
+    """To the sides of squares; lanes are the last axis."""
+
+    upright: Ways
+    """Of shape ``[rows, columns + 1, L]``: to the western sides of squares, and the eastern ones of the last."""
+    level: Ways
+    """Of shape ``[rows + 1, columns, L]``: to the northern sides of squares, and the southern ones of the last."""
+
+    def of_squares(self) -> tuple[Ways, Ways, Ways, Ways]:
+        """To the four sides of each square, in the order of the sides, ``[rows, columns, L]``."""
+        west, east = (jax.tree.map(lambda a, cut=cut: a[..., cut, :], self.upright) for cut in _LESS_ONE)
+        north, south = (jax.tree.map(lambda a, cut=cut: a[..., cut, :, :], self.level) for cut in _LESS_ONE)
+        return west, east, north, south
+
+
+# All but the last, and all but the first.
+_LESS_ONE = (slice(None, -1), slice(1, None))
+
+
+@struct.dataclass(kw_only=True)
+class Outlook:
+    """What lies beyond subgoals as the network imagines it, for each lane: a subgoal and what to stay away from."""
+
+    way: Float32[Array, "*B W"]
+    """``OF_WAY`` numbers, whatever is looked for."""
+    goal: Float32[Array, "*B P V"]
+    """``OF_GOAL`` numbers for each proposition."""
+
+
+@struct.dataclass(kw_only=True)
+class Scenery:
+    """What is known of the squares of a map.
+
+    Attributes:
+        unseen: whether a cell is unknown.
+        hidden: whether the square is a part of what is not observed.
+        seen: whether a cell with each proposition was seen in it.
+        open: whether a free cell was seen in it.
+        frontier: whether it has a cell of the frontier.
+        free: share of the unknown cells that are free, as imagined.
+        holds: chance that an unknown cell with each proposition lies in it.
+        passages, approach: as imagined.
+    """
+
+    unseen: Bool[Array, "rows columns"]
+    hidden: Bool[Array, "rows columns"]
+    seen: Bool[Array, "rows columns P"]
+    open: Bool[Array, "rows columns"]
+    frontier: Bool[Array, "rows columns"]
+    free: Float32[Array, "rows columns"]
+    holds: Float32[Array, "rows columns P"]
+    passages: Float32[Array, "rows columns 6"]
+    approach: Float32[Array, "rows columns P 4"]
+
+
+def scenery(belief: BeliefMap, imagined: Squares) -> Scenery:
+    """What is known of the squares of a belief, and what is imagined of the rest.
+
+    Args:
+        belief: one map.
+        imagined: chances; of at least the map's squares, more are left out.
+    """
+    unseen, free = (in_squares(mask).sum(axis=(2, 3)).astype(jnp.float32) for mask in (belief.unknown, belief.free))
+    rows, columns = unseen.shape
+    imagined = jax.tree.map(lambda array: array[:rows, :columns], imagined)
+    labelled = jnp.stack([(belief.letters >> bit) & 1 for bit in range(len(belief.propositions))], axis=-1) > 0
+    seen = jnp.any(in_squares(labelled & belief.free[:, :, None]), axis=(2, 3))
+    # Of the square's free cells those that are not known to be free.
+    rest = SQUARE * SQUARE * imagined.free - free
+    return Scenery(
+        unseen=unseen > 0,
+        hidden=unseen > _HIDDEN * (unseen + free),
+        seen=seen,
+        open=free > 0,
+        frontier=jnp.any(in_squares(frontier_cells(belief, belief.free)), axis=(2, 3)),
+        free=jnp.clip(rest / jnp.maximum(unseen, 1.0), 0.0, 1.0),
+        holds=jnp.where(seen | (unseen == 0)[:, :, None], 0.0, imagined.holds),
+        passages=imagined.passages,
+        approach=imagined.approach,
+    )
+
+
+def outlook(scene: Scenery, subgoals: Int32[Array, "L 2"], stay: Int8[Array, "L P"]) -> Outlook:
+    """What lies beyond subgoals.
+
+    Args:
+        scene: of the maps.
+        subgoals: a cell for each lane.
+        stay: its ``phi_stay``: the propositions at -1 are avoided.
+
+    Returns:
+        Numbers of about the size of 1.
+    """
+    scene = jax.tree.map(jax.lax.stop_gradient, scene)
+    avoided = (stay == -1)[..., None, None, :, :]
+    # [rows, columns, L], as all that follows.
+    clear = jnp.prod(jnp.where(avoided, 1 - scene.holds[..., None, :], 1.0), axis=-1)
+    barred = jnp.any(scene.seen[..., None, :] & avoided, axis=-1)
+    away = _squares_away(scene, subgoals)
+    begins = (away == 0) | ((away == 1) & scene.frontier[..., None])
+    start = _at_sides(jnp.where(begins, _INSIDE + SQUARE * away.astype(jnp.float32), jnp.inf))
+    closed = [1 - scene.passages[..., number, None] * clear for number in range(len(PASSAGES))]
+    hidden = _solved(start, [jnp.where(scene.hidden[..., None], step, jnp.inf) for step in closed])
+    # Out by another frontier than the subgoal's own, and on through what is observed.
+    leaves = _at_sides(jnp.where((scene.open & scene.frontier)[..., None] & (away > _OWN), 0.0, jnp.inf))
+    out = jax.tree.map(lambda ways, leaving: ways + leaving, hidden, leaves)
+    closed = [1 - scene.passages[..., number, None] + jnp.zeros_like(clear) for number in range(len(PASSAGES))]
+    seen = _solved(out, [jnp.where(scene.open[..., None] & ~barred, step, jnp.inf) for step in closed])
+    here = away == 0
+    goals = [_of_goal(scene, hidden, _arrived(seen), here, bit) for bit in range(stay.shape[-1])]
+    return Outlook(way=_of_way(scene, clear, _arrived(hidden)), goal=jnp.stack(goals, axis=-2))
+
+
+def _squares_away(scene: Scenery, subgoals: Int32[Array, "L 2"]) -> Int32[Array, "rows columns L"]:
+    """How many squares each is away from each subgoal's, diagonal steps counted as one."""
+    rows, columns = scene.unseen.shape[-2:]
+    row, column = jnp.moveaxis(subgoals // SQUARE, -1, 0)
+    down = jnp.abs(jnp.arange(rows, dtype=jnp.int32)[:, None, None] - row[..., None, None, :])
+    across = jnp.abs(jnp.arange(columns, dtype=jnp.int32)[:, None] - column[..., None, None, :])
+    return jnp.maximum(down, across)
+
+
+def _at_sides(cost: Float32[Array, "rows columns L"]) -> _SideWays:
+    """Ways without obstacles to the sides of squares, by the cheaper of the two squares that share it."""
+
+    def ways(least: Array) -> Ways:
+        return Ways(cost=least, obstacles=jnp.zeros_like(least))
+
+    before, behind = (_padded(cost, -2, first) for first in (False, True))
+    above, below = (_padded(cost, -3, first) for first in (False, True))
+    return _SideWays(upright=ways(jnp.minimum(before, behind)), level=ways(jnp.minimum(above, below)))
+
+
+def _padded(array: Array, axis: int, first: bool, value: float = jnp.inf) -> Array:
+    """One more along an axis, at its beginning or at its end."""
+    widths = [(0, 0)] * array.ndim
+    widths[axis] = (1, 0) if first else (0, 1)
+    return jnp.pad(array, widths, constant_values=value)
+
+
+def _cheaper(one: Ways, other: Ways) -> Ways:
+    less = other.cost < one.cost
+    return jax.tree.map(lambda a, b: jnp.where(less, b, a), one, other)
+
+
+def _solved(start: _SideWays, closed: Sequence[Float32[Array, "rows columns L"]]) -> _SideWays:
+    """Cheapest ways from where they begin.
+
+    Squares are swept line by line, downwards, upwards and along columns, as in ``planning.distances.sweeping``, until
+    nothing changes.
+
+    Args:
+        start: where ways begin.
+        closed: the chance that each of ``PASSAGES`` is closed; infinite where it never is to be taken.
+    """
+    *batch, _, _, lanes = closed[0].shape
+    closed = [_folded(chance) for chance in closed]
+    down = _Lines(closed)
+    across = _Lines([jnp.swapaxes(closed[number], 0, 1) for number in _TRANSPOSED])
+
+    def swept(state: tuple[_SideWays, Bool[Array, ""]]) -> tuple[_SideWays, Bool[Array, ""]]:
+        before, _ = state
+        after = _transposed(across.swept(_transposed(down.swept(before))))
+        old, new = ((ways.upright.cost, ways.level.cost) for ways in (before, after))
+        return after, jnp.any(new[0] < old[0] - _GAIN) | jnp.any(new[1] < old[1] - _GAIN)
+
+    begin = (jax.tree.map(_folded, start), jnp.bool_(True))
+    solved = jax.lax.while_loop(lambda state: state[1], swept, begin)[0]
+
+    def unfolded(array: Array) -> Array:
+        array = array.reshape(*array.shape[:2], -1, lanes)
+        return jnp.moveaxis(array, 2, 0).reshape(*batch, *array.shape[:2], lanes)
+
+    return jax.tree.map(unfolded, solved)
+
+
+def _folded(array: Array) -> Array:
+    """``[*B, rows, columns, L]`` to ``[rows, columns, lanes]``: the lanes of all maps side by side."""
+    rows, columns, lanes = array.shape[-3:]
+    return jnp.moveaxis(array.reshape(-1, rows, columns, lanes), 0, 2).reshape(rows, columns, -1)
+
+
+def _transposed(ways: _SideWays) -> _SideWays:
+    turned = jax.tree.map(lambda array: jnp.swapaxes(array, 0, 1), ways)
+    return _SideWays(upright=turned.level, level=turned.upright)
+
+
+# What each passage becomes where rows and columns change places.
+_TRANSPOSED = tuple(PASSAGES.index(pair) for pair in ((NORTH, SOUTH), (WEST, EAST), (WEST, NORTH), (WEST, SOUTH), (NORTH, EAST), (SOUTH, EAST)))
+
+
+class _Lines:
+    """The rows of squares of a map, to be swept in both directions."""
+
+    def __init__(self, closed: Sequence[Float32[Array, "rows columns L"]]) -> None:
+        self.steps = tuple(
+            Ways(cost=(_STRAIGHT if number < 2 else _CORNER) + _DETOUR * chance, obstacles=chance)
+            for number, chance in enumerate(closed)
+        )
+
+    def swept(self, ways: _SideWays) -> _SideWays:
+        """Once downwards, once upwards."""
+        for near, far in ((NORTH, SOUTH), (SOUTH, NORTH)):
+            ways = self._swept_once(ways, near, far)
+        return ways
+
+    def _swept_once(self, ways: _SideWays, near: int, far: int) -> _SideWays:
+        """Row by row from the map's ``near`` side to its ``far`` side."""
+
+        def next_row(begin: Ways, row: tuple[Ways, Ways, tuple[Ways, ...]]) -> tuple[Ways, tuple[Ways, Ways]]:
+            upright, end, steps = row
+
+            def through(side: Ways, *ends: int) -> Ways:
+                return jax.tree.map(jnp.add, side, steps[_passage(*ends)])
+
+            upright = _cheaper(upright, _shifted(through(begin, near, EAST), first=True))
+            upright = _cheaper(upright, _shifted(through(begin, near, WEST), first=False))
+            west, east = (jax.tree.map(lambda array, cut=cut: array[cut], upright) for cut in _LESS_ONE)
+            for arriving in (through(begin, near, far), through(west, WEST, far), through(east, EAST, far)):
+                end = _cheaper(end, arriving)
+            return end, (upright, end)
+
+        upwards = near == SOUTH
+        outermost, ends = (jax.tree.map(lambda array, cut=cut: array[cut], ways.level) for cut in _EDGE[upwards])
+        _, (upright, level) = jax.lax.scan(next_row, outermost, (ways.upright, ends, self.steps), reverse=upwards)
+        joined = (level, outermost) if upwards else (outermost, level)
+        return _SideWays(upright=upright, level=jax.tree.map(_stacked, *joined))
+
+
+def _passage(one: int, other: int) -> int:
+    """Which of ``PASSAGES`` joins two sides."""
+    return PASSAGES.index((one, other) if (one, other) in PASSAGES else (other, one))
+
+
+def _stacked(above: Array, below: Array) -> Array:
+    """One row and several, or several and one, as one array of rows."""
+    most = max(above.ndim, below.ndim)
+    return jnp.concatenate([array if array.ndim == most else array[None] for array in (above, below)])
+
+
+# Of the level sides the outermost row and the others, for sweeps downwards and upwards.
+_EDGE = ((0, slice(1, None)), (-1, slice(None, -1)))
+
+
+def _shifted(ways: Ways, first: bool) -> Ways:
+    """Ways to one more side, to which none leads, before or behind the others of a row."""
+    return Ways(
+        cost=_padded(ways.cost, 0, first),
+        obstacles=_padded(ways.obstacles, 0, first, 0.0),
+    )
+
+
+def _arrived(ways: _SideWays, closed: Sequence[Array] = (jnp.float32(0),) * SIDES) -> Ways:
+    """Ways into squares, by the side that is cheapest; ``closed``: the obstacles behind each side."""
+    entered = [
+        Ways(cost=side.cost + (_INSIDE + _DETOUR * step), obstacles=side.obstacles + step)
+        for side, step in zip(ways.of_squares(), closed, strict=True)
+    ]
+    return functools.reduce(_cheaper, entered)
+
+
+def _of_way(scene: Scenery, clear: Float32[Array, "rows columns L"], arrived: Ways) -> Float32[Array, "*B W"]:
+    """How far and how much one can explore there: what R_F depends on."""
+    hidden, free = scene.hidden[..., None], scene.free[..., None]
+    walked = hidden & (arrived.obstacles < _OPEN) & (free * clear > _ROOMY) & jnp.isfinite(arrived.cost)
+    farthest = jnp.max(jnp.where(walked, arrived.length, 0.0), axis=(-3, -2))
+    expected = jnp.max(jnp.where(hidden & (free > _ROOMY), arrived.chance() * arrived.length, 0.0), axis=(-3, -2))
+    room = jnp.sum(walked, axis=(-3, -2)).astype(jnp.float32)
+    return jnp.stack([_scaled(farthest), _scaled(expected), _scaled(room)], axis=-1)
+
+
+def _of_goal(
+    scene: Scenery, hidden: _SideWays, seen: Ways, here: Bool[Array, "rows columns L"], bit: int
+) -> Float32[Array, "L V"]:
+    """How much of a proposition can be reached, and how far it is: what P_S and R_S depend on."""
+    approach = [1 - scene.approach[..., bit, side, None] for side in range(SIDES)]
+    arrived = _arrived(hidden, approach)
+    # The subgoal's own square is entered already.
+    cost, obstacles = (jnp.where(here, 0.0, array) for array in (arrived.cost, arrived.obstacles))
+    arrived = Ways(cost=cost, obstacles=obstacles)
+    mass = jnp.where(scene.unseen, scene.holds[..., bit], 0.0)[..., None]
+
+    def total(weight: Array) -> Array:
+        return jnp.sum(mass * weight, axis=(-3, -2))
+
+    there, near = jnp.sum(mass, axis=(-3, -2)), arrived.chance(2.0)
+    reached, share = total(arrived.chance()), jnp.maximum(there, _LITTLE)
+    length = total(near * arrived.length) / jnp.maximum(total(near), _LITTLE)
+    found = jnp.where(scene.seen[..., bit, None], seen.chance(), 0.0)
+    best = jnp.max(found, axis=(-3, -2))
+    distance = jnp.where(found >= jnp.maximum(best, _LITTLE)[..., None, None, :], seen.length, jnp.inf)
+    distance = jnp.min(distance, axis=(-3, -2))
+    return jnp.stack(
+        [
+            jnp.minimum(there, 3.0) + jnp.zeros_like(reached),
+            jnp.minimum(reached, 3.0),
+            reached / share,
+            total(near) / share,
+            _scaled(length),
+            best,
+            jnp.where(best > 0, _scaled(jnp.where(best > 0, distance, 0.0)), 0.0),
+        ],
+        axis=-1,
+    )
+
+
+def _scaled(cost: Array) -> Array:
+    return jnp.log1p(cost / _UNIT)
+
+
+def prospects(lanes: Outlook, phi_go: Int8[Array, "*B K P"]) -> Float32[Array, "*B K N"]:
+    """What the head of the network is told of pairs of a subgoal and a class.
+
+    Args:
+        lanes: for each pair the outlook of its lane, ``[*B, K, ...]``.
+        phi_go: of the pair's class.
+
+    Returns:
+        ``PROSPECTS`` numbers. Of several propositions that must hold together the least chance and the farthest way
+        count, of none all are 0.
+    """
+    wanted = (phi_go == 1)[..., None]
+    some = jnp.any(wanted, axis=-2)
+    least = jnp.min(jnp.where(wanted, lanes.goal, jnp.inf), axis=-2)
+    most = jnp.max(jnp.where(wanted, lanes.goal, -jnp.inf), axis=-2)
+    goal = jnp.where(some, jnp.where(jnp.asarray(_IS_COST), most, least), 0.0)
+    return jnp.concatenate([lanes.way, goal, some.astype(jnp.float32)], axis=-1)
