@@ -368,8 +368,8 @@ def _of_goal(
     length = total(near * arrived.length) / jnp.maximum(total(near), _LITTLE)
     found = jnp.where(scene.seen[..., bit, None], seen.chance(), 0.0)
     best = jnp.max(found, axis=(-3, -2))
-    distance = jnp.where(found >= jnp.maximum(best, _LITTLE)[..., None, None, :], seen.length, jnp.inf)
-    distance = jnp.min(distance, axis=(-3, -2))
+    likeliest = (found > 0) & (found >= best[..., None, None, :])
+    distance = jnp.min(jnp.where(likeliest, seen.length, jnp.inf), axis=(-3, -2))
     return jnp.stack(
         [
             jnp.minimum(there, 3.0) + jnp.zeros_like(reached),

@@ -117,7 +117,8 @@ def _openings(free: Bool[Array, "H W"]) -> Bool[Array, "rows columns 4 side side
         rows, columns = (1 + (step if axis == number else 0) for number in (0, 1))
         crossing = free & around[rows : rows + height, columns : columns + width]
         at_edge = edge == (0 if step < 0 else SQUARE - 1)
-        found.append(in_squares(crossing) & (at_edge[:, None] if axis == 0 else at_edge[None, :]))
+        at_edge = at_edge[:, None] if axis == 0 else at_edge[None, :]
+        found.append(in_squares(crossing) & at_edge[None, None])
     return jnp.stack(found, axis=2)
 
 
