@@ -113,7 +113,9 @@ class BuildingLearner:
         places = network.places(params, encoded, inputs.subgoals)
         asked = jnp.take_along_axis(places, inputs.subgoal_of[:, :, None], axis=1)
         imagined = jax.tree.map(jax.nn.sigmoid, encoded.squares)
-        lanes = outlook(jax.vmap(scenery)(belief, imagined), inputs.lane_subgoals, inputs.lane_stays)
+        scenes = jax.vmap(scenery)(belief, imagined)
+        # One map after the other: sweeps of several at once go on for the one that takes longest.
+        lanes = jax.lax.map(lambda one: outlook(*one), (scenes, inputs.lane_subgoals, inputs.lane_stays))
         of_pairs = jax.vmap(lambda lane, index: jax.tree.map(lambda array: array[index], lane))(lanes, inputs.lane_of)
         answers = network.answer(
             params, asked, prospects(of_pairs, phi_go), network.modulation(params, phi_stay, phi_go)

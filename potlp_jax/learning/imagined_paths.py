@@ -88,8 +88,8 @@ class _SideWays:
 
     def of_squares(self) -> tuple[Ways, Ways, Ways, Ways]:
         """To the four sides of each square, in the order of the sides, ``[rows, columns, L]``."""
-        west, east = (jax.tree.map(lambda a, cut=cut: a[..., cut, :], self.upright) for cut in _LESS_ONE)
-        north, south = (jax.tree.map(lambda a, cut=cut: a[..., cut, :, :], self.level) for cut in _LESS_ONE)
+        west, east = (jax.tree.map(lambda a, cut=cut: a[:, cut], self.upright) for cut in _LESS_ONE)
+        north, south = (jax.tree.map(lambda a, cut=cut: a[cut], self.level) for cut in _LESS_ONE)
         return west, east, north, south
 
 
@@ -172,31 +172,31 @@ def outlook(scene: Scenery, subgoals: Int32[Array, "L 2"], stay: Int8[Array, "L 
         Numbers of about the size of 1.
     """
     scene = jax.tree.map(jax.lax.stop_gradient, scene)
-    avoided = (stay == -1)[..., None, None, :, :]
+    avoided = (stay == -1)[None, None]
     # [rows, columns, L], as all that follows.
-    clear = jnp.prod(jnp.where(avoided, 1 - scene.holds[..., None, :], 1.0), axis=-1)
-    barred = jnp.any(scene.seen[..., None, :] & avoided, axis=-1)
+    clear = jnp.prod(jnp.where(avoided, 1 - scene.holds[:, :, None], 1.0), axis=-1)
+    barred = jnp.any(scene.seen[:, :, None] & avoided, axis=-1)
     away = _squares_away(scene, subgoals)
-    begins = (away == 0) | ((away == 1) & scene.frontier[..., None])
+    begins = (away == 0) | ((away == 1) & scene.frontier[:, :, None])
     start = _at_sides(jnp.where(begins, _INSIDE + SQUARE * away.astype(jnp.float32), jnp.inf))
-    closed = [1 - scene.passages[..., number, None] * clear for number in range(len(PASSAGES))]
-    hidden = _solved(start, [jnp.where(scene.hidden[..., None], step, jnp.inf) for step in closed])
+    passages = [scene.passages[:, :, number, None] for number in range(len(PASSAGES))]
+    inside = scene.hidden[:, :, None]
+    hidden = _solved(start, [jnp.where(inside, 1 - chance * clear, jnp.inf) for chance in passages])
     # Out by another frontier than the subgoal's own, and on through what is observed.
-    leaves = _at_sides(jnp.where((scene.open & scene.frontier)[..., None] & (away > _OWN), 0.0, jnp.inf))
-    out = jax.tree.map(lambda ways, leaving: ways + leaving, hidden, leaves)
-    closed = [1 - scene.passages[..., number, None] + jnp.zeros_like(clear) for number in range(len(PASSAGES))]
-    seen = _solved(out, [jnp.where(scene.open[..., None] & ~barred, step, jnp.inf) for step in closed])
-    here = away == 0
-    goals = [_of_goal(scene, hidden, _arrived(seen), here, bit) for bit in range(stay.shape[-1])]
+    leaves = _at_sides(jnp.where((scene.open & scene.frontier)[:, :, None] & (away > _OWN), 0.0, jnp.inf))
+    out = jax.tree.map(jnp.add, hidden, leaves)
+    inside = scene.open[:, :, None] & ~barred
+    seen = _arrived(_solved(out, [jnp.where(inside, 1 - chance, jnp.inf) for chance in passages]))
+    goals = [_of_goal(scene, hidden, seen, away == 0, bit) for bit in range(stay.shape[-1])]
     return Outlook(way=_of_way(scene, clear, _arrived(hidden)), goal=jnp.stack(goals, axis=-2))
 
 
 def _squares_away(scene: Scenery, subgoals: Int32[Array, "L 2"]) -> Int32[Array, "rows columns L"]:
     """How many squares each is away from each subgoal's, diagonal steps counted as one."""
-    rows, columns = scene.unseen.shape[-2:]
-    row, column = jnp.moveaxis(subgoals // SQUARE, -1, 0)
-    down = jnp.abs(jnp.arange(rows, dtype=jnp.int32)[:, None, None] - row[..., None, None, :])
-    across = jnp.abs(jnp.arange(columns, dtype=jnp.int32)[:, None] - column[..., None, None, :])
+    rows, columns = scene.unseen.shape
+    row, column = (subgoals // SQUARE).T
+    down = jnp.abs(jnp.arange(rows, dtype=jnp.int32)[:, None, None] - row[None, None])
+    across = jnp.abs(jnp.arange(columns, dtype=jnp.int32)[None, :, None] - column[None, None])
     return jnp.maximum(down, across)
 
 
@@ -206,8 +206,8 @@ def _at_sides(cost: Float32[Array, "rows columns L"]) -> _SideWays:
     def ways(least: Array) -> Ways:
         return Ways(cost=least, obstacles=jnp.zeros_like(least))
 
-    before, behind = (_padded(cost, -2, first) for first in (False, True))
-    above, below = (_padded(cost, -3, first) for first in (False, True))
+    before, behind = (_padded(cost, 1, first) for first in (False, True))
+    above, below = (_padded(cost, 0, first) for first in (False, True))
     return _SideWays(upright=ways(jnp.minimum(before, behind)), level=ways(jnp.minimum(above, below)))
 
 
@@ -233,8 +233,6 @@ def _solved(start: _SideWays, closed: Sequence[Float32[Array, "rows columns L"]]
         start: where ways begin.
         closed: the chance that each of ``PASSAGES`` is closed; infinite where it never is to be taken.
     """
-    *batch, _, _, lanes = closed[0].shape
-    closed = [_folded(chance) for chance in closed]
     down = _Lines(closed)
     across = _Lines([jnp.swapaxes(closed[number], 0, 1) for number in _TRANSPOSED])
 
@@ -244,20 +242,7 @@ def _solved(start: _SideWays, closed: Sequence[Float32[Array, "rows columns L"]]
         old, new = ((ways.upright.cost, ways.level.cost) for ways in (before, after))
         return after, jnp.any(new[0] < old[0] - _GAIN) | jnp.any(new[1] < old[1] - _GAIN)
 
-    begin = (jax.tree.map(_folded, start), jnp.bool_(True))
-    solved = jax.lax.while_loop(lambda state: state[1], swept, begin)[0]
-
-    def unfolded(array: Array) -> Array:
-        array = array.reshape(*array.shape[:2], -1, lanes)
-        return jnp.moveaxis(array, 2, 0).reshape(*batch, *array.shape[:2], lanes)
-
-    return jax.tree.map(unfolded, solved)
-
-
-def _folded(array: Array) -> Array:
-    """``[*B, rows, columns, L]`` to ``[rows, columns, lanes]``: the lanes of all maps side by side."""
-    rows, columns, lanes = array.shape[-3:]
-    return jnp.moveaxis(array.reshape(-1, rows, columns, lanes), 0, 2).reshape(rows, columns, -1)
+    return jax.lax.while_loop(lambda state: state[1], swept, (start, jnp.bool_(True)))[0]
 
 
 def _transposed(ways: _SideWays) -> _SideWays:
@@ -266,7 +251,10 @@ def _transposed(ways: _SideWays) -> _SideWays:
 
 
 # What each passage becomes where rows and columns change places.
-_TRANSPOSED = tuple(PASSAGES.index(pair) for pair in ((NORTH, SOUTH), (WEST, EAST), (WEST, NORTH), (WEST, SOUTH), (NORTH, EAST), (SOUTH, EAST)))
+_TRANSPOSED = tuple(
+    PASSAGES.index(pair)
+    for pair in ((NORTH, SOUTH), (WEST, EAST), (WEST, NORTH), (WEST, SOUTH), (NORTH, EAST), (SOUTH, EAST))
+)
 
 
 class _Lines:
@@ -330,22 +318,24 @@ def _shifted(ways: Ways, first: bool) -> Ways:
     )
 
 
-def _arrived(ways: _SideWays, closed: Sequence[Array] = (jnp.float32(0),) * SIDES) -> Ways:
-    """Ways into squares, by the side that is cheapest; ``closed``: the obstacles behind each side."""
+def _arrived(ways: _SideWays, closed: Sequence[Float32[Array, "rows columns 1"]] | None = None) -> Ways:
+    """Ways into squares, by the side that is cheapest; ``closed``: the obstacles behind each side, none by default."""
+    sides = ways.of_squares()
+    steps = [jnp.zeros_like(side.cost) for side in sides] if closed is None else closed
     entered = [
         Ways(cost=side.cost + (_INSIDE + _DETOUR * step), obstacles=side.obstacles + step)
-        for side, step in zip(ways.of_squares(), closed, strict=True)
+        for side, step in zip(sides, steps, strict=True)
     ]
     return functools.reduce(_cheaper, entered)
 
 
 def _of_way(scene: Scenery, clear: Float32[Array, "rows columns L"], arrived: Ways) -> Float32[Array, "*B W"]:
     """How far and how much one can explore there: what R_F depends on."""
-    hidden, free = scene.hidden[..., None], scene.free[..., None]
+    hidden, free = scene.hidden[:, :, None], scene.free[:, :, None]
     walked = hidden & (arrived.obstacles < _OPEN) & (free * clear > _ROOMY) & jnp.isfinite(arrived.cost)
-    farthest = jnp.max(jnp.where(walked, arrived.length, 0.0), axis=(-3, -2))
-    expected = jnp.max(jnp.where(hidden & (free > _ROOMY), arrived.chance() * arrived.length, 0.0), axis=(-3, -2))
-    room = jnp.sum(walked, axis=(-3, -2)).astype(jnp.float32)
+    farthest = jnp.max(jnp.where(walked, arrived.length, 0.0), axis=(0, 1))
+    expected = jnp.max(jnp.where(hidden & (free > _ROOMY), arrived.chance() * arrived.length, 0.0), axis=(0, 1))
+    room = jnp.sum(walked, axis=(0, 1)).astype(jnp.float32)
     return jnp.stack([_scaled(farthest), _scaled(expected), _scaled(room)], axis=-1)
 
 
@@ -353,23 +343,23 @@ def _of_goal(
     scene: Scenery, hidden: _SideWays, seen: Ways, here: Bool[Array, "rows columns L"], bit: int
 ) -> Float32[Array, "L V"]:
     """How much of a proposition can be reached, and how far it is: what P_S and R_S depend on."""
-    approach = [1 - scene.approach[..., bit, side, None] for side in range(SIDES)]
+    approach = [1 - scene.approach[:, :, bit, side, None] for side in range(SIDES)]
     arrived = _arrived(hidden, approach)
     # The subgoal's own square is entered already.
     cost, obstacles = (jnp.where(here, 0.0, array) for array in (arrived.cost, arrived.obstacles))
     arrived = Ways(cost=cost, obstacles=obstacles)
-    mass = jnp.where(scene.unseen, scene.holds[..., bit], 0.0)[..., None]
+    mass = jnp.where(scene.unseen, scene.holds[:, :, bit], 0.0)[:, :, None]
 
     def total(weight: Array) -> Array:
-        return jnp.sum(mass * weight, axis=(-3, -2))
+        return jnp.sum(mass * weight, axis=(0, 1))
 
-    there, near = jnp.sum(mass, axis=(-3, -2)), arrived.chance(2.0)
+    there, near = jnp.sum(mass, axis=(0, 1)), arrived.chance(2.0)
     reached, share = total(arrived.chance()), jnp.maximum(there, _LITTLE)
     length = total(near * arrived.length) / jnp.maximum(total(near), _LITTLE)
-    found = jnp.where(scene.seen[..., bit, None], seen.chance(), 0.0)
-    best = jnp.max(found, axis=(-3, -2))
-    likeliest = (found > 0) & (found >= best[..., None, None, :])
-    distance = jnp.min(jnp.where(likeliest, seen.length, jnp.inf), axis=(-3, -2))
+    found = jnp.where(scene.seen[:, :, bit, None], seen.chance(), 0.0)
+    best = jnp.max(found, axis=(0, 1))
+    likeliest = (found > 0) & (found >= best[None, None])
+    distance = jnp.min(jnp.where(likeliest, seen.length, jnp.inf), axis=(0, 1))
     return jnp.stack(
         [
             jnp.minimum(there, 3.0) + jnp.zeros_like(reached),
@@ -401,7 +391,8 @@ def prospects(lanes: Outlook, phi_go: Int8[Array, "*B K P"]) -> Float32[Array, "
     """
     wanted = (phi_go == 1)[..., None]
     some = jnp.any(wanted, axis=-2)
-    least = jnp.min(jnp.where(wanted, lanes.goal, jnp.inf), axis=-2)
-    most = jnp.max(jnp.where(wanted, lanes.goal, -jnp.inf), axis=-2)
-    goal = jnp.where(some, jnp.where(jnp.asarray(_IS_COST), most, least), 0.0)
+    # The least chance and the largest cost, which is the least of what lies below 0.
+    sign = jnp.broadcast_to(jnp.where(jnp.asarray(_IS_COST), -1.0, 1.0), lanes.goal.shape)
+    worst = sign[..., 0, :] * jnp.min(jnp.where(wanted, sign * lanes.goal, jnp.inf), axis=-2)
+    goal = jnp.where(some, worst, 0.0)
     return jnp.concatenate([lanes.way, goal, some.astype(jnp.float32)], axis=-1)

@@ -1,11 +1,11 @@
 """What a building network says of squares of the map: how free they are, what they hold, how one gets through them.
 
-A square has four sides. A **passage** joins two of them: a robot that enters the square by one can leave it by the
-other without entering another square in between. Paths on squares that follow passages are paths on cells, also where
-a wall of one cell divides a square.
+A square has four sides, each with one opening: the longest run of cells by which one crosses it. A **passage** joins two
+of them: a robot that enters the square by one opening can leave it by the other without entering another square in
+between. So paths on squares that follow passages are paths on cells, also where a wall of one cell divides a square and
+its sides; what they miss is a second, smaller opening of a side.
 """
 
-import dataclasses
 import itertools
 
 import jax.numpy as jnp
@@ -39,8 +39,8 @@ class Squares:
         free: share of the cells that are free.
         holds: whether a cell with each proposition lies in it.
         passages: whether each of ``PASSAGES`` is open.
-        approach: for each proposition and side, whether a cell with it can be reached from that side without leaving
-            the square; says nothing where the proposition does not hold in the square.
+        approach: for each proposition and side, whether a cell with it can be reached from that side's opening without
+            leaving the square; says nothing where the proposition does not hold in the square.
     """
 
     free: Float32[Array, "*B rows columns"]
@@ -96,30 +96,43 @@ def true_squares(
     reached = _reached(in_squares(free), openings)
     passages = [jnp.any(reached[:, :, one] & openings[:, :, other], axis=(-2, -1)) for one, other in PASSAGES]
     approach = jnp.any(reached[..., None] & holding[:, :, None], axis=(3, 4))
-    numbers = Squares(
-        free=share,
-        holds=jnp.any(holding, axis=(2, 3)),
-        passages=jnp.stack(passages, axis=-1),
-        approach=jnp.swapaxes(approach, -1, -2),
+    return number > 0, Squares(
+        free=share.astype(jnp.float32),
+        holds=jnp.any(holding, axis=(2, 3)).astype(jnp.float32),
+        passages=jnp.stack(passages, axis=-1).astype(jnp.float32),
+        approach=jnp.swapaxes(approach, -1, -2).astype(jnp.float32),
     )
-    as_floats = {field.name: getattr(numbers, field.name).astype(jnp.float32) for field in dataclasses.fields(numbers)}
-    return number > 0, Squares(**as_floats)
 
 
 def _openings(free: Bool[Array, "H W"]) -> Bool[Array, "rows columns 4 side side"]:
-    """For each side of each square the cells by which one enters: free, with a free cell on the other side."""
-    edge = jnp.arange(SQUARE)
+    """The opening of each side of each square: cells with a free one on the other side, the longest run of them."""
     around = jnp.pad(free, 1)
     height, width = free.shape
     found = []
     # In the order of the sides.
     for axis, step in ((1, -1), (1, 1), (0, -1), (0, 1)):
         rows, columns = (1 + (step if axis == number else 0) for number in (0, 1))
-        crossing = free & around[rows : rows + height, columns : columns + width]
-        at_edge = edge == (0 if step < 0 else SQUARE - 1)
-        at_edge = at_edge[:, None] if axis == 0 else at_edge[None, :]
-        found.append(in_squares(crossing) & at_edge[None, None])
+        crossing = in_squares(free & around[rows : rows + height, columns : columns + width])
+        edge = 0 if step < 0 else SQUARE - 1
+        along = jnp.take(crossing, edge, axis=2 + axis)
+        at_edge = jnp.arange(SQUARE) == edge
+        at_edge = at_edge[None, :] if axis == 1 else at_edge[:, None]
+        opening = _longest_run(along)
+        opening = opening[:, :, :, None] if axis == 1 else opening[:, :, None, :]
+        found.append(opening & at_edge[None, None])
     return jnp.stack(found, axis=2)
+
+
+def _longest_run(along: Bool[Array, "rows columns side"]) -> Bool[Array, "rows columns side"]:
+    """The longest run of True, of several the first."""
+    runs = [
+        jnp.zeros(SQUARE, bool).at[first : first + length].set(True)
+        for length in range(SQUARE, 0, -1)
+        for first in range(SQUARE - length + 1)
+    ]
+    # Longest first: the first that fits is the longest.
+    fits = [jnp.all(along | ~run[None, None], axis=-1, keepdims=True) for run in runs]
+    return jnp.select(fits, [run[None, None] & along for run in runs], False)
 
 
 def _reached(
