@@ -1,7 +1,6 @@
 """The building network in training: what it is shown is what a trial shows it, mirrored and lit as buildings may be."""
 
 import dataclasses
-import math
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +10,7 @@ import pytest
 from potlp_jax.learning.augmentation import Augmentation
 from potlp_jax.learning.batches import Batches
 from potlp_jax.learning.building_estimator import BuildingEstimator
-from potlp_jax.learning.building_learner import BuildingInputs, BuildingLearner, BuildingOptions, square_targets
-from potlp_jax.learning.building_network import SQUARE
+from potlp_jax.learning.building_learner import BuildingInputs, BuildingLearner, BuildingOptions
 from potlp_jax.learning.dataset import DatasetMetadata, Samples, encode
 from potlp_jax.learning.loss import DataScale
 from potlp_jax.learning.map_images import encode_view, encode_world
@@ -202,24 +200,6 @@ def test_gains_change_colours_and_nothing_else(learner, samples):
     )
     for one, other in zip(jax.tree.leaves(kept), jax.tree.leaves(inputs), strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_targets_of_squares_equal_loops_over_cells(seed):
-    draw = np.random.default_rng(seed)
-    shape = tuple(draw.integers(5, 14, 2).tolist())
-    cells = draw.choice([-1, 0, 1], shape, p=[0.5, 0.3, 0.2]).astype(np.int8)
-    letters = np.where(cells == 0, draw.integers(0, 8, shape), 0).astype(np.int32)
-    known, targets = square_targets(jnp.asarray(cells), jnp.asarray(letters), 3)
-    for row in range(math.ceil(shape[0] / SQUARE)):
-        for column in range(math.ceil(shape[1] / SQUARE)):
-            part = np.s_[row * SQUARE : (row + 1) * SQUARE, column * SQUARE : (column + 1) * SQUARE]
-            there = [(c, z) for c, z in zip(cells[part].flat, letters[part].flat, strict=True) if c != -1]
-            assert bool(known[row, column]) == bool(there)
-            if there:
-                free = sum(c == 0 for c, _ in there) / len(there)
-                has = [float(any(z >> bit & 1 for _, z in there)) for bit in range(3)]
-                np.testing.assert_allclose(targets[row, column], [free, *has], rtol=1e-6)
 
 
 def test_views_that_fill_a_batch_up_count_nothing(learner, params, samples):

@@ -10,15 +10,16 @@ import pytest
 from potlp_jax.errors import NetworkError, PropositionsError
 from potlp_jax.learning.building_estimator import BuildingEstimator
 from potlp_jax.learning.building_network import (
-    SQUARE,
     BuildingConfig,
     BuildingNetwork,
     building_operations,
     channel_count,
     map_channels,
 )
+from potlp_jax.learning.imagined_paths import PROSPECTS, outlook, prospects, scenery
 from potlp_jax.learning.observing import ObservingEstimator, observe_panorama
 from potlp_jax.learning.painting import blank_painting
+from potlp_jax.learning.squares import SQUARE
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.situation import DecisionConfig
@@ -104,8 +105,12 @@ def test_estimates_are_the_networks_answers_and_padding_cannot_succeed(params):
     found = eyes(belief, subgoals, task.arrays)
     encoded = NETWORK.encode(params, map_channels(belief, eyes.memory))
     places = NETWORK.places(params, encoded, subgoals.cells)
-    phi = task.arrays.class_phi
-    answers = NETWORK.answer(params, places[:, None], NETWORK.modulation(params, phi[:, 0], phi[:, 1])[None])
+    stay, go = task.arrays.class_phi[:, 0], task.arrays.class_phi[:, 1]
+    # Each pair by itself, where the estimator solves what pairs share once.
+    scene = scenery(belief, jax.tree.map(jax.nn.sigmoid, encoded.squares))
+    beyond = jnp.stack([prospects(outlook(scene, jnp.tile(cell, (len(stay), 1)), stay), go) for cell in subgoals.cells])
+    modulation = NETWORK.modulation(params, stay, go)[None]
+    answers = NETWORK.answer(params, places[:, None], beyond, modulation)
     real = np.asarray(subgoals.mask)[:, None] & np.asarray(task.arrays.class_mask)[None, :]
     np.testing.assert_allclose(
         np.asarray(found.success_probability)[real], np.asarray(answers.success_probability)[real], atol=1e-6
@@ -117,14 +122,14 @@ def test_estimates_are_the_networks_answers_and_padding_cannot_succeed(params):
     assert np.all(np.asarray(found.failure_cost) >= 0)
 
 
-def test_answers_depend_on_map_paint_place_and_phi(params):
+def test_answers_depend_on_map_paint_place_what_lies_beyond_and_phi(params):
     eyes, belief, subgoals, task = _asked(params, _world())
 
-    def answer(eyes=eyes, belief=belief, cells=subgoals.cells, phi=task.arrays.class_phi):
+    def answer(eyes=eyes, belief=belief, cells=subgoals.cells, beyond=0.0, phi=task.arrays.class_phi):
         encoded = NETWORK.encode(params, map_channels(belief, eyes.memory))
         places = NETWORK.places(params, encoded, cells)
         modulation = NETWORK.modulation(params, phi[0, 0], phi[0, 1])
-        return float(NETWORK.answer(params, places[0], modulation).success_logit)
+        return float(NETWORK.answer(params, places[0], jnp.full(PROSPECTS, beyond), modulation).success_logit)
 
     darker = dataclasses.replace(eyes.memory, floor=eyes.memory.floor // 2)
     seen = dataclasses.replace(belief, letters=belief.letters.at[8, 4].set(2))
@@ -132,9 +137,10 @@ def test_answers_depend_on_map_paint_place_and_phi(params):
         answer(eyes=dataclasses.replace(eyes, memory=darker)),
         answer(belief=seen),
         answer(cells=subgoals.cells + 2),
+        answer(beyond=1.0),
         answer(phi=-task.arrays.class_phi),
     )
-    assert len({answer(), *others}) == 5
+    assert len({answer(), *others}) == 6
 
 
 def test_a_maps_answers_do_not_depend_on_the_others_in_the_batch(params):
@@ -143,7 +149,7 @@ def test_a_maps_answers_do_not_depend_on_the_others_in_the_batch(params):
     cells = jnp.asarray(random.integers(0, 12, (3, 4, 2)), jnp.int32)
     together = NETWORK.encode(params, maps)
     # 26 columns are padded to 32, and 12 rows to 16.
-    assert together.squares.shape == (3, 16 // SQUARE, 32 // SQUARE, 3)
+    assert together.squares.holds.shape == (3, 16 // SQUARE, 32 // SQUARE, 2)
     places = NETWORK.places(params, together, cells)
     for index in range(3):
         alone = NETWORK.places(params, NETWORK.encode(params, maps[index]), cells[index])
@@ -194,7 +200,7 @@ def test_operations_are_about_those_that_xla_counts(params):
     first, place, pair = building_operations(CONFIG, 62, 182)
     # XLA counts activations too, and leaves out what convolutions would do on their padding.
     assert first == pytest.approx(analysis["flops"], rel=0.2)
-    assert pair == 2 * (3 * 16 * 16 + 16 * 3)
+    assert pair == 2 * (PROSPECTS * 16 + 3 * 16 * 16 + 16 * 3)
     # 25 squares of 8 features, 9 of 8 of the one scale of the decoder, 12 of the whole, 2 coordinates.
     assert place == 2 * ((25 * 8 + 9 * 8 + 12 + 2) * 16 + 16 * 16)
 

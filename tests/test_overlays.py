@@ -18,7 +18,7 @@ from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.errors import EstimatorError
 from potlp_jax.learning.building_estimator import BuildingEstimator
-from potlp_jax.learning.building_network import SQUARE, BuildingConfig, BuildingNetwork
+from potlp_jax.learning.building_network import BuildingConfig, BuildingNetwork
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.overlays import (
     Imagined,
@@ -29,6 +29,7 @@ from potlp_jax.learning.overlays import (
     painting_overlays,
 )
 from potlp_jax.learning.painting import Painting, blank_painting, paint
+from potlp_jax.learning.squares import SQUARE
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.search.config import BestFirstConfig
@@ -159,11 +160,11 @@ def test_the_building_network_shows_its_painting_and_its_squares():
         "imagined",
     ]
     assert isinstance(imagined, Imagined)
-    said = np.asarray(jax.nn.sigmoid(asked.imagine(belief).squares))
-    np.testing.assert_allclose(imagined.free, said[..., 0], rtol=1e-5)
-    np.testing.assert_allclose(imagined.holds[..., 0], said[..., 1], rtol=1e-5)
+    said = jax.tree.map(jax.nn.sigmoid, asked.imagine(belief).squares)
+    np.testing.assert_allclose(imagined.free, said.free, rtol=1e-5)
+    np.testing.assert_allclose(imagined.holds[..., 0], said.holds[..., 0], rtol=1e-5)
     # The hazard's square is known to have it, so there is nothing to imagine.
-    expected = said[..., 2].copy()
+    expected = np.array(said.holds[..., 1])
     expected[2 // SQUARE, 5 // SQUARE] = 0.0
     np.testing.assert_allclose(imagined.holds[..., 1], expected, rtol=1e-5)
 

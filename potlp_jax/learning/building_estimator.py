@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float32, Int8, Int32, UInt8
 
 from potlp_jax.learning.building_network import BuildingConfig, BuildingNetwork, EncodedMap, Params, map_channels
 from potlp_jax.learning.exclusion import exclusive_chances
-from potlp_jax.learning.imagined_paths import Outlook, Scenery, outlook, prospects, scenery
+from potlp_jax.learning.imagined_paths import OF_GOAL, OF_WAY, Outlook, Scenery, outlook, prospects, scenery
 from potlp_jax.learning.network import require_propositions
 from potlp_jax.learning.overlays import Overlay, imagined_overlay, painting_overlays
 from potlp_jax.learning.painting import Painting, paint
@@ -107,8 +107,7 @@ def _outlook_of_classes(
             lambda into, rows: jax.lax.dynamic_update_slice_in_dim(into, rows, chunk * lanes, axis=0), found, solved
         )
 
-    shapes = jax.eval_shape(outlook, scene, subgoals.cells[:1], stay[:1])
-    nothing = jax.tree.map(lambda like: jnp.zeros((pairs.size, *like.shape[1:]), like.dtype), shapes)
+    nothing = Outlook(way=jnp.zeros((pairs.size, OF_WAY)), goal=jnp.zeros((pairs.size, stay.shape[1], OF_GOAL)))
     chunks = -(-jnp.sum(real, dtype=jnp.int32) // lanes)
     solved = jax.lax.fori_loop(0, chunks, solve, nothing)
     # From the order of work to that of the pairs, and from the first class to all that avoid the same.

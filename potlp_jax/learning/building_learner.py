@@ -35,7 +35,7 @@ class BuildingInputs:
         true_cells, true_letters: of the buildings, ``UNKNOWN`` where nobody knows.
         subgoals: cells of the subgoals that are asked about; any where there are fewer.
         subgoal_of: which of them each of the ``K`` samples asks about.
-        lane_subgoals, lane_stays: the ``L`` pairs of a subgoal's cell and a ``phi_stay`` that are asked about; any where
+        lane_subgoals, lane_stays: the pairs of a subgoal's cell and a ``phi_stay`` that are asked about; any where
             there are fewer.
         lane_of: which of them each sample asks about.
         real: True for views, False for what fills the batch up.

@@ -122,15 +122,15 @@ class Scenery:
         passages, approach: as imagined.
     """
 
-    unseen: Bool[Array, "rows columns"]
-    hidden: Bool[Array, "rows columns"]
-    seen: Bool[Array, "rows columns P"]
-    open: Bool[Array, "rows columns"]
-    frontier: Bool[Array, "rows columns"]
-    free: Float32[Array, "rows columns"]
-    holds: Float32[Array, "rows columns P"]
-    passages: Float32[Array, "rows columns 6"]
-    approach: Float32[Array, "rows columns P 4"]
+    unseen: Bool[Array, "*B rows columns"]
+    hidden: Bool[Array, "*B rows columns"]
+    seen: Bool[Array, "*B rows columns P"]
+    open: Bool[Array, "*B rows columns"]
+    frontier: Bool[Array, "*B rows columns"]
+    free: Float32[Array, "*B rows columns"]
+    holds: Float32[Array, "*B rows columns P"]
+    passages: Float32[Array, "*B rows columns 6"]
+    approach: Float32[Array, "*B rows columns P 4"]
 
 
 def scenery(belief: BeliefMap, imagined: Squares) -> Scenery:

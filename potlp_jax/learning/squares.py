@@ -1,7 +1,7 @@
 """What a building network says of squares of the map: how free they are, what they hold, how one gets through them.
 
-A square has four sides, each with one opening: the longest run of cells by which one crosses it. A **passage** joins two
-of them: a robot that enters the square by one opening can leave it by the other without entering another square in
+A square has four sides, each with one opening: the longest run of cells by which one crosses it. A **passage** joins
+two of them: a robot that enters the square by one opening can leave it by the other without entering another square in
 between. So paths on squares that follow passages are paths on cells, also where a wall of one cell divides a square and
 its sides; what they miss is a second, smaller opening of a side.
 """
