@@ -16,7 +16,7 @@ from potlp_jax.learning.batches import Choice
 from potlp_jax.learning.building_network import BuildingConfig, BuildingNetwork, Params, map_channels
 from potlp_jax.learning.data_figures import camera_geometry, cost_scales, image_shape
 from potlp_jax.learning.dataset import Samples
-from potlp_jax.learning.imagined_paths import outlook, prospects, scenery
+from potlp_jax.learning.imagined_paths import Outlook, outlook, prospects, scenery
 from potlp_jax.learning.map_images import DecodedView, decode_view
 from potlp_jax.learning.network import Answers
 from potlp_jax.learning.painting import Painting
@@ -35,9 +35,8 @@ class BuildingInputs:
         true_cells, true_letters: of the buildings, ``UNKNOWN`` where nobody knows.
         subgoals: cells of the subgoals that are asked about; any where there are fewer.
         subgoal_of: which of them each of the ``K`` samples asks about.
-        lane_subgoals, lane_stays: the pairs of a subgoal's cell and a ``phi_stay`` that are asked about; any where
-            there are fewer.
-        lane_of: which of them each sample asks about.
+        lanes: a sample of each pair of a subgoal and a ``phi_stay`` that are asked about; any where there are fewer.
+        lane_of: which of these pairs each sample asks about.
         real: True for views, False for what fills the batch up.
     """
 
@@ -49,8 +48,7 @@ class BuildingInputs:
     true_letters: Int32[Array, "*G H W"]
     subgoals: Int32[Array, "*G S 2"]
     subgoal_of: Int32[Array, "*G K"]
-    lane_subgoals: Int32[Array, "*G L 2"]
-    lane_stays: Int8[Array, "*G L P"]
+    lanes: Int32[Array, "*G L"]
     lane_of: Int32[Array, "*G K"]
     real: Bool[Array, "*G"]
 
@@ -78,7 +76,8 @@ class BuildingLearner:
             return jnp.asarray(np.stack([getattr(view, name) for view in views]))
 
         cells, stays = samples.cells[choice.index], samples.phi_stay[choice.index]
-        subgoals, subgoal_of = _distinct(cells, samples.most_subgoals)
+        first, subgoal_of = _distinct(cells, samples.most_subgoals)
+        subgoals = np.take_along_axis(cells, first[:, :, None], axis=1)
         lanes, lane_of = _distinct(np.concatenate([cells, stays], axis=-1), min(samples.most_lanes, cells.shape[1]))
         return BuildingInputs(
             cells=stacked("cells"),
@@ -87,10 +86,9 @@ class BuildingLearner:
             painting=Painting(floor=stacked("floor"), beyond=stacked("beyond"), distance=stacked("distance")),
             true_cells=stacked("true_cells"),
             true_letters=stacked("true_letters"),
-            subgoals=jnp.asarray(subgoals),
+            subgoals=jnp.asarray(subgoals.astype(np.int32)),
             subgoal_of=jnp.asarray(subgoal_of),
-            lane_subgoals=jnp.asarray(lanes[:, :, :2]),
-            lane_stays=jnp.asarray(lanes[:, :, 2:].astype(np.int8)),
+            lanes=jnp.asarray(lanes),
             lane_of=jnp.asarray(lane_of),
             real=jnp.arange(len(views)) < len(choice.views),
         )
@@ -107,19 +105,13 @@ class BuildingLearner:
         self, params: Params, inputs: BuildingInputs, phi_stay: Int8[Array, "G K P"], phi_go: Int8[Array, "G K P"]
     ) -> tuple[Answers, Float32[Array, " G"]]:
         """The network's answers, and the cross-entropy of what it says of the squares."""
-        network = BuildingNetwork(self.config)
-        belief = self._belief(inputs)
+        network, belief = BuildingNetwork(self.config), self._belief(inputs)
         encoded = network.encode(params, jax.vmap(map_channels)(belief, inputs.painting))
         places = network.places(params, encoded, inputs.subgoals)
         asked = jnp.take_along_axis(places, inputs.subgoal_of[:, :, None], axis=1)
         imagined = jax.tree.map(jax.nn.sigmoid, encoded.squares)
-        scenes = jax.vmap(scenery)(belief, imagined)
-        # One map after the other: sweeps of several at once go on for the one that takes longest.
-        lanes = jax.lax.map(lambda one: outlook(*one), (scenes, inputs.lane_subgoals, inputs.lane_stays))
-        of_pairs = jax.vmap(lambda lane, index: jax.tree.map(lambda array: array[index], lane))(lanes, inputs.lane_of)
-        answers = network.answer(
-            params, asked, prospects(of_pairs, phi_go), network.modulation(params, phi_stay, phi_go)
-        )
+        beyond = prospects(_outlook_of_samples(belief, imagined, inputs, phi_stay), phi_go)
+        answers = network.answer(params, asked, beyond, network.modulation(params, phi_stay, phi_go))
         loss = jax.vmap(_squares_loss, in_axes=(0, 0, 0, None))(
             encoded.squares, inputs.true_cells, inputs.true_letters, len(self.config.propositions)
         )
@@ -167,17 +159,32 @@ class BuildingOptions:
         )
 
 
+def _outlook_of_samples(
+    belief: BeliefMap, imagined: Squares, inputs: BuildingInputs, phi_stay: Int8[Array, "G K P"]
+) -> Outlook:
+    """The outlook of every sample, leading dimensions ``G K``; those that share a subgoal and ``phi_stay`` share it."""
+
+    def of_view(view: tuple[BeliefMap, Squares, BuildingInputs, Int8[Array, "K P"]]) -> Outlook:
+        belief, imagined, inputs, stay = view
+        cells = inputs.subgoals[inputs.subgoal_of[inputs.lanes]]
+        lanes = outlook(scenery(belief, imagined), cells, stay[inputs.lanes])
+        return jax.tree.map(lambda array: array[inputs.lane_of], lanes)
+
+    # One view after the other: side by side all would be swept until the last one is done.
+    return jax.lax.map(of_view, (belief, imagined, inputs, phi_stay))
+
+
 def _decoded(samples: Samples, view: np.integer) -> DecodedView:
     return decode_view(samples.maps[view], samples.worlds[samples.world_of[view]], samples.metadata.shape)
 
 
 def _distinct(
     asked: Int32[np.ndarray, "G K N"], most: int
-) -> tuple[Int32[np.ndarray, "G S N"], Int32[np.ndarray, "G K"]]:
-    """The distinct vectors of each row, at most ``most`` and padded to so many, and which of them each entry is."""
-    found = [np.unique(row, axis=0, return_inverse=True) for row in asked]
-    distinct = np.stack([np.pad(row, ((0, most - len(row)), (0, 0))) for row, _ in found])
-    return distinct.astype(np.int32), np.stack([index.reshape(-1) for _, index in found]).astype(np.int32)
+) -> tuple[Int32[np.ndarray, "G S"], Int32[np.ndarray, "G K"]]:
+    """Where each row has its distinct vectors, padded with 0 to ``most``, and which of them each entry is."""
+    found = [np.unique(row, axis=0, return_index=True, return_inverse=True) for row in asked]
+    first = np.stack([np.pad(index, (0, most - len(index))) for _, index, _ in found])
+    return first.astype(np.int32), np.stack([index.reshape(-1) for _, _, index in found]).astype(np.int32)
 
 
 def _mirrored(inputs: BuildingInputs, mirrored: Bool[Array, "2"]) -> BuildingInputs:
@@ -190,12 +197,7 @@ def _mirrored(inputs: BuildingInputs, mirrored: Bool[Array, "2"]) -> BuildingInp
     cells, letters, painting, true_cells, true_letters = jax.tree.map(
         lambda array: array[places[0]][:, places[1]], maps
     )
-
-    def turned(places: Int32[Array, "N 2"]) -> Int32[Array, "N 2"]:
-        there = jnp.where(mirrored[None, :], inputs.extent[None, :] - 1 - places, places)
-        # Places that are not asked about may lie outside of the map then.
-        return jnp.clip(there, 0, inputs.extent[None, :] - 1)
-
+    subgoals = jnp.where(mirrored[None, :], inputs.extent[None, :] - 1 - inputs.subgoals, inputs.subgoals)
     return dataclasses.replace(
         inputs,
         cells=cells,
@@ -203,8 +205,7 @@ def _mirrored(inputs: BuildingInputs, mirrored: Bool[Array, "2"]) -> BuildingInp
         painting=painting,
         true_cells=true_cells,
         true_letters=true_letters,
-        subgoals=turned(inputs.subgoals),
-        lane_subgoals=turned(inputs.lane_subgoals),
+        subgoals=subgoals,
     )
 
 
