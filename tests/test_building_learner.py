@@ -13,7 +13,8 @@ from potlp_jax.learning.batches import Batches
 from potlp_jax.learning.building_estimator import BuildingEstimator
 from potlp_jax.learning.building_learner import BuildingInputs, BuildingLearner, BuildingOptions, square_targets
 from potlp_jax.learning.building_network import SQUARE
-from potlp_jax.learning.dataset import DatasetMetadata, Samples, encode
+from potlp_jax.learning.dataset import Samples, encode
+from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.loss import DataScale
 from potlp_jax.learning.map_images import encode_view, encode_world
 from potlp_jax.learning.painting import blank_painting, paint

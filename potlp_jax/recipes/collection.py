@@ -29,13 +29,13 @@ from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import DatasetError
 from potlp_jax.learning.dataset import (
-    DatasetMetadata,
     Samples,
     finished_shards,
     read_metadata,
     remove_unfinished_files,
     write_shard,
 )
+from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.domain import unit_of
 from potlp_jax.learning.estimator import identity_of, named_estimator
 from potlp_jax.learning.questions import HELD_OUT, TaskDistribution
