@@ -36,11 +36,11 @@ class ImageFile:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as this object lives
         weakref.finalize(self, self._file.close)
 
-    def write(self, entries: Iterable[Sequence[bytes]]) -> Int64[np.ndarray, "N *K1"]:
+    def write(self, entries: Iterable[Sequence[bytes]]) -> Int64[np.ndarray, "N ..."]:
         """Append entries of some byte strings each, equally many.
 
         Returns:
-            Of each entry, where its byte strings begin and where the last one ends.
+            Of each entry, a row: where its byte strings begin, and where the last one ends.
 
         Raises:
             DatasetError: there is no space.
