@@ -20,6 +20,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
+from potlp_jax.checks import AT_LEAST_ONE, SHARE, require_fields
 from potlp_jax.errors import TrainingError
 from potlp_jax.learning.augmentation import Augmentation
 from potlp_jax.learning.batches import Batch, Batches, prefetched
@@ -67,16 +68,9 @@ class TrainingOptions:
     checkpoint_steps: int = 200
 
     def __post_init__(self) -> None:
-        for name in ("views_per_batch", "samples_per_view", "checkpoint_steps"):
-            _require_one(name, getattr(self, name))
-        for name in ("weighting", "warmup", "average_decay"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise TrainingError(f"{name} is {getattr(self, name)}; give a number from 0 to 1")
-
-
-def _require_one(name: str, value: int) -> None:
-    if value < 1:
-        raise TrainingError(f"{name} is {value}; give at least 1")
+        names = ("views_per_batch", "samples_per_view", "checkpoint_steps")
+        require_fields(self, names, AT_LEAST_ONE, TrainingError)
+        require_fields(self, ("weighting", "warmup", "average_decay"), SHARE, TrainingError)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -92,7 +86,7 @@ class TrainingConfig(TrainingOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require_one("steps", self.steps)
+        require_fields(self, ["steps"], AT_LEAST_ONE, TrainingError)
 
 
 @struct.dataclass(kw_only=True)

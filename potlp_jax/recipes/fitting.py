@@ -16,6 +16,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from potlp_jax.checks import AT_LEAST_ONE, require_fields
 from potlp_jax.codec import differences
 from potlp_jax.errors import TrainingError
 from potlp_jax.files import MOST_TEXT, read_json, reading
@@ -65,8 +66,7 @@ class FitConfig:
     training: TrainingOptions = TrainingOptions()
 
     def __post_init__(self) -> None:
-        if self.epochs < 1:
-            raise TrainingError(f"epochs is {self.epochs}; give at least 1")
+        require_fields(self, ["epochs"], AT_LEAST_ONE, TrainingError)
         if self.minutes is not None and not self.minutes > 0:
             raise TrainingError(f"minutes is {self.minutes}; give a positive number, or null for no limit")
 
