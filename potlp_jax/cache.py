@@ -9,7 +9,6 @@ import contextlib
 import hashlib
 import os
 import platform
-import sys
 from pathlib import Path
 
 SWITCH: str = "POTLP_NO_CACHE"
@@ -17,6 +16,11 @@ SWITCH: str = "POTLP_NO_CACHE"
 
 LEAST_COMPILE_SECONDS: float = 0.5
 """What compiles faster is not worth a file."""
+
+# Linux says there, of each processor, what it is and what it can do, on x86 and on ARM. The model decides what the
+# compiler prefers.
+_PROCESSORS = Path("/proc/cpuinfo")
+_TOLD = ("cpu family", "model", "flags", "Features", "CPU implementer", "CPU part")
 
 LOG_LEVEL: str = "TF_CPP_MIN_LOG_LEVEL"
 """Environment variable from which XLA takes the least severe messages that it writes (3: none but fatal ones)."""
@@ -26,18 +30,18 @@ def enable_compilation_cache(folder: Path | None = None) -> Path | None:
     """Keep compiled programs in ``folder`` (default: ``cache_folder()``) and use those that are there.
 
     A cache that jax has been given already, as by JAX_COMPILATION_CACHE_DIR, stays in use. A folder that cannot be
-    made, or that others may write to, is not used: whoever can write there can run code here. Called before jax is
-    imported, this also keeps XLA's messages on loaded programs from stderr.
+    made, or that others may write to, is not used: whoever can write there can run code here. This also keeps XLA's
+    messages on loaded programs from stderr.
 
     Returns:
       The folder in use; None where there is none.
     """
     if os.environ.get(SWITCH, "0") not in ("", "0"):
         return None
-    _quiet_xla()
     # Imported here, so that programs that only offer the cache start without jax.
     import jax
 
+    _quiet_xla()
     chosen = jax.config.values["jax_compilation_cache_dir"]
     if chosen:
         return Path(chosen)
@@ -60,9 +64,8 @@ def machine_fingerprint() -> str:
     """The same for processors that offer the same instructions. jax's own keys tell versions and flags apart."""
     # The same model in a virtual machine may offer fewer instructions, so its flags count as well as its name.
     words = {platform.system(), platform.machine(), platform.processor()}
-    with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8", errors="replace") as lines:
-        told = (line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part")))
-        words.update(told)
+    with contextlib.suppress(OSError), _PROCESSORS.open(encoding="utf-8", errors="replace") as lines:
+        words.update(line for line in lines if line.startswith(_TOLD))
     return hashlib.sha256("\n".join(sorted(words)).encode()).hexdigest()[:16]
 
 
@@ -80,12 +83,19 @@ def _is_private_folder(folder: Path) -> bool:
 
 
 def _quiet_xla() -> None:
-    """Keep XLA from reporting each program that it loads from the cache, where jax has not been imported yet.
+    """Keep XLA from reporting each program that it loads from the cache, here and in processes that this one starts.
 
     On many processors XLA takes two of its compiler's preferences (no gather, no scatter) for instructions that the
     processor lacks. It then writes a page on them to stderr for each program, although the program was compiled on the
-    same machine and runs (https://github.com/openxla/xla/issues/44565). The messages are of level "error", and the
-    level is read when jaxlib is loaded; failures are raised as exceptions and are not affected.
+    same machine and runs (https://github.com/openxla/xla/issues/44565). The messages are of level "error"; failures are
+    raised as exceptions and are not affected. A level that the user has chosen stays.
     """
-    if "jaxlib" not in sys.modules:
-        os.environ.setdefault(LOG_LEVEL, "3")
+    import jax
+
+    # jax sets 1 where nobody has set another, and its own level is that of its loggers.
+    if os.environ.get(LOG_LEVEL, "1") != "1" or jax.config.values["jax_logging_level"] not in (None, "NOTSET"):
+        return
+    os.environ[LOG_LEVEL] = "3"
+    # XLA has read the variable when jax was imported. To set no level undoes that of Python's loggers and not XLA's.
+    jax.config.update("jax_logging_level", "CRITICAL")
+    jax.config.update("jax_logging_level", "NOTSET")

@@ -249,6 +249,9 @@ def test_a_second_process_finds_what_the_first_compiled(tmp_path):
     assert second["hits"] > first["hits"]
     assert second["q"] == first["q"]
     assert "prefer-no-" not in said
+    third, said = _run("import jax\n" + CACHED, XDG_CACHE_HOME=str(tmp_path))
+    assert third["hits"] == second["hits"]
+    assert "prefer-no-" not in said
 
 
 def test_the_switch_turns_the_cache_off(tmp_path, monkeypatch):
@@ -282,3 +285,20 @@ def test_each_kind_of_machine_has_its_own_folder(tmp_path, monkeypatch):
     assert cache_folder() == tmp_path / "potlp-jax" / here
     monkeypatch.setattr("platform.machine", lambda: "another")
     assert machine_fingerprint() != here
+
+
+def test_what_a_processor_can_do_decides_on_its_folder(tmp_path, monkeypatch):
+    told = "processor\t: {}\ncpu family\t: 6\nmodel\t\t: 143\nmodel name\t: A processor\ncpu MHz\t: {}\nflags\t: {}\n"
+
+    def fingerprint(*processors):
+        file = tmp_path / "cpuinfo"
+        file.write_text("".join(told.format(number, *found) for number, found in enumerate(processors)))
+        monkeypatch.setattr("potlp_jax.cache._PROCESSORS", file)
+        return machine_fingerprint()
+
+    known = fingerprint((2600, "fpu avx avx2"))
+    # Neither how many there are nor how fast they run at the moment.
+    assert fingerprint((800, "fpu avx avx2"), (900, "fpu avx avx2")) == known
+    assert fingerprint((2600, "fpu avx avx2 avx512f")) != known
+    told = told.replace("143", "85")
+    assert fingerprint((2600, "fpu avx avx2")) != known

@@ -11,7 +11,8 @@ from potlp_jax.learning.augmentation import Augmentation
 from potlp_jax.learning.batches import Batches
 from potlp_jax.learning.building_estimator import BuildingEstimator
 from potlp_jax.learning.building_learner import BuildingInputs, BuildingLearner, BuildingOptions
-from potlp_jax.learning.dataset import DatasetMetadata, Samples, encode
+from potlp_jax.learning.dataset import Samples, encode
+from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.loss import DataScale
 from potlp_jax.learning.map_images import encode_view, encode_world
 from potlp_jax.learning.painting import blank_painting, paint

@@ -7,33 +7,17 @@ import pytest
 from jax.sharding import Mesh, PartitionSpec
 
 import potlp_jax
-from potlp_jax import BestFirstConfig, DecisionConfig, FrontierConfig, PlanningProblem, SensorConfig, Start, UctConfig
+from potlp_jax import BestFirstConfig, DecisionConfig, FrontierConfig, SensorConfig, Start, UctConfig
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.trials.config import TrialConfig
 from tests.reference.domains import domain_of
+from tests.reference.toy_plan import TASK, C, S, plan
 
 TOY = potlp_jax.make("toy")
-TASK = TOY.task(2)
-S, Z, C = 3, len(TASK.dfa.accepting), len(TASK.classes)
 NETWORK = NetworkConfig(
     propositions=TOY.propositions, first_widths=(4,) * 4, second_widths=(4,) * 8, dense_widths=(8,) * 4, fovea=3
 )
-
-
-def plan(chances, key, config):
-    problem = PlanningProblem.from_arrays(
-        TASK.arrays,
-        travel=jnp.full((S + 1, Z, S, Z), 10.0),
-        finish=jnp.full((S + 1, Z), jnp.inf),
-        success_probability=chances,
-        success_cost=jnp.full((S, C), 5.0),
-        failure_cost=jnp.full((S, C), 20.0),
-        dfa_state=TASK.dfa.initial,
-        subgoal_mask=jnp.ones(S, bool),
-        dead_end_cost=500.0,
-    )
-    return potlp_jax.plan_actions(problem, key, config)
 
 
 @pytest.mark.parametrize("config", [BestFirstConfig(simulations=20), UctConfig(simulations=20)])

@@ -185,7 +185,7 @@ def test_several_processes_take_whole_shards(tmp_path):
     collect(GENERATOR, "firefighting", Split.TRAINING, WORLDS, tmp_path, config, processes=2)
     assert finished_shards(tmp_path) == set(range(WORLDS // config.worlds_per_shard))
     assert samples_file(tmp_path, 0).stat().st_mtime_ns == first
-    assert read_dataset(tmp_path).images == []
+    assert len(read_dataset(tmp_path).images) == 0
 
 
 def _assert_same_picture(found, expected):

@@ -1,6 +1,10 @@
 """Datasets on disk: what is written is read back, by this library and by pandas; what is damaged is named."""
 
 import dataclasses
+import tempfile
+import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,8 +14,6 @@ import pytest
 
 from potlp_jax.errors import DatasetError
 from potlp_jax.learning.dataset import (
-    SCHEMA_VERSION,
-    DatasetMetadata,
     decode,
     encode,
     finished_shards,
@@ -25,6 +27,7 @@ from potlp_jax.learning.dataset import (
     worlds_file,
     write_shard,
 )
+from potlp_jax.learning.dataset_metadata import SCHEMA_VERSION, DatasetMetadata
 from tests.reference.data_sets import SHAPE, blank_columns, world_columns
 
 METADATA = DatasetMetadata(
@@ -269,10 +272,49 @@ def test_data_sets_of_one_family_are_joined(tmp_path):
     _write(tmp_path / "two", [1, 2], dataclasses.replace(METADATA, collection={"estimator": "mine"}))
     one, two = read_dataset(tmp_path / "one"), read_dataset(tmp_path / "two")
     both = joined([one, two])
-    assert both.images == one.images + two.images
+    assert list(both.images) == [*one.images, *two.images]
+    assert list(both.maps) == [*one.maps, *two.maps]
+    assert both.images[-2] == two.images[4]
+    with pytest.raises(IndexError):
+        both.images[9]
     assert both.view_of.tolist() == one.view_of.tolist() + (two.view_of + 3).tolist()
     assert both.world_of.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2]
     np.testing.assert_array_equal(both.distance, np.concatenate([one.distance, two.distance]))
     other = dataclasses.replace(two, metadata=dataclasses.replace(two.metadata, resolution=0.5))
     with pytest.raises(DatasetError, match=r"differ in resolution cannot be joined: 1\.0 and 0\.5"):
         joined([one, other])
+
+
+def test_images_stay_on_disk(tmp_path):
+    # An image need not be one to be kept.
+    images = [np.random.default_rng(index).bytes(1 << 20) for index in range(16)]
+    views, samples = _shard(0, views=16)
+    write_shard(tmp_path, 0, world_columns(7), {**views, "image": images, "floor": images}, samples, METADATA)
+    del views["image"]
+    tracemalloc.start()
+    try:
+        both = joined([read_dataset(tmp_path), read_dataset(tmp_path)])
+        held, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert held < 1 << 20
+    assert pa.total_allocated_bytes() < 1 << 20
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(both.images.__getitem__, range(32))) == images * 2
+        assert [view.floor for view in pool.map(both.maps.__getitem__, range(32))] == images * 2
+
+
+def test_a_shard_may_have_no_views(tmp_path):
+    columns = _shard(0, views=0)
+    for shard in (0, 1):
+        write_shard(tmp_path, shard, world_columns(7), *columns, METADATA)
+    samples = read_dataset(tmp_path)
+    assert (len(samples.images), len(samples.maps), len(samples.success)) == (0, 0, 0)
+
+
+def test_a_full_temporary_folder_is_named(tmp_path, monkeypatch):
+    _write(tmp_path, [0])
+    # Writes to it fail as those to a full disk do.
+    monkeypatch.setattr(tempfile, "TemporaryFile", lambda: Path("/dev/full").open("wb", buffering=0))  # noqa: SIM115
+    with pytest.raises(DatasetError, match=r"cannot be kept in .* \(No space left on device\): .*TMPDIR"):
+        read_dataset(tmp_path)

@@ -18,7 +18,8 @@ from typer.testing import CliRunner
 from potlp_jax.cli import app
 from potlp_jax.codec import config_from_dict
 from potlp_jax.errors import EvaluationError, PropositionsError
-from potlp_jax.learning.dataset import DatasetMetadata, Samples, decode, encode, view_id, write_shard
+from potlp_jax.learning.dataset import Samples, decode, encode, view_id, write_shard
+from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.map_images import without_painting
 from potlp_jax.learning.metrics import (
     BINS,

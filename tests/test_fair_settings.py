@@ -6,19 +6,10 @@ import json
 import numpy as np
 import pytest
 
-from eval.fair_settings import (
-    ROWS,
-    changes_of,
-    chosen_settings,
-    compare,
-    grid,
-    interval,
-    read_rows,
-    results,
-    run,
-    setting_of,
-    write_report,
-)
+from eval.fair_settings.choosing import chosen_settings, compare, interval, results
+from eval.fair_settings.report import write_report
+from eval.fair_settings.running import ROWS, read_rows, run
+from eval.fair_settings.settings import changes_of, grid, setting_of
 from potlp_jax.codec import with_settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key

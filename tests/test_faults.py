@@ -427,13 +427,18 @@ def _text_kinds():
     return [kind for kind in texts.KINDS if not kind.name.startswith(slow)]
 
 
+def _assert_good(kind, cases, folder):
+    """Every case of this kind of damage ends well."""
+    for number in range(cases):
+        own = folder / str(number)
+        own.mkdir()
+        verdict, text = judged(kind, 3, number, own)
+        assert Verdict(verdict) in GOOD, text
+
+
 @pytest.mark.parametrize("kind", _text_kinds(), ids=lambda kind: kind.name)
 def test_damaged_texts_end_well(kind, tmp_path):
-    for number in range(8):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        verdict, text = judged(kind, 3, number, folder)
-        assert Verdict(verdict) in GOOD, text
+    _assert_good(kind, 8, tmp_path)
 
 
 def _file_kinds():
@@ -443,11 +448,7 @@ def _file_kinds():
 
 @pytest.mark.parametrize("kind", _file_kinds(), ids=lambda kind: kind.name)
 def test_damaged_files_end_well(kind, tmp_path):
-    for number in range(8):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        verdict, text = judged(kind, 3, number, folder)
-        assert Verdict(verdict) in GOOD, text
+    _assert_good(kind, 8, tmp_path)
 
 
 class _LongError(PotlpError):
@@ -546,11 +547,7 @@ def test_the_page_has_the_tables_of_its_counts():
 
 def test_words_of_the_command_line_end_well(tmp_path):
     (kind,) = options.KINDS
-    for number in range(12):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        verdict, text = judged(kind, 3, number, folder)
-        assert Verdict(verdict) in GOOD, text
+    _assert_good(kind, 12, tmp_path)
 
 
 def test_waiting_for_a_core_is_no_time_of_a_case(monkeypatch):

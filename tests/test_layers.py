@@ -10,6 +10,7 @@ import potlp_jax
 ORDER = (
     "types",
     "errors",
+    "checks",
     "precision",
     "files",
     "images",

@@ -32,7 +32,7 @@ MADE = {
     "regret.md": "eval/bench/regret.py",
     "faults.md": "eval/faults/__main__.py",
     "X.md": "eval/bench/throughput.py",
-    "NAME.md": "eval/fair_settings.py",
+    "NAME.md": "eval/fair_settings/__main__.py",
 }
 """Files that are not there before something writes them, and what does."""
 

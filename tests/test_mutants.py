@@ -7,7 +7,8 @@ import pytest
 
 from eval.mutants import __main__ as program
 from eval.mutants.__main__ import judge, page, stale, write
-from eval.mutants.core import MUTANTS, Mutant
+from eval.mutants.core import MUTANTS
+from eval.mutants.mutant import Mutant
 
 # 1 + 1 made wrong; what is imported stands beside the test.
 SUM = Mutant("a part", "a sum is a difference", "sums.py", "a + b", "a - b", ("tests/test_sums.py",))

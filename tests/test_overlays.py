@@ -98,6 +98,25 @@ def views(trial) -> Views:
     return views_of(trial, painter)
 
 
+@struct.dataclass
+class FirstLook(Painter):
+    """Says that all it answers comes from the first panorama."""
+
+    def observations(self, subgoals):
+        return jnp.where(subgoals.mask, 0, -1)
+
+
+def test_an_estimator_of_ones_own_says_which_panorama_it_answers_from(trial):
+    first = FirstLook(memory=blank_painting(*WORLD.shape))
+    found = run_trial(WORLD, TOY.task("2"), Policy.POTLP, jax.random.key(0), CONFIG, environment="toy", estimator=first)
+    assert [decision.observations for decision in found.decisions] == [
+        (0,) * len(decision.subgoals) for decision in trial.decisions
+    ]
+    assert set(views_of(found, first).panoramas) == {0}
+    # One that does not say is not asked.
+    assert not any(decision.observations for decision in trial.decisions)
+
+
 def test_the_views_of_a_trial_are_those_of_its_decisions(trial, views):
     assert len(trial.decisions) > 2
     assert sorted(views.panoramas) == sorted(views.overlays) == [decision.index for decision in trial.decisions]

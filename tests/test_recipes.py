@@ -129,6 +129,17 @@ def test_rounds_drive_with_what_was_fitted_and_learn_from_all_records(tmp_path):
     data = (first / "training", last / "training", last / "explored")
     views = [len(read_dataset(folder).images) for folder in data]
     assert metadata["panoramas"] == sum(views)
+    # The file names everything that it was made from.
+    assert metadata["initial"] == driven.collection["estimator"]
+    sources = [metadata["training_data"][str(number)] for number in range(3)]
+    assert [source["views"] for source in sources] == views
+    assert [(source["first_world"], source["worlds"]) for source in sources] == [(0, 4), (4, 2), (6, 2)]
+    assert [source["driver"] for source in sources] == ["explorer", "potlp", "explorer"]
+    assert [source["estimator"] for source in sources] == ["", metadata["initial"], ""]
+    assert metadata["validation_data"]["0"]["split"] == "validation"
+    shown = _potlp("estimator", "info", last / ESTIMATOR).stdout
+    assert "toy/training, 2 worlds from 4, by potlp with" in shown
+    assert metadata["initial"] in shown
     # The scales of costs stay those of the first fit, with which its parameters mean something.
     assert config == load_estimator(first / ESTIMATOR)[1]
     again = len(lines)
@@ -168,6 +179,10 @@ def test_the_commands_collect_and_fit_by_a_recipe(tmp_path):
         (("collect", "mars", "--worlds", 4), "mars"),
         (("fit",), "give a DATASET and --validation, or a recipe"),
         (("fit", "data"), "another of other worlds"),
+        (
+            ("fit", "data", "--validation", "other", "--initial", "mine.npz", "--set", "network.fovea=2"),
+            "--initial keeps the network of its estimator as it is: leave out --set network",
+        ),
         (("fit", "--recipe", "soup"), "neither a file nor one of those that are shipped"),
     ],
 )

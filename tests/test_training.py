@@ -20,11 +20,13 @@ from potlp_jax.errors import CheckpointError, TrainingError
 from potlp_jax.learning.augmentation import Augmentation
 from potlp_jax.learning.batches import Batch, Batches
 from potlp_jax.learning.checkpoints import checkpoint_steps
-from potlp_jax.learning.dataset import DatasetMetadata, Samples, encode
+from potlp_jax.learning.dataset import Samples, encode, joined
+from potlp_jax.learning.dataset_metadata import DatasetMetadata
+from potlp_jax.learning.estimator import read_estimator
 from potlp_jax.learning.loss import DataScale, evaluation_of, loss_sums, total_loss
 from potlp_jax.learning.network import Answers
 from potlp_jax.learning.panorama_learner import PanoramaLearner, PanoramaOptions
-from potlp_jax.learning.serialization import load_estimator
+from potlp_jax.learning.serialization import load_estimator, save_estimator
 from potlp_jax.learning.training import (
     TrainingConfig,
     batches_of,
@@ -417,6 +419,47 @@ def test_resuming_with_other_options_or_data_names_the_difference(tmp_path):
     renamed = dataclasses.replace(network.config, propositions=("red", "blue"))
     with pytest.raises(CheckpointError, match=r"network\.propositions .*green.*blue"):
         train(PanoramaLearner(renamed), samples, samples, _config(2), folder=tmp_path)
+    # Of the same size, environment and split: what was recorded differs.
+    for training, validation, what in (
+        (synthetic(4, 4, 8), samples, "training"),
+        (samples, synthetic(4, 4, 8), "validation"),
+    ):
+        with pytest.raises(CheckpointError, match=rf"{what}_data\.0\.digest was"):
+            train(network, training, validation, _config(2), folder=tmp_path)
+
+
+def test_a_fit_of_several_data_sets_resumes_with_the_same_ones_alone(tmp_path):
+    validation = synthetic(4, 4, 9)
+    network = _learner(validation, TINY)
+    first, *others = (synthetic(4, 4, seed) for seed in (9, 10, 11))
+    metadata = dataclasses.replace(METADATA, collection={"first_world": 40, "driver": "potlp", "estimator": "mine 1a"})
+    driven = [dataclasses.replace(other, metadata=metadata) for other in others]
+    train(network, joined([first, driven[0]]), validation, _config(2), folder=tmp_path)
+    with pytest.raises(CheckpointError, match=r"another folder. training_data\.1\.digest was"):
+        train(network, joined([first, driven[1]]), validation, _config(2), folder=tmp_path)
+    assert train(network, joined([first, driven[0]]), validation, _config(2), folder=tmp_path).steps == 2
+    source = joined([first, driven[0]]).sources[1]
+    assert (source.first_world, source.driver, source.estimator) == (40, "potlp", "mine 1a")
+    assert (source.worlds, source.views, source.samples) == (1, 4, 16)
+    # What was joined before stays apart.
+    assert joined([joined([first, driven[0]]), driven[1]]).sources == tuple(
+        source for samples in (first, *driven) for source in samples.sources
+    )
+
+
+def test_a_fit_resumes_with_the_estimator_that_it_went_on_from_alone(tmp_path):
+    samples = synthetic(4, 4, 9)
+    network = _learner(samples, TINY)
+    for seed, name in enumerate(("one", "other")):
+        save_estimator(
+            tmp_path / f"{name}.npz", network.init(jax.random.key(seed)), network.config, METADATA.domain, {}
+        )
+    one, other = (read_estimator(tmp_path / f"{name}.npz") for name in ("one", "other"))
+    folder = tmp_path / "checkpoints"
+    train(network, samples, samples, _config(2), initial=one, folder=folder)
+    for changed, said in ((other, f'"{other.identity}"'), (None, "null")):
+        with pytest.raises(CheckpointError, match=f'initial was "{one.identity}", is {said}'):
+            train(network, samples, samples, _config(2), initial=changed, folder=folder)
 
 
 def test_the_command_writes_an_estimator_and_resumes(tmp_path):

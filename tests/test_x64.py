@@ -13,7 +13,6 @@ from potlp_jax import (
     DecisionConfig,
     Estimates,
     FrontierConfig,
-    PlanningProblem,
     SensorConfig,
     Start,
     TaskEnv,
@@ -23,10 +22,9 @@ from potlp_jax import (
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.precision import in_32_bits
 from potlp_jax.trials.robot import initial_belief
+from tests.reference.toy_plan import TASK, C, S, plan, problem
 
 TOY = potlp_jax.make("toy")
-TASK = TOY.task(2)
-S, Z, C = 3, len(TASK.dfa.accepting), len(TASK.classes)
 CONFIG = TrialConfig(
     sensor=SensorConfig(range_cells=5.0),
     decision=DecisionConfig(frontiers=FrontierConfig(max_subgoals=4), search=BestFirstConfig(simulations=20)),
@@ -38,22 +36,6 @@ def wide() -> Iterator[None]:
     with jax.enable_x64(True):
         assert jnp.zeros(1).dtype == np.float64
         yield
-
-
-def plan(chances, config):
-    """A plan from arrays of a caller's own, which have 64 bits where the switch is on."""
-    problem = PlanningProblem.from_arrays(
-        TASK.arrays,
-        travel=jnp.full((S + 1, Z, S, Z), 10.0),
-        finish=jnp.full((S + 1, Z), jnp.inf),
-        success_probability=chances,
-        success_cost=jnp.full((S, C), 5.0),
-        failure_cost=jnp.full((S, C), 20.0),
-        dfa_state=jnp.asarray(TASK.dfa.initial),
-        subgoal_mask=jnp.ones(S, bool),
-        dead_end_cost=jnp.asarray(500.0),
-    )
-    return potlp_jax.plan_actions(problem, jax.random.key(0), config)
 
 
 CHANCES = np.random.default_rng(0).uniform(0.1, 0.9, (4, S, C)).astype(np.float32)
@@ -85,10 +67,16 @@ def narrow(function, *arguments):
     ids=["jit of vmap", "vmap of jit", "vmap of jit, PO-UCT"],
 )
 def test_a_plan_within_a_program_of_64_bits(config, transformed):
-    # `plan` is wrapped anew, so that no program of the other kind is found.
-    found = transformed(lambda chances: plan(chances, config))(jnp.asarray(CHANCES, jnp.float64))
+    def planned(chances):
+        # `plan` is wrapped anew, so that no program of the other kind is found.
+        return transformed(lambda chances: plan(chances, jax.random.key(0), config))(chances)
+
+    found = planned(jnp.asarray(CHANCES, jnp.float64))
     assert found.value.dtype == jnp.float32
-    assert_same(found, narrow(lambda: transformed(lambda chances: plan(chances, config))(jnp.asarray(CHANCES))))
+    assert_same(
+        found,
+        narrow(lambda: transformed(lambda chances: plan(chances, jax.random.key(0), config))(jnp.asarray(CHANCES))),
+    )
 
 
 def test_a_move_from_a_cell_of_64_bits():
@@ -144,19 +132,9 @@ def test_an_episode_of_64_bits():
 
 def test_the_exact_solution_of_a_problem_made_with_64_bits():
     def value():
-        problem = PlanningProblem.from_arrays(
-            TASK.arrays,
-            travel=np.full((S + 1, Z, S, Z), 10.0),
-            finish=np.full((S + 1, Z), np.inf),
-            success_probability=CHANCES[0],
-            success_cost=np.full((S, C), 5.0),
-            failure_cost=np.full((S, C), 20.0),
-            dfa_state=TASK.dfa.initial,
-            subgoal_mask=np.ones(S, bool),
-            dead_end_cost=500.0,
-        )
-        problem.check()
-        return potlp_jax.solve_exact(problem).value
+        made = problem(CHANCES[0], np)
+        made.check()
+        return potlp_jax.solve_exact(made).value
 
     assert value() == narrow(value)
 

@@ -170,7 +170,7 @@ def _use_record(folder: Path) -> None:
 
 
 def _read_metadata(text: str, folder: Path) -> None:
-    from potlp_jax.learning.dataset import DatasetMetadata
+    from potlp_jax.learning.dataset_metadata import DatasetMetadata
 
     DatasetMetadata.from_json(text)
 

@@ -1,7 +1,8 @@
 """The page of results: shares of the attainable savings, and what each true answer brings."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,14 @@ from eval.provenance import lines_of
 from eval.savings import policy_row
 from potlp_jax.codec import finite_or_null
 from potlp_jax.sweep.rows import provenance
-from potlp_jax.sweep.statistics import UNRELIABLE, Comparison, TrialResult, attainable_interval, attainable_share
+from potlp_jax.sweep.statistics import (
+    UNRELIABLE,
+    Comparison,
+    PolicyRow,
+    TrialResult,
+    attainable_interval,
+    attainable_share,
+)
 from potlp_jax.trials.record import Outcome
 
 TITLES = {
@@ -24,6 +32,9 @@ TITLES = {
     Arm.POTLP: "PO-TLP",
     Arm.BASELINE: "baseline",
 }
+
+Columns = Mapping[str, Callable[[Mapping[str, Any]], str]]
+"""Of a table, by their titles: what each says of the figures of one task."""
 
 
 def results_of(rows: Sequence[Mapping[str, Any]], formulas: Mapping[str, str]) -> dict[str, Any]:
@@ -178,18 +189,40 @@ def _shares(results: Mapping[str, Any], data: str) -> Iterator[str]:
 
 
 def _share_table(results: Mapping[str, Any]) -> Iterator[str]:
-    arms = [arm for arm in Arm if arm.value in results["identities"]]
-    shown = [arm for arm in arms if arm not in (Arm.KNOWN_MAP, Arm.BASELINE)]
-    yield f"| task | worlds | known map, cost | {' | '.join(TITLES[arm] for arm in shown)} | baseline, cost |"
-    yield "|" + "---|" * (len(shown) + 4)
+    shown = [arm for arm in _arms(results, Arm) if arm not in (Arm.KNOWN_MAP, Arm.BASELINE)]
+    columns: Columns = {
+        "worlds": lambda table: str(table["satisfied"]["pairs"]),
+        "known map, cost": lambda table: _cost(table, Arm.KNOWN_MAP),
+        **{TITLES[arm]: partial(_share, arm=arm) for arm in shown},
+        "baseline, cost": lambda table: _cost(table, Arm.BASELINE),
+    }
+    return _rows(results, columns)
+
+
+def _rows(results: Mapping[str, Any], columns: Columns) -> Iterator[str]:
+    """A table with a row for each task: its name, and what each column says of its figures."""
+    yield f"| task | {' | '.join(columns)} |"
+    yield "|" + "---|" * (len(columns) + 1)
     for name, table in results["tables"].items():
-        found = {entry["policy"]: policy_row(entry) for entry in table["satisfied"]["rows"]}
-        shares = " | ".join(
-            f"{100 * row.attainable_share:.1f} % ({_interval(row.attainable_low, row.attainable_high, '.0f')})"
-            for row in (found[arm] for arm in shown)
-        )
-        costs = [f"{found[arm].mean_cost:.1f}" for arm in (Arm.KNOWN_MAP, Arm.BASELINE)]
-        yield f"| {name} | {table['satisfied']['pairs']} | {costs[0]} | {shares} | {costs[1]} |"
+        yield f"| {name} | {' | '.join(tell(table) for tell in columns.values())} |"
+
+
+def _arms(results: Mapping[str, Any], arms: Iterable[Arm]) -> list[Arm]:
+    """Those of the arms that ran."""
+    return [arm for arm in arms if arm.value in results["identities"]]
+
+
+def _cost(table: Mapping[str, Any], arm: Arm) -> str:
+    return f"{_policy(table, arm).mean_cost:.1f}"
+
+
+def _share(table: Mapping[str, Any], arm: Arm) -> str:
+    row = _policy(table, arm)
+    return f"{100 * row.attainable_share:.1f} % ({_interval(row.attainable_low, row.attainable_high, '.0f')})"
+
+
+def _policy(table: Mapping[str, Any], arm: Arm) -> PolicyRow:
+    return next(policy_row(entry) for entry in table["satisfied"]["rows"] if entry["policy"] == arm)
 
 
 def _gain_lines(results: Mapping[str, Any], data: str) -> Iterator[str]:
@@ -208,17 +241,12 @@ def _gain_lines(results: Mapping[str, Any], data: str) -> Iterator[str]:
 
 
 def _gain_table(results: Mapping[str, Any]) -> Iterator[str]:
-    shown = [arm for arm in (Arm.TRUE_CHANCES, Arm.TRUE_COSTS, Arm.ORACLE, Arm.IDEAL_OBSERVER)]
-    shown = [arm for arm in shown if arm.value in results["identities"]]
-    yield f"| task | {' | '.join(TITLES[arm] for arm in shown)} |"
-    yield "|" + "---|" * (len(shown) + 1)
-    for name, table in results["tables"].items():
-        cells = " | ".join(_gain(table["gains"][arm]) for arm in shown)
-        yield f"| {name} | {cells} |"
+    shown = _arms(results, (Arm.TRUE_CHANCES, Arm.TRUE_COSTS, Arm.ORACLE, Arm.IDEAL_OBSERVER))
+    return _rows(results, {TITLES[arm]: partial(_gain, arm=arm) for arm in shown})
 
 
-def _gain(entry: Mapping[str, float | None]) -> str:
-    gain, low, high = (np.nan if value is None else float(value) for value in entry.values())
+def _gain(table: Mapping[str, Any], arm: Arm) -> str:
+    gain, low, high = (np.nan if value is None else float(value) for value in table["gains"][arm].values())
     return f"{100 * gain:+.1f} ({_interval(low, high, '+.0f')})"
 
 

@@ -26,7 +26,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from eval.mutants.core import MUTANTS, Mutant
+from eval.mutants.core import MUTANTS
+from eval.mutants.mutant import Mutant
 from eval.provenance import lines_of
 from potlp_jax.sweep.rows import provenance, source_commit
 
@@ -125,7 +126,7 @@ sensing, frontiers, distances, automata, labels, the loss, the rules of a trial,
 
 **Answer.** {caught} of {all} faults are noticed. Each is made alone in a copy of the repository, and the tests that are
 to notice it run there; the last column names the first one that failed. The faults, with the exchange of text that
-makes each, are in `eval/mutants/core.py`.
+makes each, are in `eval/mutants/core/`.
 
 **Command.**
 

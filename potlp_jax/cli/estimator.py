@@ -126,15 +126,20 @@ def _warn(metadata: Mapping[str, Any], samples: "Samples") -> None:
     from potlp_jax.cli.inputs import warn_of_test_worlds
     from potlp_jax.environments.splits import Split
 
-    trained_on = metadata.get("data", {})
     own = (samples.metadata.environment, samples.metadata.split)
     # By name and split: other worlds of the same split are still worlds that training may have seen.
-    if (trained_on.get("environment"), trained_on.get("split")) == own:
+    if any((source.get("environment"), source.get("split")) == own for source in _trained_on(metadata)):
         logger.warning(
             f"the estimator was trained on {'/'.join(own)}: these figures say nothing about worlds it has not seen"
         )
     if samples.metadata.split == Split.TEST:
         warn_of_test_worlds()
+
+
+def _trained_on(metadata: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The data sets that an estimator was fitted to."""
+    # Files of before these were listed have the metadata of one alone, and those of others may have nothing.
+    return [*metadata.get("training_data", {}).values()] or [metadata.get("data", {})]
 
 
 def _predict(
@@ -260,7 +265,7 @@ def _rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     """Names and values for people; what the file does not say is left out."""
     # Estimators of others may lack any entry of the metadata; those of the network are always there.
     network, domain, metadata = (description[name] for name in ("network", "domain", "metadata"))
-    data, operations = metadata.get("data", {}), description["operations"]
+    operations = description["operations"]
     rows = [
         ("propositions", ", ".join(network["propositions"])),
         ("serves", f"worlds of {domain['family'] or 'no named family'}, costs in {domain['unit']}"),
@@ -270,8 +275,11 @@ def _rows(description: dict[str, Any]) -> list[tuple[str, str]]:
         ("architecture", description["architecture"]),
         *_sizes(description),
     ]
-    if data:
-        rows.append(("trained on", f"{data.get('environment')}/{data.get('split')}"))
+    if metadata.get("initial"):
+        rows.append(("goes on from", metadata["initial"]))
+    sources = _trained_on(metadata)
+    if any(sources):
+        rows += zip(["trained on", *[""] * (len(sources) - 1)], map(_in_words, sources), strict=True)
     if "panoramas" in metadata:
         rows.append(("", f"{metadata['panoramas']:,} panoramas, {metadata.get('samples', 0):,} samples"))
     if "steps" in metadata:
@@ -293,6 +301,16 @@ def _rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     if "versions" in metadata:
         rows.append(("versions", ", ".join(f"{name} {value}" for name, value in metadata["versions"].items())))
     return rows
+
+
+def _in_words(source: Mapping[str, Any]) -> str:
+    words = f"{source.get('environment')}/{source.get('split')}"
+    if "worlds" in source:
+        words += f", {source['worlds']} worlds"
+    if source.get("driver"):
+        asked = source.get("estimator")
+        words += f" from {source.get('first_world')}, by {source['driver']}" + (f" with {asked}" if asked else "")
+    return words
 
 
 def _list(values: Sequence[int]) -> str:

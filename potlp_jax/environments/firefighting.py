@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, PRNGKeyArray, UInt8
 
+from potlp_jax.checks import require_rules
 from potlp_jax.environments.base import Generator, host_generators
 from potlp_jax.errors import WorldError
 from potlp_jax.world.grid import Appearance, World, make_world
@@ -371,7 +372,6 @@ def _check(config: FirefightingConfig) -> None:
     used = (HALLWAYS - 1) * config.hallway_spacing + config.hallway_width
     low, high = config.fire_range
     patch = 2 * config.patch_radius + 1
-    # All that is wrong is said at once, so that a configuration is mended in one go.
     rules = (
         (config.hallway_width >= 1, "hallway_width must be at least 1"),
         (
@@ -398,6 +398,4 @@ def _check(config: FirefightingConfig) -> None:
         (0 <= config.smoke_density <= 1 and config.smoke_reach > 0, "smoke_density is a share, smoke_reach positive"),
         (config.tile_size >= 1 and config.tint >= 0 and config.tint_noise >= 0, "tiles and tints cannot be negative"),
     )
-    broken = [message for holds, message in rules if not holds]
-    if broken:
-        raise WorldError("not a fire-fighting building: " + "; ".join(broken))
+    require_rules(rules, "a fire-fighting building", WorldError)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float32, PRNGKeyArray
 
+from potlp_jax.checks import SHARE, require_fields
 from potlp_jax.errors import TrainingError
 
 
@@ -27,9 +28,7 @@ class Augmentation:
     colour: float = 0.02
 
     def __post_init__(self) -> None:
-        for name in ("mirror_rows", "mirror_columns"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise TrainingError(f"{name} is {getattr(self, name)}; give a number from 0 to 1")
+        require_fields(self, ("mirror_rows", "mirror_columns"), SHARE, TrainingError)
 
 
 def draw_mirrors(key: PRNGKeyArray, views: int, amount: Augmentation) -> tuple[Bool[Array, " G"], Bool[Array, " G"]]:

@@ -10,7 +10,6 @@ in its schema, under the key ``potlp``. ``docs/dataset.md`` describes the column
 import contextlib
 import dataclasses
 import functools
-import json
 import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,16 +23,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Bool, Float32, Int8, Int32, UInt8
 
-from potlp_jax.codec import config_from_dict, differences, json_copy
-from potlp_jax.errors import ConfigurationError, DatasetError
-from potlp_jax.files import one_line, reading, require_file, short
+from potlp_jax.errors import DatasetError
+from potlp_jax.files import reading, require_file
 from potlp_jax.images import decode_image
-from potlp_jax.learning.domain import Domain
+from potlp_jax.learning.dataset_metadata import DatasetMetadata, DataSource, data_source
 from potlp_jax.learning.map_images import MAP_COLUMNS, EncodedView, EncodedWorld
-from potlp_jax.world.camera import CameraConfig
-
-SCHEMA_VERSION: int = 2
-"""Changes when a column or its meaning does."""
+from potlp_jax.learning.on_disk import Chained, Entries, ImageFile, OnDisk
 
 JPEG_QUALITY: int = 92
 
@@ -43,7 +38,7 @@ _TEMPORARY = ".tmp"
 
 _REMEDY = "delete all files of the shard and collect or convert it again"
 
-# docs/dataset.md says what the columns mean; who changes them changes SCHEMA_VERSION.
+# docs/dataset.md says what the columns mean; who changes them changes dataset_metadata.SCHEMA_VERSION.
 WORLDS_SCHEMA = pa.schema(
     {"world": pa.int64(), "rows": pa.int32(), "columns": pa.int32(), "cells": pa.binary(), "letters": pa.binary()}
 )
@@ -82,86 +77,9 @@ SAMPLES_SCHEMA = pa.schema(
 )
 
 
-@dataclass(frozen=True)
-class DatasetMetadata:
-    """What all shards of a dataset share. Nested values are JSON-able.
-
-    Attributes:
-        propositions: Sigma: the order of the entries of ``phi_stay`` and ``phi_go``.
-        environment: name of the worlds as it was given, or of the building.
-        family: what kind of worlds they are (``Generator.family``); ``learning.domain.LOGS`` for robots' logs.
-        generator: the family's configuration.
-        split: name of the split that the worlds are from (``environments.splits``); for real data any name.
-        camera: geometry of the panorama.
-        disturbance: what was added to the clean image.
-        encoding: format and quality of the encoded images.
-        weights: the bounds of ``success_weight`` and ``failure_weight``: ``low`` and ``high``.
-        collection: how poses, tasks and classes were drawn, seeds included.
-        versions: of the libraries.
-        unit: the unit of every distance, cost and weight.
-        resolution: side of a cell in that unit.
-        shape: rows and columns of the array that all maps are padded to.
-        source: ``simulation``, or what else made the records.
-        schema_version: ``SCHEMA_VERSION`` at the time of writing.
-    """
-
-    propositions: tuple[str, ...]
-    environment: str
-    family: str
-    generator: Mapping[str, Any]
-    split: str
-    camera: Mapping[str, Any]
-    disturbance: Mapping[str, Any]
-    encoding: Mapping[str, Any]
-    weights: Mapping[str, float]
-    collection: Mapping[str, Any]
-    versions: Mapping[str, str]
-    shape: tuple[int, int]
-    unit: str = "cells"
-    resolution: float = 1.0
-    source: str = "simulation"
-    schema_version: int = SCHEMA_VERSION
-
-    def to_json(self) -> str:
-        """Canonical text: equal metadata give equal text."""
-        return json.dumps(dataclasses.asdict(self), sort_keys=True)
-
-    @classmethod
-    def from_json(cls, text: str) -> "DatasetMetadata":
-        """The metadata that ``to_json`` wrote. Raises DatasetError where the text is something else."""
-        try:
-            data = json.loads(text)
-            version = data["schema_version"]
-        except (KeyError, TypeError, ValueError, RecursionError) as error:
-            raise DatasetError(f"not the metadata of a dataset: {one_line(error)}") from error
-        # Before the other fields: those of another version may well have other names.
-        if version != SCHEMA_VERSION:
-            raise DatasetError(
-                f"schema version {short(version)}; this library reads {SCHEMA_VERSION}: collect the dataset again, or "
-                "use the version of the library that wrote it"
-            )
-        try:
-            return config_from_dict(cls, data, "metadata")
-        except ConfigurationError as error:
-            raise DatasetError(f"not the metadata of a dataset: {error}") from error
-
-    @property
-    def domain(self) -> Domain:
-        """What an estimator serves that learns from this dataset. Raises DatasetError where ``camera`` is none."""
-        try:
-            camera = config_from_dict(CameraConfig, self.camera, "camera")
-        except ConfigurationError as error:
-            raise DatasetError(f"not the metadata of a dataset: {error}") from error
-        return Domain.of_cells(self.family, camera, self.resolution)
-
-    def differences(self, other: "DatasetMetadata") -> list[str]:
-        """What differs, with both values: of this dataset, and of the other."""
-        return differences(json_copy(dataclasses.asdict(self)), json_copy(dataclasses.asdict(other)))
-
-
 @dataclass
 class Samples:
-    """A dataset in memory, on the host; images stay encoded and are decoded per batch by ``decode``.
+    """A dataset on the host; images stay encoded, those that were read from files on disk, and are decoded per batch.
 
     Attributes:
         images: one per view.
@@ -179,11 +97,12 @@ class Samples:
         success_cost: the true R_S, NaN where P_S = 0.
         failure_cost: the true R_F.
         success_weight, failure_weight: cost of missing a success and of taking a failure.
-        metadata: what the shards share.
+        metadata: what the shards share; of several data sets the first one's.
+        joined_from: what identifies each data set, where several were joined.
     """
 
-    images: list[bytes]
-    maps: list[EncodedView]
+    images: Entries[bytes]
+    maps: Entries[EncodedView]
     worlds: list[EncodedWorld]
     world_of: Int32[np.ndarray, " views"]
     view_of: Int32[np.ndarray, "N"]
@@ -199,6 +118,15 @@ class Samples:
     success_weight: Float32[np.ndarray, "N"]
     failure_weight: Float32[np.ndarray, "N"]
     metadata: DatasetMetadata
+    joined_from: tuple[DataSource, ...] = ()
+
+    @property
+    def sources(self) -> tuple[DataSource, ...]:
+        """What identifies the data set, or each of those that were joined."""
+        # Views and worlds are counted, and every column of the samples counts.
+        arrays = {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+        columns = [array for name, array in arrays.items() if name != "world_of"]
+        return self.joined_from or (data_source(self.metadata, len(self.worlds), len(self.images), columns),)
 
     @functools.cached_property
     def most_subgoals(self) -> int:
@@ -335,12 +263,13 @@ def read_dataset(folder: Path | str) -> Samples:
 
     Raises:
         DatasetError: no shards, a file that is truncated or has other columns, another schema version, shards with
-            different metadata, samples without a view, or values out of range.
+            different metadata, samples without a view, values out of range, or no space for the images in the
+            temporary folder.
     """
     metadata = read_metadata(folder)
-    # Images and maps stay encoded: decoded, a training set of 1,300 worlds would take several gigabytes.
-    parts = [_read_shard(folder, shard, metadata) for shard in sorted(finished_shards(folder))]
-    return joined(parts)
+    # Images and maps are most of a dataset: 25 KB a view, 1.3 GB for 51,000 views.
+    kept = ImageFile()
+    return _one_after_another([_read_shard(folder, shard, metadata, kept) for shard in sorted(finished_shards(folder))])
 
 
 def joined(parts: Sequence[Samples]) -> Samples:
@@ -355,10 +284,15 @@ def joined(parts: Sequence[Samples]) -> Samples:
             mine, other = getattr(first, name), getattr(part.metadata, name)
             if mine != other:
                 raise DatasetError(f"data sets that differ in {name} cannot be joined: {mine} and {other}")
+    sources = tuple(source for part in parts for source in part.sources)
+    return dataclasses.replace(_one_after_another(parts), joined_from=sources)
+
+
+def _one_after_another(parts: Sequence[Samples]) -> Samples:
     views = np.cumsum([0, *(len(part.images) for part in parts)])
     worlds = np.cumsum([0, *(len(part.worlds) for part in parts)])
     # Once at the end: joining one by one would copy the first ones again and again.
-    columns = {
+    columns: dict[str, Any] = {
         field.name: np.concatenate([getattr(part, field.name) for part in parts])
         for field in dataclasses.fields(Samples)
         if isinstance(getattr(parts[0], field.name), np.ndarray)
@@ -367,21 +301,27 @@ def joined(parts: Sequence[Samples]) -> Samples:
     for name, offsets in shifted.items():
         arrays = [getattr(part, name) + np.int32(offset) for part, offset in zip(parts, offsets[:-1], strict=True)]
         columns[name] = np.concatenate(arrays)
-    lists = {name: [row for part in parts for row in getattr(part, name)] for name in ("images", "maps", "worlds")}
-    everything: dict[str, Any] = {**lists, **columns}
-    return Samples(metadata=first, **everything)
+    return Samples(
+        images=Chained(part.images for part in parts),
+        maps=Chained(part.maps for part in parts),
+        worlds=[world for part in parts for world in part.worlds],
+        metadata=parts[0].metadata,
+        **columns,
+    )
 
 
-def _read_shard(folder: Path | str, shard: int, metadata: DatasetMetadata) -> Samples:
+def _read_shard(folder: Path | str, shard: int, metadata: DatasetMetadata, kept: ImageFile) -> Samples:
+    """A shard whose images are kept in a file."""
     paths = worlds_file(folder, shard), views_file(folder, shard), samples_file(folder, shard)
     worlds = _read_table(paths[0], WORLDS_SCHEMA, None)
     views = _read_table(paths[1], VIEWS_SCHEMA, ("view", "world", "image", *MAP_COLUMNS))
     columns = _sample_columns(_read_table(paths[2], SAMPLES_SCHEMA, None), len(metadata.propositions), paths[2])
     view_of = _index_of(columns.pop("view"), views["view"].to_numpy(), "view", paths[2])
     world_of = _index_of(views["world"].to_numpy(), worlds["world"].to_numpy(), "world", paths[1])
+    maps = zip(*(views[name].to_pylist() for name in MAP_COLUMNS), strict=True)
     return Samples(
-        images=views["image"].to_pylist(),
-        maps=[EncodedView(**row) for row in views.select(MAP_COLUMNS).to_pylist()],
+        images=OnDisk(kept, bytes, ((image,) for image in views["image"].to_pylist())),
+        maps=OnDisk(kept, EncodedView, maps),
         worlds=[EncodedWorld(**row) for row in worlds.drop_columns(["world"]).to_pylist()],
         world_of=world_of,
         view_of=view_of,
@@ -450,7 +390,7 @@ def _read_table(path: Path, schema: pa.Schema, columns: tuple[str, ...] | None) 
     return table
 
 
-def _sample_columns(table: pa.Table, propositions: int, path: Path) -> dict[str, np.ndarray]:
+def _sample_columns(table: pa.Table, propositions: int, path: Path) -> dict[str, Any]:
     """Columns of ``Samples`` by name, and ``view``."""
     numbers = {
         "view": "view",

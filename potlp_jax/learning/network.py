@@ -34,6 +34,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float32, Int8, PRNGKeyArray, UInt8
 
+from potlp_jax.checks import POSITIVE, require_fields
 from potlp_jax.errors import NetworkError
 from potlp_jax.learning.fovea import ABOVE, BAND, BELOW, bands_of, packed, patch, unpacked
 from potlp_jax.task.propositions import require_same_propositions
@@ -110,17 +111,8 @@ class NetworkConfig:
         side = STRIDE * math.prod(_SECOND_STRIDES)
         if any(size < side or size % side for size in self.image_shape):
             raise NetworkError(f"image_shape is {self.image_shape}; rows and columns must be multiples of {side}")
-        for name in (
-            "distance_scale",
-            "success_cost_scale",
-            "failure_cost_scale",
-            "step",
-            "pixel_scale",
-            "far",
-            "fold",
-        ):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise NetworkError(f"{name} is {getattr(self, name)}; give a positive number")
+        scales = ("distance_scale", "success_cost_scale", "failure_cost_scale", "step", "pixel_scale", "far", "fold")
+        require_fields(self, scales, POSITIVE, NetworkError)
         if not (math.isfinite(self.exclusive_within) and self.exclusive_within >= 0):
             raise NetworkError(f"exclusive_within is {self.exclusive_within}; give a number of cells, 0 for none")
         if not math.isfinite(self.horizon):

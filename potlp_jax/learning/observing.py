@@ -10,7 +10,7 @@ from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 import jax
 from jaxtyping import Array, Int32, UInt8
 
-from potlp_jax.planning.estimates import Estimates
+from potlp_jax.planning.estimates import Estimates, Estimator
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.world.frontiers import Subgoals
 from potlp_jax.world.grid import BeliefMap
@@ -47,6 +47,15 @@ class ObservingEstimator(Protocol):
     def __call__(self, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays) -> Estimates: ...
 
 
+@runtime_checkable
+class AnswersFromPanoramas(Protocol):
+    """An estimator whose answers about a subgoal come from one of the panoramas that it was shown."""
+
+    def observations(self, subgoals: Subgoals) -> Int32[Array, " S"]:
+        """Number of that panorama for each subgoal, counted from 0 as they were shown; anything where masked. Pure."""
+        ...
+
+
 _Observing = TypeVar("_Observing", bound=ObservingEstimator)
 
 
@@ -57,6 +66,16 @@ def observe_panorama(
     """The estimator after a panorama from ``cell``; ``belief`` is the map after the observation."""
     # A typing.Self would say that the class stays; checks at run time cannot read it in a protocol.
     return cast(_Observing, estimator.remember(estimator.encode(panorama), belief, cell))
+
+
+def observations_of(estimator: Estimator | None, subgoals: Subgoals) -> Int32[Array, " S"] | None:
+    """Which panorama the estimates of each subgoal come from; None where no single one does."""
+    return _observations(estimator, subgoals) if isinstance(estimator, AnswersFromPanoramas) else None
+
+
+@jax.jit
+def _observations(estimator: AnswersFromPanoramas, subgoals: Subgoals) -> Int32[Array, " S"]:
+    return estimator.observations(subgoals)
 
 
 def with_memory(estimator: _Observing, memory: Any) -> _Observing:

@@ -48,7 +48,7 @@ class NetworkEstimator:
         """
         require_propositions(self.config.propositions, task.propositions, "the estimator's network")
         # Each subgoal is judged from the panorama in which it was last in sight, taken from where the robot then stood.
-        places = slots_of_observations(self.memory, observation_of_subgoals(self.memory, subgoals))
+        places = slots_of_observations(self.memory, self.observations(subgoals))
         distance = self.distances(belief, subgoals)
         angle = jax.vmap(bearing)(self.memory.cells[places], subgoals.cells)
         classes = task.class_mask.shape[0]
@@ -107,8 +107,12 @@ class NetworkEstimator:
 
         0 where masked, or where known space does not lead there.
         """
-        poses = self.memory.cells[slots_of_observations(self.memory, observation_of_subgoals(self.memory, subgoals))]
+        poses = self.memory.cells[slots_of_observations(self.memory, self.observations(subgoals))]
         return _distances(belief, poses, subgoals)
+
+    def observations(self, subgoals: Subgoals) -> Int32[Array, " S"]:
+        """The panorama that each subgoal is judged from (``learning.memory.observation_of_subgoals``)."""
+        return observation_of_subgoals(self.memory, subgoals)
 
     def encode(self, panorama: UInt8[Array, "rows columns 3"]) -> Float32[Array, "feature_rows feature_columns F"]:
         """The first stage's features of a panorama."""

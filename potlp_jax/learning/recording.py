@@ -25,11 +25,11 @@ from potlp_jax.learning.dataset import (
     SAMPLES_SCHEMA,
     VIEWS_SCHEMA,
     WORLDS_SCHEMA,
-    DatasetMetadata,
     encode,
     view_id,
     writer_versions,
 )
+from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.labels import true_labels
 from potlp_jax.learning.map_images import encode_view, encode_world
 from potlp_jax.learning.painting import Painting, blank_painting, paint

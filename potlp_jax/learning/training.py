@@ -20,11 +20,13 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
+from potlp_jax.checks import AT_LEAST_ONE, SHARE, require_fields
 from potlp_jax.errors import TrainingError
 from potlp_jax.learning.augmentation import Augmentation
 from potlp_jax.learning.batches import Batch, Batches, prefetched
 from potlp_jax.learning.checkpoints import checkpoint_steps, load_checkpoint, save_checkpoint
 from potlp_jax.learning.dataset import Samples
+from potlp_jax.learning.estimator import TrainedEstimator, identity_of
 from potlp_jax.learning.learner import Learner
 from potlp_jax.learning.loss import DataScale, Evaluation, Sums, evaluation_of, loss_sums, total_loss
 from potlp_jax.learning.network import Params
@@ -66,16 +68,9 @@ class TrainingOptions:
     checkpoint_steps: int = 200
 
     def __post_init__(self) -> None:
-        for name in ("views_per_batch", "samples_per_view", "checkpoint_steps"):
-            _require_one(name, getattr(self, name))
-        for name in ("weighting", "warmup", "average_decay"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise TrainingError(f"{name} is {getattr(self, name)}; give a number from 0 to 1")
-
-
-def _require_one(name: str, value: int) -> None:
-    if value < 1:
-        raise TrainingError(f"{name} is {value}; give at least 1")
+        names = ("views_per_batch", "samples_per_view", "checkpoint_steps")
+        require_fields(self, names, AT_LEAST_ONE, TrainingError)
+        require_fields(self, ("weighting", "warmup", "average_decay"), SHARE, TrainingError)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -91,7 +86,7 @@ class TrainingConfig(TrainingOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require_one("steps", self.steps)
+        require_fields(self, ["steps"], AT_LEAST_ONE, TrainingError)
 
 
 @struct.dataclass(kw_only=True)
@@ -310,28 +305,42 @@ def steps_per_epoch(learner: Learner, training: Samples, config: TrainingConfig)
     return batches_of(learner, training, config).per_epoch
 
 
+def provenance(training: Samples, validation: Samples, initial: TrainedEstimator | None) -> dict[str, Any]:
+    """What a training is made from: every data set, and the estimator that it goes on from; JSON-able."""
+
+    # By number and not as a list, so that what differs is named by itself.
+    def data(samples: Samples) -> dict[str, Any]:
+        return {str(number): dataclasses.asdict(source) for number, source in enumerate(samples.sources)}
+
+    return {
+        "training_data": data(training),
+        "validation_data": data(validation),
+        "initial": None if initial is None else identity_of(initial),
+    }
+
+
 def training_identity(
-    learner: Learner, training: Samples, validation: Samples, config: TrainingConfig
+    learner: Learner,
+    training: Samples,
+    validation: Samples,
+    config: TrainingConfig,
+    initial: TrainedEstimator | None = None,
 ) -> dict[str, Any]:
     """What must be equal for a training to be resumed.
 
     Args:
         learner: what is trained.
-        training, validation: the data, of which the sizes and splits are compared.
+        training, validation: the data.
         config: how.
+        initial: what it goes on from.
 
     Returns:
         JSON-able; differences are named on loading. Versions are part of it: others would end with other bits.
     """
-
-    def data(samples: Samples) -> dict[str, Any]:
-        return {"views": len(samples.images), "samples": len(samples.success), "split": samples.metadata.split}
-
     return {
         "network": dataclasses.asdict(learner.config),
         "training": dataclasses.asdict(config),
-        "training_data": data(training),
-        "validation_data": data(validation),
+        **provenance(training, validation, initial),
         "versions": {name: version(name) for name in ("jax", "jaxlib", "flax", "optax", "numpy")},
     }
 
@@ -342,7 +351,7 @@ def train(
     validation: Samples,
     config: TrainingConfig,
     *,
-    initial: Params | None = None,
+    initial: TrainedEstimator | None = None,
     folder: Path | None = None,
     budget_seconds: float = float("inf"),
     on_start: Callable[[int], None] = lambda step: None,
@@ -356,7 +365,7 @@ def train(
         training: what is learned from.
         validation: of other worlds; decides which parameters are the best.
         config: how, and for how many steps.
-        initial: parameters to begin with; new ones by default.
+        initial: its parameters are begun with; new ones by default.
         folder: where checkpoints go; None for none.
         budget_seconds: training stops after this time, over all resumptions, also where steps are left.
         on_start: told the number of steps already done.
@@ -401,18 +410,18 @@ class _Loop:
         validation: Samples,
         config: TrainingConfig,
         folder: Path | None,
-        initial: Params | None,
+        initial: TrainedEstimator | None,
     ) -> None:
         self._learner, self._config, self._folder = learner, config, folder
         # Figures of the training data also scale the validation loss: they belong to the loss, not to the data.
         scale = DataScale.of(training)
         self.batches = batches_of(learner, training, config)
         self._validation = batches_of(learner, validation, config)
-        self._identity = training_identity(learner, training, validation, config)
+        self._identity = training_identity(learner, training, validation, config, initial)
         self._train_step = make_train_step(learner, config, scale)
         self._evaluate_step = make_evaluate_step(learner, scale, config.weighting)
         self._schedule = learning_rate_schedule(config)
-        self._state = initial_state(learner, config, initial)
+        self._state = initial_state(learner, config, None if initial is None else initial.params)
         before = 0.0
         saved = checkpoint_steps(folder) if folder is not None else []
         if folder is not None and saved:

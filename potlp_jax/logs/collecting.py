@@ -9,7 +9,8 @@ import numpy as np
 from potlp_jax.environments.ros.places import Places
 from potlp_jax.errors import DatasetError, LogError
 from potlp_jax.learning import recording
-from potlp_jax.learning.dataset import DatasetMetadata, finished_shards, write_shard
+from potlp_jax.learning.dataset import finished_shards, write_shard
+from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.domain import LOGS
 from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.sample_weights import WeightBounds

@@ -24,18 +24,19 @@ import numpy as np
 from jaxtyping import Array, Int32, PRNGKeyArray, UInt8
 
 from potlp_jax.cache import enable_compilation_cache
+from potlp_jax.checks import AT_LEAST_ONE, require_fields
 from potlp_jax.codec import json_copy
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import DatasetError
 from potlp_jax.learning.dataset import (
-    DatasetMetadata,
     Samples,
     finished_shards,
     read_metadata,
     remove_unfinished_files,
     write_shard,
 )
+from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.domain import unit_of
 from potlp_jax.learning.estimator import identity_of, named_estimator
 from potlp_jax.learning.questions import HELD_OUT, TaskDistribution
@@ -86,9 +87,8 @@ class CollectConfig(RecordingConfig):
     pursued: int = 12
 
     def __post_init__(self) -> None:
-        for name in ("drives", "pursued", "tasks_per_world", "worlds_per_shard"):
-            if getattr(self, name) < 1:
-                raise DatasetError(f"{name} is {getattr(self, name)}; give at least 1")
+        names = ("drives", "pursued", "tasks_per_world", "worlds_per_shard")
+        require_fields(self, names, AT_LEAST_ONE, DatasetError)
         if self.first_world < 0:
             raise DatasetError(f"first_world is {self.first_world}; worlds are numbered from 0")
         # An estimator that nobody asks would be named in the data set all the same.

@@ -16,21 +16,24 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from potlp_jax.checks import AT_LEAST_ONE, require_fields
 from potlp_jax.codec import differences
 from potlp_jax.errors import TrainingError
 from potlp_jax.files import MOST_TEXT, read_json, reading
 from potlp_jax.learning.building_learner import BuildingOptions
 from potlp_jax.learning.dataset import Samples
+from potlp_jax.learning.estimator import TrainedEstimator, read_estimator
 from potlp_jax.learning.learner import Learner
 from potlp_jax.learning.learners import learner_of
 from potlp_jax.learning.loss import DataScale
-from potlp_jax.learning.network import Params, parameter_count, require_propositions
+from potlp_jax.learning.network import parameter_count, require_propositions
 from potlp_jax.learning.panorama_learner import PanoramaOptions
-from potlp_jax.learning.serialization import load_estimator, save_estimator
+from potlp_jax.learning.serialization import save_estimator
 from potlp_jax.learning.training import (
     Trained,
     TrainingConfig,
     TrainingOptions,
+    provenance,
     seconds_per_step,
     steps_per_epoch,
     train,
@@ -63,8 +66,7 @@ class FitConfig:
     training: TrainingOptions = TrainingOptions()
 
     def __post_init__(self) -> None:
-        if self.epochs < 1:
-            raise TrainingError(f"epochs is {self.epochs}; give at least 1")
+        require_fields(self, ["epochs"], AT_LEAST_ONE, TrainingError)
         if self.minutes is not None and not self.minutes > 0:
             raise TrainingError(f"minutes is {self.minutes}; give a positive number, or null for no limit")
 
@@ -94,7 +96,8 @@ def fit(
         TrainingError: the data do not fit, ``out`` has a plan for something else, or the loss is not finite.
         CheckpointError: ``out`` holds a damaged checkpoint, or one of another training.
     """
-    learner, begin = _beginning(training, config, initial)
+    begin = None if initial is None else read_estimator(initial)
+    learner = config.network.learner(training) if begin is None else _learner_of(begin, training)
     out.mkdir(parents=True, exist_ok=True)
     # Measuring counts: the time asked for is that of the whole command.
     began = time.perf_counter()
@@ -121,19 +124,18 @@ def fit(
     finally:
         journal.close()
     # Whoever has the file alone can still say how it was made.
-    metadata = _metadata(training, validation, plan, trained, journal)
+    made_from = provenance(training, validation, begin)
+    metadata = made_from | _metadata(training, plan, trained, journal)
     save_estimator(out / ESTIMATOR, trained.params, learner.config, training.metadata.domain, metadata)
     return trained
 
 
-def _beginning(training: Samples, config: FitConfig, initial: Path | None) -> tuple[Learner, Params | None]:
-    """What is fitted, and its parameters where it does not begin with new ones."""
-    if initial is None:
-        return config.network.learner(training), None
-    params, known, _, _ = load_estimator(initial)
-    require_propositions(known.propositions, training.metadata.propositions, str(initial), asker="the training data")
+def _learner_of(begin: TrainedEstimator, training: Samples) -> Learner:
+    """What is fitted where an estimator is gone on from."""
+    known = begin.config
+    require_propositions(known.propositions, training.metadata.propositions, begin.name, asker="the training data")
     # The scales of costs are the estimator's own: with others its parameters would mean other costs.
-    return learner_of(known), params
+    return learner_of(known)
 
 
 def _plan(learner: Learner, training: Samples, out: Path, config: FitConfig) -> TrainingConfig:
@@ -195,14 +197,11 @@ def _say_what_is_fitted(training: Samples, plan: TrainingConfig, config: FitConf
     )
 
 
-def _metadata(
-    training: Samples, validation: Samples, plan: TrainingConfig, trained: Trained, journal: Journal
-) -> dict[str, Any]:
-    """What an estimator's file says of how it was made."""
+def _metadata(training: Samples, plan: TrainingConfig, trained: Trained, journal: Journal) -> dict[str, Any]:
+    """What an estimator's file says of how it was made, beside what it was made from."""
     return {
         "training": dataclasses.asdict(plan),
         "data": dataclasses.asdict(training.metadata),
-        "validation_split": validation.metadata.split,
         "panoramas": len(training.images),
         "samples": len(training.success),
         "prior": DataScale.of(training).prior,

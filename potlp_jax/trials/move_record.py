@@ -8,8 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from potlp_jax.learning.memory import observation_of_subgoals
-from potlp_jax.learning.panorama_estimator import NetworkEstimator
+from potlp_jax.learning.observing import observations_of
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.history import ActionTerms
 from potlp_jax.planning.move import Move, MoveKind
@@ -21,8 +20,6 @@ KIND_NAMES: Mapping[int, str] = MappingProxyType(
     {value: name.lower() for name, value in vars(MoveKind).items() if name.isupper()}
 )
 """What records call the kinds of moves: ``Decision.kind``."""
-
-_observation_numbers = jax.jit(observation_of_subgoals)
 
 
 def decision_of(
@@ -77,11 +74,9 @@ def decision_of(
 
 def _observations(estimator: Estimator | None, move: Move) -> tuple[int, ...]:
     """Per subgoal, the decision whose panorama its estimates come from; there is one panorama per decision."""
-    if not isinstance(estimator, NetworkEstimator):
-        return ()
     # A subgoal may be out of sight from here and be known from an earlier panorama.
-    numbers = np.asarray(_observation_numbers(estimator.memory, move.subgoals))
-    return tuple(int(number) for number in numbers[np.asarray(move.subgoals.mask)])
+    numbers = observations_of(estimator, move.subgoals)
+    return () if numbers is None else tuple(np.asarray(numbers)[np.asarray(move.subgoals.mask)].tolist())
 
 
 def _recorded_index(move: Move, action: int) -> int | None:

@@ -17,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Int32, PRNGKeyArray, UInt8
 
+from potlp_jax.checks import require_rules
+
 
 @dataclasses.dataclass(frozen=True)
 class CameraConfig:
@@ -74,9 +76,7 @@ class CameraConfig:
             (0 <= self.texture <= 1 and 0 <= self.ambient <= 1, "texture and ambient lie between 0 and 1"),
             (len(colours) == 6 and all(0 <= v <= 255 for v in colours), "a colour is three values of 0 to 255"),
         )
-        broken = [message for holds, message in rules if not holds]
-        if broken:
-            raise ValueError("not a camera: " + "; ".join(broken))
+        require_rules(rules, "a camera", ValueError)
 
     def lengths(self, scale: float = 1.0) -> dict[str, float]:
         """The fields that are lengths, by name, in cells that are ``scale`` times smaller."""

@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from jaxtyping import Int
 
+from potlp_jax.checks import require_rules
 from potlp_jax.environments.campus.furnishing import NO_ROOM, Floor, Kind
 from potlp_jax.errors import WorldError
 
@@ -71,9 +72,7 @@ class BlockStyle:
     joining_door: float = 0.06
 
     def __post_init__(self) -> None:
-        broken = [message for holds, message in self.rules() if not holds]
-        if broken:
-            raise WorldError("not a building: " + "; ".join(broken))
+        require_rules(self.rules(), "a building", WorldError)
 
     def rules(self) -> Iterator[tuple[bool, str]]:
         """What must hold, and how it is said where it does not."""

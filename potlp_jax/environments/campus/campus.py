@@ -14,6 +14,7 @@ import dataclasses
 
 import numpy as np
 
+from potlp_jax.checks import require_rules
 from potlp_jax.environments.campus.campus_builder import CampusBuilder, CampusFloor, CampusStyle
 from potlp_jax.environments.campus.delivery import DELIVERY_FAMILY, PARCELS_FAMILY
 from potlp_jax.environments.campus.floor_generator import FloorGenerator
@@ -85,9 +86,7 @@ class CampusConfig:
                 f"largest {self.largest} has too few rows for the outlines with wings {deepest} cells deep",
             ),
         )
-        broken = [message for holds, message in rules if not holds]
-        if broken:
-            raise WorldError("not a campus building: " + "; ".join(broken))
+        require_rules(rules, "a campus building", WorldError)
 
     def outlines_of(self, width: int) -> tuple[tuple[Outline, float], ...]:
         """The outlines for which a building of so many columns is large enough."""

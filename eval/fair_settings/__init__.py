@@ -1,0 +1,1 @@
+"""The settings that are best for each policy: what is tried, trials, the choice, the report."""

@@ -1,0 +1,19 @@
+"""The mutants: small faults of the core, each as one exchange of text, with the tests that must notice it.
+
+One module for each part of the core, in the order of the table.
+"""
+
+from eval.mutants.core import distances, judges, learning, rollouts, search, status, tasks, trials, world
+from eval.mutants.mutant import Mutant
+
+MUTANTS: tuple[Mutant, ...] = (
+    *rollouts.MUTANTS,
+    *search.MUTANTS,
+    *world.MUTANTS,
+    *distances.MUTANTS,
+    *tasks.MUTANTS,
+    *learning.MUTANTS,
+    *trials.MUTANTS,
+    *status.MUTANTS,
+    *judges.MUTANTS,
+)

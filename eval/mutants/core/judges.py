@@ -1,0 +1,57 @@
+"""Faults of the core: judges."""
+
+from eval.mutants.mutant import Mutant
+
+PART = "judges"
+
+_AUDIT = "potlp_jax/verify/audit.py"
+_ALONE = "not sweep and not command and not row"
+"""Of the auditor's tests: those of one trial, which need no sweep."""
+
+MUTANTS = (
+    Mutant(
+        PART,
+        "the auditor sees no violation",
+        _AUDIT,
+        "if len(word) > 1 and word_violates(formula, world.propositions, word):",
+        "if False:",
+        ("tests/test_audit.py",),
+        _ALONE,
+    ),
+    Mutant(
+        PART,
+        "the auditor believes any outcome",
+        _AUDIT,
+        "if word_satisfies(formula, world.propositions, word) != (outcome == Outcome.SATISFIED):",
+        "if False:",
+        ("tests/test_audit.py",),
+        _ALONE,
+    ),
+    Mutant(
+        PART,
+        "the auditor takes costs roughly",
+        _AUDIT,
+        "_TOLERANCE = 1e-9",
+        "_TOLERANCE = 1e-1",
+        ("tests/test_audit.py",),
+        _ALONE,
+    ),
+    Mutant(
+        PART,
+        "the auditor does not look where the path begins",
+        _AUDIT,
+        "if not cells or cells[0] != start:",
+        "if not cells:",
+        ("tests/test_audit.py",),
+        _ALONE,
+    ),
+    Mutant(
+        PART,
+        "the auditor lets unobserved cells be entered",
+        _AUDIT,
+        "_decision_differences(trial) + _entered_before_observed(trial)",
+        "_decision_differences(trial)",
+        ("tests/test_audit.py",),
+        _ALONE,
+    ),
+)

@@ -1,0 +1,89 @@
+"""Faults of the core: trials."""
+
+from eval.mutants.mutant import Mutant
+
+PART = "trials"
+
+_RULES = "potlp_jax/trials/rules.py"
+
+MUTANTS = (
+    Mutant(
+        PART,
+        "products are contracted with the sum that they are added to (rounding)",
+        "potlp_jax/planning/rounding.py",
+        "return jnp.abs(first * second)",
+        "return first * second",
+        ("tests/test_rounding.py",),
+    ),
+    Mutant(
+        PART,
+        "the word begins with the second cell",
+        _RULES,
+        "state=task.transitions[task.initial, letter]",
+        "state=task.initial",
+        ("tests/test_trial.py",),
+        "start_that",
+    ),
+    Mutant(
+        PART,
+        "a proposition seen for the first time is no reason to decide",
+        _RULES,
+        "return replans | surprised | pointless",
+        "return replans | pointless",
+        ("tests/test_rules.py",),
+    ),
+    Mutant(
+        PART,
+        "the robot goes on to a frontier that has nothing more to show",
+        _RULES,
+        "return replans | surprised | pointless",
+        "return replans | surprised",
+        ("tests/test_rules.py",),
+    ),
+    Mutant(
+        PART,
+        "a map that has not changed is decided on again",
+        _RULES,
+        "replans = (now.cells > before.cells) & (travelled >= self.replan_distance)",
+        "replans = travelled >= self.replan_distance",
+        ("tests/test_rules.py",),
+    ),
+    Mutant(
+        PART,
+        "visits are not counted anew on another map",
+        _RULES,
+        "jnp.where(known == tally.known, tally.visits, 0)",
+        "tally.visits",
+        ("tests/test_rules.py",),
+    ),
+    Mutant(
+        PART,
+        "a trial that satisfied its task beyond its budget ends as budget",
+        _RULES,
+        "    outcome = jnp.where(tally.travelled >= budget(belief, config), _BUDGET, outcome)\n"
+        "    outcome = jnp.where(task.trap[tally.state], _INFEASIBLE, outcome)\n"
+        "    outcome = jnp.where(task.accepting[tally.state], _SATISFIED, outcome)\n",
+        "    outcome = jnp.where(task.trap[tally.state], _INFEASIBLE, outcome)\n"
+        "    outcome = jnp.where(task.accepting[tally.state], _SATISFIED, outcome)\n"
+        "    outcome = jnp.where(tally.travelled >= budget(belief, config), _BUDGET, outcome)\n",
+        ("tests/test_rules.py",),
+    ),
+    Mutant(
+        PART,
+        "a path of a batch is written over its last cell",
+        "potlp_jax/trials/slots.py",
+        "cells[1:].astype(jnp.int16), (tally.steps + 1, 0))",
+        "cells[1:].astype(jnp.int16), (tally.steps, 0))",
+        ("tests/test_batch.py",),
+        "alone",
+    ),
+    Mutant(
+        PART,
+        "a planner without an action stays where it is (liveness)",
+        "potlp_jax/planning/policies.py",
+        "kind = jnp.where(falls_back, MoveKind.FALLBACK, jnp.where(acts, MoveKind.ACTION, MoveKind.NONE))",
+        "kind = jnp.where(acts, MoveKind.ACTION, MoveKind.NONE)",
+        ("tests/test_trial.py",),
+        "lose_nothing or keep_their_promises",
+    ),
+)
