@@ -17,8 +17,9 @@ side, entries                  lines of one side of a square, or pixels of a dis
 
 Task
 Z                              states of the task automaton (DFA)
-L                              letters, ``2 ** P``; bit ``i`` of a letter is proposition ``i``
-P, P1                          propositions
+L                              letters, ``2 ** P``; bit ``i`` of a letter is proposition ``i``; in learning, lanes: pairs
+                               of a subgoal and what to stay away from
+P                              propositions
 E                              edges (z', z'') of the automaton that a high-level action can attempt
 C                              outcome classes (stay, cube): what an estimator is asked for
 M                              conditions: the C classes first, then the conditions that several cubes make up
@@ -50,6 +51,7 @@ bands, columns_out             bands of rows of a panorama; columns of a result 
 patch_rows, patch_columns      rows and columns of the patch around a subgoal
 packed, pixels                 bands as channels; values of a patch in one vector
 k                              samples chosen from more
+of_way, of_goal                numbers that describe a way beyond a subgoal, and one to a proposition
 U, layers                      units of a layer; layers whose units phi scales and shifts
 =============================  ======================================================================================
 

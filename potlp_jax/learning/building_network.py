@@ -3,9 +3,13 @@
 The belief and the painting (``learning.painting``) are one picture of the building from above. A U-Net encodes it once
 a decision, for all frontiers and all classes (the first stage). What a subgoal is asked about is read off around its
 cell at every scale, together with one vector of the whole building; a small head per (subgoal, class) answers, its
-units scaled and shifted by phi (the second stage). Beside the answers the first stage says of every square of
-``SQUARE`` cells how much of it is free and which propositions lie in it, also where nothing was observed: training asks
-for it, because the simulator knows it everywhere, and people can look at it.
+units scaled and shifted by phi (the second stage).
+
+The first stage also says of every square of ``SQUARE`` cells how much of it is free, what lies in it and how one gets
+through it (``learning.squares``), also where nothing was observed: training asks for it, because the simulator knows it
+everywhere. In the building that is imagined so, paths are computed from each subgoal (``learning.imagined_paths``), and
+the head is told how much of what the class looks for they reach, and how far it is. Without, a network that imagines a
+building well still answers badly: paths are hard to learn (docs/estimator.md).
 
 No layer normalises over a batch, and the map is padded to whole squares on the right and below, so a map's answers
 never depend on what else is computed with it. Convolutions see where the edge of the array is, and the answers for a

@@ -101,9 +101,9 @@ _LESS_ONE = (slice(None, -1), slice(1, None))
 class Outlook:
     """What lies beyond subgoals as the network imagines it, for each lane: a subgoal and what to stay away from."""
 
-    way: Float32[Array, "*B W"]
+    way: Float32[Array, "*B of_way"]
     """``OF_WAY`` numbers, whatever is looked for."""
-    goal: Float32[Array, "*B P V"]
+    goal: Float32[Array, "*B P of_goal"]
     """``OF_GOAL`` numbers for each proposition."""
 
 
@@ -329,7 +329,7 @@ def _arrived(ways: _SideWays, closed: Sequence[Float32[Array, "rows columns 1"]]
     return functools.reduce(_cheaper, entered)
 
 
-def _of_way(scene: Scenery, clear: Float32[Array, "rows columns L"], arrived: Ways) -> Float32[Array, "*B W"]:
+def _of_way(scene: Scenery, clear: Float32[Array, "rows columns L"], arrived: Ways) -> Float32[Array, "*B of_way"]:
     """How far and how much one can explore there: what R_F depends on."""
     hidden, free = scene.hidden[:, :, None], scene.free[:, :, None]
     walked = hidden & (arrived.obstacles < _OPEN) & (free * clear > _ROOMY) & jnp.isfinite(arrived.cost)
@@ -341,7 +341,7 @@ def _of_way(scene: Scenery, clear: Float32[Array, "rows columns L"], arrived: Wa
 
 def _of_goal(
     scene: Scenery, hidden: _SideWays, seen: Ways, here: Bool[Array, "rows columns L"], bit: int
-) -> Float32[Array, "L V"]:
+) -> Float32[Array, "L of_goal"]:
     """How much of a proposition can be reached, and how far it is: what P_S and R_S depend on."""
     approach = [1 - scene.approach[:, :, bit, side, None] for side in range(SIDES)]
     arrived = _arrived(hidden, approach)

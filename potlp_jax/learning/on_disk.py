@@ -58,7 +58,7 @@ class ImageFile:
             ) from error
         return np.array(bounds, np.int64)
 
-    def read(self, bounds: Int64[np.ndarray, " K1"]) -> list[bytes]:
+    def read(self, bounds: Int64[np.ndarray, " entries"]) -> list[bytes]:
         """The byte strings of an entry, by its row of what ``write`` returned."""
         first, *_, last = bounds.tolist()
         # One call without a position, which threads would share.
