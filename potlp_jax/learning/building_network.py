@@ -8,8 +8,8 @@ units scaled and shifted by phi (the second stage).
 The first stage also says of every square of ``SQUARE`` cells how much of it is free, what lies in it and how one gets
 through it (``learning.squares``), also where nothing was observed: training asks for it, because the simulator knows it
 everywhere. In the building that is imagined so, paths are computed from each subgoal (``learning.imagined_paths``), and
-the head is told how much of what the class looks for they reach, and how far it is. Without, a network that imagines a
-building well still answers badly: paths are hard to learn (docs/estimator.md).
+the head is told how much of what the class looks for they reach, and how far it is: paths are easily computed and
+hard to learn.
 
 No layer normalises over a batch, and the map is padded to whole squares on the right and below, so a map's answers
 never depend on what else is computed with it. Convolutions see where the edge of the array is, and the answers for a

@@ -3,7 +3,7 @@
 One module for each part of the core, in the order of the table.
 """
 
-from eval.mutants.core import distances, judges, learning, rollouts, search, status, tasks, trials, world
+from eval.mutants.core import distances, imagination, judges, learning, rollouts, search, status, tasks, trials, world
 from eval.mutants.mutant import Mutant
 
 MUTANTS: tuple[Mutant, ...] = (
@@ -13,6 +13,7 @@ MUTANTS: tuple[Mutant, ...] = (
     *distances.MUTANTS,
     *tasks.MUTANTS,
     *learning.MUTANTS,
+    *imagination.MUTANTS,
     *trials.MUTANTS,
     *status.MUTANTS,
     *judges.MUTANTS,
