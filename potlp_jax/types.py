@@ -17,8 +17,8 @@ side, entries                  lines of one side of a square, or pixels of a dis
 
 Task
 Z                              states of the task automaton (DFA)
-L                              letters, ``2 ** P``; bit ``i`` of a letter is proposition ``i``; in learning, lanes: pairs
-                               of a subgoal and what to stay away from
+L                              letters, ``2 ** P``; bit ``i`` of a letter is proposition ``i``; in learning, lanes: a
+                               subgoal and what to stay away from
 P                              propositions
 E                              edges (z', z'') of the automaton that a high-level action can attempt
 C                              outcome classes (stay, cube): what an estimator is asked for

@@ -81,8 +81,8 @@ def _estimator(params, world: World) -> BuildingEstimator:
     return BuildingEstimator(params=params, memory=blank_painting(*world.shape), config=CONFIG)
 
 
-def _asked(params, world: World):
-    task = Task.from_formula("!hazard U goal", propositions=NAMES)
+def _asked(params, world: World, formula: str = "!hazard U goal"):
+    task = Task.from_formula(formula, propositions=NAMES)
     belief = observe(BeliefMap.unobserved(world), world, world.start, SENSOR)
     eyes = observe_panorama(_estimator(params, world), render(world, world.start, CAMERA), belief, world.start)
     subgoals = find_subgoals(belief, belief.free, jnp.zeros(world.shape), FrontierConfig(max_subgoals=4))
@@ -100,8 +100,9 @@ def test_worlds_that_look_alike_so_far_get_equal_answers(params):
             np.testing.assert_array_equal(mine, its)
 
 
-def test_estimates_are_the_networks_answers_and_padding_cannot_succeed(params):
-    eyes, belief, subgoals, task = _asked(params, _world())
+@pytest.mark.parametrize("formula", ["!hazard U goal", "(!hazard U goal) & F hazard"])
+def test_estimates_are_the_networks_answers_and_padding_cannot_succeed(params, formula):
+    eyes, belief, subgoals, task = _asked(params, _world(), formula)
     found = eyes(belief, subgoals, task.arrays)
     encoded = NETWORK.encode(params, map_channels(belief, eyes.memory))
     places = NETWORK.places(params, encoded, subgoals.cells)

@@ -141,6 +141,28 @@ def test_a_goal_that_was_seen_counts_where_a_way_comes_out_by_another_frontier()
     assert found.goal[1, 0, SEEN] == 0.0
 
 
+def test_a_way_does_not_come_back_by_its_own_frontier() -> None:
+    cells, letters = house()
+    letters = np.zeros_like(letters)
+    letters[10, 3] = 1
+    seen = np.zeros(cells.shape, bool)
+    seen[:, :10] = True
+    found = beyond(cells, letters, seen, [(14, 9)])
+    assert found.goal[0, 0, SEEN] == 0.0
+
+
+def test_a_goal_before_a_wall_is_not_reached_from_behind_it() -> None:
+    cells, letters = house()
+    letters = np.zeros_like(letters)
+    # Beside the wall at column 22, in the same squares.
+    letters[3:6, 21] = 1
+    seen = np.zeros(cells.shape, bool)
+    seen[:, :10] = True
+    before, behind = np.asarray(beyond(cells, letters, seen, [(4, 9), (14, 9)]).goal[:, 0, SHARE])
+    assert before == 1.0
+    assert behind == 0.0
+
+
 def test_prospects_of_several_propositions_are_the_worst() -> None:
     lanes = Outlook(
         way=jnp.ones((3, OF_WAY)),
