@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from potlp_jax.learning import imagined_paths
+from potlp_jax.learning import square_ways
 from potlp_jax.learning.imagined_paths import OF_GOAL, OF_WAY, PROSPECTS, Outlook, outlook, prospects, scenery
 from potlp_jax.learning.squares import EAST, NORTH, PASSAGES, SOUTH, SQUARE, WEST, true_squares
 from potlp_jax.world.grid import BeliefMap
@@ -53,14 +53,14 @@ def cheapest(start: dict[tuple[str, int, int], float], closed: np.ndarray) -> di
 @pytest.mark.parametrize("seed", range(6))
 def test_ways_equal_those_of_dijkstra(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     # Without the tolerance that saves sweeps.
-    monkeypatch.setattr(imagined_paths, "_GAIN", 0.0)
+    monkeypatch.setattr(square_ways, "_GAIN", 0.0)
     random = np.random.default_rng(seed)
     rows, columns, lanes = int(random.integers(2, 7)), int(random.integers(2, 9)), 3
     closed = random.choice([0.0, 0.0, 0.3, 1.0, np.inf], (rows, columns, len(PASSAGES), lanes))
     begins = random.random((rows, columns, lanes)) < 0.1
-    start = imagined_paths._at_sides(jnp.where(jnp.asarray(begins), 2.0, jnp.inf))
+    start = square_ways.ways_to_sides(jnp.where(jnp.asarray(begins), 2.0, jnp.inf))
     chances = [jnp.asarray(closed[..., passage, :], jnp.float32) for passage in range(len(PASSAGES))]
-    ways = jax.jit(imagined_paths._solved)(start, chances)
+    ways = jax.jit(square_ways.cheapest_ways)(start, chances)
     for lane in range(lanes):
         of_lane = {
             side_of(row, column, side): 2.0

@@ -2,24 +2,20 @@
 
 A network that says what unobserved squares hold (``learning.squares``) knows nearly all that P_S, R_S and R_F depend
 on, but a path is hard to learn. So it is computed: from each subgoal, for each set of propositions to stay away from,
-the cheapest way to every square through what is not observed, as docs/model.md section 6 has it on cells. A step may be
-closed, with the chance that the network gives; the chances are added up along the way (its **obstacles**, the expected
-number of closed steps) and weigh as a detour of ``_DETOUR`` cells each. Where the network is sure, a way with less than
-one half of an obstacle is open. What comes out is not an estimate yet: steps are not independent, and the head of the
-network learns what the numbers are worth.
+the cheapest way to every square through what is not observed (``learning.square_ways``), as docs/model.md section 6 has
+it on cells. What comes out is not an estimate yet: steps are not independent, and the head of the network learns what
+the numbers are worth.
 
 No gradient passes: what is imagined is learned from what the buildings are, not from what would suit the answers.
 """
-
-import functools
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int8, Int32
 
-from potlp_jax.learning.squares import EAST, NORTH, PASSAGES, SIDES, SOUTH, SQUARE, WEST, Squares, in_squares
+from potlp_jax.learning.square_ways import INSIDE, SideWays, Ways, cheapest_ways, ways_into_squares, ways_to_sides
+from potlp_jax.learning.squares import PASSAGES, SIDES, SQUARE, Squares, in_squares
 from potlp_jax.world.frontiers import frontier_cells
 from potlp_jax.world.grid import BeliefMap
 
@@ -34,10 +30,6 @@ PROSPECTS: int = OF_WAY + OF_GOAL + 1
 
 # Which numbers of a way to a proposition are costs, and not chances.
 _IS_COST = (False, False, False, False, True, False, True)
-# A step that is surely closed counts as a detour of so many cells: more than there is to go round in most buildings.
-_DETOUR = 600.0
-# Lengths in cells of the way through a square: straight, around a corner, and from a side to somewhere inside.
-_STRAIGHT, _CORNER, _INSIDE = 4.0, 2.8, 2.0
 # From this share of cells on that nobody has seen, of those that are not known to be occupied, a square is a part of
 # what is not observed; with fewer a path through it would mostly cross what is.
 _HIDDEN = 0.6
@@ -49,52 +41,8 @@ _OPEN = 0.5
 _ROOMY = 0.3
 # Below this there is nothing to divide by.
 _LITTLE = 1e-3
-# Sweeps go on while a way is found that is so much cheaper, in cells: nothing is gained by less.
-_GAIN = 2.0
 # Costs enter the head in this unit of cells, as a logarithm.
 _UNIT = 10.0
-
-
-@struct.dataclass(kw_only=True)
-class Ways:
-    """Cheapest ways to places.
-
-    Attributes:
-        cost: length in cells plus ``_DETOUR`` times the obstacles; infinite where no way leads.
-        obstacles: along the way; 0 where no way leads.
-    """
-
-    cost: Float32[Array, "..."]
-    obstacles: Float32[Array, "..."]
-
-    @property
-    def length(self) -> Float32[Array, "..."]:
-        """In cells; 0 where no way leads."""
-        return jnp.where(jnp.isfinite(self.cost), self.cost - _DETOUR * self.obstacles, 0.0)
-
-    def chance(self, most: float = 1.0) -> Float32[Array, "..."]:
-        """1 without obstacles, 0 from ``most`` obstacles on and where no way leads."""
-        return jnp.where(jnp.isfinite(self.cost), jnp.maximum(1 - self.obstacles / most, 0.0), 0.0)
-
-
-@struct.dataclass(kw_only=True)
-class _SideWays:
-    """To the sides of squares; lanes are the last axis."""
-
-    upright: Ways
-    """Of shape ``[rows, columns + 1, L]``: to the western sides of squares, and the eastern ones of the last."""
-    level: Ways
-    """Of shape ``[rows + 1, columns, L]``: to the northern sides of squares, and the southern ones of the last."""
-
-    def of_squares(self) -> tuple[Ways, Ways, Ways, Ways]:
-        """To the four sides of each square, in the order of the sides, ``[rows, columns, L]``."""
-        west, east = (jax.tree.map(lambda a, cut=cut: a[:, cut], self.upright) for cut in _LESS_ONE)
-        north, south = (jax.tree.map(lambda a, cut=cut: a[cut], self.level) for cut in _LESS_ONE)
-        return west, east, north, south
-
-
-# All but the last, and all but the first.
-_LESS_ONE = (slice(None, -1), slice(1, None))
 
 
 @struct.dataclass(kw_only=True)
@@ -178,17 +126,17 @@ def outlook(scene: Scenery, subgoals: Int32[Array, "L 2"], stay: Int8[Array, "L 
     barred = jnp.any(scene.seen[:, :, None] & avoided, axis=-1)
     away = _squares_away(scene, subgoals)
     begins = (away == 0) | ((away == 1) & scene.frontier[:, :, None])
-    start = _at_sides(jnp.where(begins, _INSIDE + SQUARE * away.astype(jnp.float32), jnp.inf))
+    start = ways_to_sides(jnp.where(begins, INSIDE + SQUARE * away.astype(jnp.float32), jnp.inf))
     passages = [scene.passages[:, :, number, None] for number in range(len(PASSAGES))]
     inside = scene.hidden[:, :, None]
-    hidden = _solved(start, [jnp.where(inside, 1 - chance * clear, jnp.inf) for chance in passages])
+    hidden = cheapest_ways(start, [jnp.where(inside, 1 - chance * clear, jnp.inf) for chance in passages])
     # Out by another frontier than the subgoal's own, and on through what is observed.
-    leaves = _at_sides(jnp.where((scene.open & scene.frontier)[:, :, None] & (away > _OWN), 0.0, jnp.inf))
+    leaves = ways_to_sides(jnp.where((scene.open & scene.frontier)[:, :, None] & (away > _OWN), 0.0, jnp.inf))
     out = jax.tree.map(jnp.add, hidden, leaves)
     inside = scene.open[:, :, None] & ~barred
-    seen = _arrived(_solved(out, [jnp.where(inside, 1 - chance, jnp.inf) for chance in passages]))
+    seen = ways_into_squares(cheapest_ways(out, [jnp.where(inside, 1 - chance, jnp.inf) for chance in passages]))
     goals = [_of_goal(scene, hidden, seen, away == 0, bit) for bit in range(stay.shape[-1])]
-    return Outlook(way=_of_way(scene, clear, _arrived(hidden)), goal=jnp.stack(goals, axis=-2))
+    return Outlook(way=_of_way(scene, clear, ways_into_squares(hidden)), goal=jnp.stack(goals, axis=-2))
 
 
 def _squares_away(scene: Scenery, subgoals: Int32[Array, "L 2"]) -> Int32[Array, "rows columns L"]:
@@ -198,135 +146,6 @@ def _squares_away(scene: Scenery, subgoals: Int32[Array, "L 2"]) -> Int32[Array,
     down = jnp.abs(jnp.arange(rows, dtype=jnp.int32)[:, None, None] - row[None, None])
     across = jnp.abs(jnp.arange(columns, dtype=jnp.int32)[None, :, None] - column[None, None])
     return jnp.maximum(down, across)
-
-
-def _at_sides(cost: Float32[Array, "rows columns L"]) -> _SideWays:
-    """Ways without obstacles to the sides of squares, by the cheaper of the two squares that share it."""
-
-    def ways(least: Array) -> Ways:
-        return Ways(cost=least, obstacles=jnp.zeros_like(least))
-
-    before, behind = (_padded(cost, 1, first) for first in (False, True))
-    above, below = (_padded(cost, 0, first) for first in (False, True))
-    return _SideWays(upright=ways(jnp.minimum(before, behind)), level=ways(jnp.minimum(above, below)))
-
-
-def _padded(array: Array, axis: int, first: bool, value: float = jnp.inf) -> Array:
-    """One more along an axis, at its beginning or at its end."""
-    widths = [(0, 0)] * array.ndim
-    widths[axis] = (1, 0) if first else (0, 1)
-    return jnp.pad(array, widths, constant_values=value)
-
-
-def _cheaper(one: Ways, other: Ways) -> Ways:
-    less = other.cost < one.cost
-    return jax.tree.map(lambda a, b: jnp.where(less, b, a), one, other)
-
-
-def _solved(start: _SideWays, closed: Sequence[Float32[Array, "rows columns L"]]) -> _SideWays:
-    """Cheapest ways from where they begin.
-
-    Squares are swept line by line, downwards, upwards and along columns, as in ``planning.distances.sweeping``, until
-    nothing changes.
-
-    Args:
-        start: where ways begin.
-        closed: the chance that each of ``PASSAGES`` is closed; infinite where it never is to be taken.
-    """
-    down = _Lines(closed)
-    across = _Lines([jnp.swapaxes(closed[number], 0, 1) for number in _TRANSPOSED])
-
-    def swept(state: tuple[_SideWays, Bool[Array, ""]]) -> tuple[_SideWays, Bool[Array, ""]]:
-        before, _ = state
-        after = _transposed(across.swept(_transposed(down.swept(before))))
-        old, new = ((ways.upright.cost, ways.level.cost) for ways in (before, after))
-        return after, jnp.any(new[0] < old[0] - _GAIN) | jnp.any(new[1] < old[1] - _GAIN)
-
-    return jax.lax.while_loop(lambda state: state[1], swept, (start, jnp.bool_(True)))[0]
-
-
-def _transposed(ways: _SideWays) -> _SideWays:
-    turned = jax.tree.map(lambda array: jnp.swapaxes(array, 0, 1), ways)
-    return _SideWays(upright=turned.level, level=turned.upright)
-
-
-# What each passage becomes where rows and columns change places.
-_TRANSPOSED = tuple(
-    PASSAGES.index(pair)
-    for pair in ((NORTH, SOUTH), (WEST, EAST), (WEST, NORTH), (WEST, SOUTH), (NORTH, EAST), (SOUTH, EAST))
-)
-
-
-class _Lines:
-    """The rows of squares of a map, to be swept in both directions."""
-
-    def __init__(self, closed: Sequence[Float32[Array, "rows columns L"]]) -> None:
-        self.steps = tuple(
-            Ways(cost=(_STRAIGHT if number < 2 else _CORNER) + _DETOUR * chance, obstacles=chance)
-            for number, chance in enumerate(closed)
-        )
-
-    def swept(self, ways: _SideWays) -> _SideWays:
-        """Once downwards, once upwards."""
-        for near, far in ((NORTH, SOUTH), (SOUTH, NORTH)):
-            ways = self._swept_once(ways, near, far)
-        return ways
-
-    def _swept_once(self, ways: _SideWays, near: int, far: int) -> _SideWays:
-        """Row by row from the map's ``near`` side to its ``far`` side."""
-
-        def next_row(begin: Ways, row: tuple[Ways, Ways, tuple[Ways, ...]]) -> tuple[Ways, tuple[Ways, Ways]]:
-            upright, end, steps = row
-
-            def through(side: Ways, *ends: int) -> Ways:
-                return jax.tree.map(jnp.add, side, steps[_passage(*ends)])
-
-            upright = _cheaper(upright, _shifted(through(begin, near, EAST), first=True))
-            upright = _cheaper(upright, _shifted(through(begin, near, WEST), first=False))
-            west, east = (jax.tree.map(lambda array, cut=cut: array[cut], upright) for cut in _LESS_ONE)
-            for arriving in (through(begin, near, far), through(west, WEST, far), through(east, EAST, far)):
-                end = _cheaper(end, arriving)
-            return end, (upright, end)
-
-        upwards = near == SOUTH
-        outermost, ends = (jax.tree.map(lambda array, cut=cut: array[cut], ways.level) for cut in _EDGE[upwards])
-        _, (upright, level) = jax.lax.scan(next_row, outermost, (ways.upright, ends, self.steps), reverse=upwards)
-        joined = (level, outermost) if upwards else (outermost, level)
-        return _SideWays(upright=upright, level=jax.tree.map(_stacked, *joined))
-
-
-def _passage(one: int, other: int) -> int:
-    """Which of ``PASSAGES`` joins two sides."""
-    return PASSAGES.index((one, other) if (one, other) in PASSAGES else (other, one))
-
-
-def _stacked(above: Array, below: Array) -> Array:
-    """One row and several, or several and one, as one array of rows."""
-    most = max(above.ndim, below.ndim)
-    return jnp.concatenate([array if array.ndim == most else array[None] for array in (above, below)])
-
-
-# Of the level sides the outermost row and the others, for sweeps downwards and upwards.
-_EDGE = ((0, slice(1, None)), (-1, slice(None, -1)))
-
-
-def _shifted(ways: Ways, first: bool) -> Ways:
-    """Ways to one more side, to which none leads, before or behind the others of a row."""
-    return Ways(
-        cost=_padded(ways.cost, 0, first),
-        obstacles=_padded(ways.obstacles, 0, first, 0.0),
-    )
-
-
-def _arrived(ways: _SideWays, closed: Sequence[Float32[Array, "rows columns 1"]] | None = None) -> Ways:
-    """Ways into squares, by the side that is cheapest; ``closed``: the obstacles behind each side, none by default."""
-    sides = ways.of_squares()
-    steps = [jnp.zeros_like(side.cost) for side in sides] if closed is None else closed
-    entered = [
-        Ways(cost=side.cost + (_INSIDE + _DETOUR * step), obstacles=side.obstacles + step)
-        for side, step in zip(sides, steps, strict=True)
-    ]
-    return functools.reduce(_cheaper, entered)
 
 
 def _of_way(scene: Scenery, clear: Float32[Array, "rows columns L"], arrived: Ways) -> Float32[Array, "*B of_way"]:
@@ -340,11 +159,11 @@ def _of_way(scene: Scenery, clear: Float32[Array, "rows columns L"], arrived: Wa
 
 
 def _of_goal(
-    scene: Scenery, hidden: _SideWays, seen: Ways, here: Bool[Array, "rows columns L"], bit: int
+    scene: Scenery, hidden: SideWays, seen: Ways, here: Bool[Array, "rows columns L"], bit: int
 ) -> Float32[Array, "L of_goal"]:
     """How much of a proposition can be reached, and how far it is: what P_S and R_S depend on."""
     approach = [1 - scene.approach[:, :, bit, side, None] for side in range(SIDES)]
-    arrived = _arrived(hidden, approach)
+    arrived = ways_into_squares(hidden, approach)
     # The subgoal's own square is entered already.
     cost, obstacles = (jnp.where(here, 0.0, array) for array in (arrived.cost, arrived.obstacles))
     arrived = Ways(cost=cost, obstacles=obstacles)

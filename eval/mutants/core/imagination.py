@@ -6,6 +6,7 @@ PART = "imagined paths"
 
 _SQUARES = "potlp_jax/learning/squares.py"
 _PATHS = "potlp_jax/learning/imagined_paths.py"
+_WAYS = "potlp_jax/learning/square_ways.py"
 _ESTIMATOR = "potlp_jax/learning/building_estimator.py"
 _LEARNER = "potlp_jax/learning/building_learner.py"
 
@@ -45,7 +46,7 @@ MUTANTS = (
     Mutant(
         PART,
         "imagined: columns are swept with the rows' passages",
-        _PATHS,
+        _WAYS,
         "_Lines([jnp.swapaxes(closed[number], 0, 1) for number in _TRANSPOSED])",
         "_Lines([jnp.swapaxes(chance, 0, 1) for chance in closed])",
         ("tests/test_imagined_paths.py",),
@@ -54,8 +55,8 @@ MUTANTS = (
         PART,
         "imagined: a goal is reached from any side",
         _PATHS,
-        "arrived = _arrived(hidden, approach)",
-        "arrived = _arrived(hidden)",
+        "arrived = ways_into_squares(hidden, approach)",
+        "arrived = ways_into_squares(hidden)",
         ("tests/test_imagined_paths.py",),
     ),
     Mutant(
