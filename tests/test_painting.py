@@ -1,5 +1,6 @@
 """What is painted on the map, against a loop over cells, and against a rendered room whose colours are known."""
 
+import itertools
 import math
 
 import jax
@@ -10,8 +11,8 @@ import pytest
 from potlp_jax.learning.painting import Painting, blank_painting, column_of, paint
 from potlp_jax.world.camera import CameraConfig, column_bearings, floor_rows
 from potlp_jax.world.grid import Appearance, BeliefMap, belief_from_numpy, make_world
-from potlp_jax.world.renderer import render
-from potlp_jax.world.sensing import SensorConfig, observe, visible
+from potlp_jax.world.renderer import obstacle_distances, render
+from potlp_jax.world.sensing import SensorConfig, observe
 
 CAMERA = CameraConfig(height=64, width=128, horizon=24.0, fold=8.0, texture=0.0)
 paint_jit = jax.jit(paint, static_argnames="camera")
@@ -30,14 +31,25 @@ def _belief(occupied: np.ndarray, unknown_from: int) -> BeliefMap:
     return belief_from_numpy(cells, np.zeros(cells.shape, np.int32))
 
 
+def _walk(occupied: np.ndarray, cell: tuple[int, int], bearing: float) -> float:
+    """How far one walks from a cell's middle along a bearing before one stands in an obstacle or outside."""
+    for step in itertools.count():
+        away = step * 1e-3
+        row, column = (
+            round(at + away * turn) for at, turn in zip(cell, (math.sin(bearing), math.cos(bearing)), strict=True)
+        )
+        inside = 0 <= row < occupied.shape[0] and 0 <= column < occupied.shape[1]
+        if not inside or (occupied[row, column] and (row, column) != cell):
+            return away
+    raise AssertionError
+
+
 def _slow_paint(painting: Painting, panorama: np.ndarray, belief: BeliefMap, cell: tuple[int, int]) -> Painting:
     """Cell by cell: the column whose bearing is nearest, the row of the floor at the cell's distance."""
     floor, beyond = np.array(painting.floor), np.array(painting.beyond)
-    distance = np.array(painting.distance)
-    everywhere = SensorConfig(range_cells=float(sum(distance.shape)))
-    sight = np.asarray(visible(belief.occupied, jnp.asarray(cell), everywhere))
+    distance, occupied = np.array(painting.distance), np.asarray(belief.occupied)
     bearings = column_bearings(CAMERA)
-    for row, column in np.argwhere(sight):
+    for row, column in np.ndindex(*distance.shape):
         away = math.hypot(row - cell[0], column - cell[1])
         if away >= distance[row, column]:
             continue
@@ -46,6 +58,9 @@ def _slow_paint(painting: Painting, panorama: np.ndarray, belief: BeliefMap, cel
         # On the border of two columns both are as near: the one that begins there.
         nearest = np.flatnonzero(apart <= apart.min() + 1e-6)
         chosen = nearest[-1] if nearest[0] != 0 or len(nearest) == 1 else nearest[0]
+        # Of an obstacle its side is seen, at most half a diagonal before its middle.
+        if away > _walk(occupied, cell, bearings[chosen]) + (math.sqrt(0.5) if occupied[row, column] else 0.0):
+            continue
         line = round(float(floor_rows(CAMERA, jnp.float32(away))))
         floor[row, column] = panorama[min(line, CAMERA.height - 1), chosen]
         beyond[row, column] = panorama[24, chosen]
@@ -65,6 +80,41 @@ def test_painting_is_what_a_loop_over_cells_paints(unknown_from):
         np.testing.assert_allclose(fast.distance, slow.distance, rtol=1e-6)
         np.testing.assert_array_equal(fast.beyond, slow.beyond)
         np.testing.assert_array_equal(fast.floor, slow.floor)
+
+
+def test_columns_look_as_far_as_a_walk_along_their_bearings():
+    occupied = _room()
+    # Without the outer wall on one side, the array's border ends the sight.
+    occupied[:, -1] = False
+    for cell in ((3, 3), (10, 5), (4, 9)):
+        found = jax.jit(obstacle_distances, static_argnames="config")(jnp.asarray(occupied), jnp.asarray(cell), CAMERA)
+        walked = [_walk(occupied, cell, bearing) for bearing in column_bearings(CAMERA)]
+        np.testing.assert_allclose(found, walked, atol=2e-3)
+
+
+def test_the_corner_of_a_wall_does_not_paint_what_it_hides():
+    """A grazing look past a corner: seen cells keep their colour when the next look meets the corner."""
+    occupied = np.ones((30, 30), bool)
+    occupied[1:-1, 15:-1] = occupied[18:24, 1:16] = False
+    red, corner = np.zeros((30, 30, 3), np.uint8), np.full((30, 30, 3), (30, 30, 200), np.uint8)
+    red[:, :, 0] = 200
+    look = Appearance(
+        floor_colour=jnp.asarray(red),
+        wall_colour=jnp.asarray(corner),
+        smoke=jnp.zeros((30, 30)),
+        light=jnp.ones((30, 30)),
+    )
+    world = make_world(occupied, np.zeros(occupied.shape, np.int32), (3, 20), appearance=look)
+    belief, painting = BeliefMap.unobserved(world), blank_painting(30, 30)
+    for cell in ((3, 20), (3, 19), (3, 18), (3, 17), (3, 16), (3, 15)):
+        at = jnp.array(cell)
+        belief = observe(belief, world, at, SensorConfig(range_cells=60.0))
+        painting = paint_jit(painting, render(world, at, CAMERA), belief, at, CAMERA)
+    floor = np.asarray(painting.floor).argmax(axis=2)
+    seen = np.isfinite(np.asarray(painting.distance)) & ~occupied
+    assert seen[18:24, 1:15].any()
+    # Pixels are as high as several cells far away: one at the foot of a wall may show the wall.
+    assert (floor[seen] > 0).mean() < 0.01
 
 
 def test_columns_are_those_that_look_along_the_bearing():

@@ -1,10 +1,12 @@
 """What the camera saw, painted on the map: a memory of colours, one for each cell, whatever the number of panoramas.
 
-Every cell that is in line of sight, as far as the belief knows, takes two colours from a panorama: that of the pixel
-in which its floor would be seen, and that at eye height in the same direction. Of a cell that the robot knows to be
-free the first is its floor, of an obstacle the foot of its wall, and of a cell that is not observed whatever is seen
-when one looks there: the floor far down a hallway, or the wall that stands in front of it. Which of these it is, and
-what haze in between says, is left to the network that reads the painting. The nearest look at a cell is kept.
+Every cell that the panorama shows, as far as the belief knows, takes two colours from it: that of the pixel in which
+its floor would be seen, and that at eye height in the same direction. Sight is followed along the very column that the
+pixel is in: another line to the cell may be free where this one meets the corner of a wall, which would be painted
+then. Of a cell that the robot knows to be free the first colour is its floor, of an obstacle the foot of its wall, and
+of a cell that is not observed whatever is seen when one looks there: the floor far down a hallway, or the wall that
+stands in front of it. Which of these it is, and what haze in between says, is left to the network that reads the
+painting. The nearest look at a cell is kept.
 """
 
 import math
@@ -15,7 +17,9 @@ from jaxtyping import Array, Float32, Int32, UInt8
 
 from potlp_jax.world.camera import CameraConfig, floor_rows
 from potlp_jax.world.grid import BeliefMap
-from potlp_jax.world.sensing import SensorConfig, visible
+from potlp_jax.world.renderer import obstacle_distances
+
+_HALF_DIAGONAL = math.sqrt(0.5)
 
 
 @struct.dataclass(kw_only=True)
@@ -67,8 +71,9 @@ def paint(
     distance = jnp.sqrt(rows**2 + columns**2)
     column = column_of(jnp.arctan2(rows, columns), panorama.shape[1])
     row = jnp.clip(jnp.round(floor_rows(camera, distance)).astype(jnp.int32), 0, panorama.shape[0] - 1)
-    # The longest line of sight on the grid is shorter than the sum of its sides.
-    in_sight = visible(belief.occupied, cell, SensorConfig(range_cells=float(height + width)))
+    free_until = obstacle_distances(belief.occupied, cell, camera)[column]
+    # An obstacle is met at its side, and may be seen across up to half a diagonal of it.
+    in_sight = distance <= free_until + jnp.where(belief.occupied, _HALF_DIAGONAL, 0.0)
     # What pads the map to an array is no part of the building, although nothing that is known hides it.
     inside = (jnp.arange(height)[:, None] < belief.extent[0]) & (jnp.arange(width)[None, :] < belief.extent[1])
     nearer = in_sight & inside & (distance < painting.distance)

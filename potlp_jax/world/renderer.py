@@ -24,7 +24,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float32, Int, Int32, UInt8
+from jaxtyping import Array, Bool, Float, Float32, Int, Int32, UInt8
 
 from potlp_jax import plugins
 from potlp_jax.errors import PluginError
@@ -139,6 +139,29 @@ def render(
     if config.renderer:
         return _render_elsewhere(world, cell, config)
     return _batched_renderer(config)(_pack_optics(world, config), _pack_colours(world), cell)
+
+
+def obstacle_distances(
+    occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], config: CameraConfig
+) -> Float32[Array, " columns"]:
+    """How far each column of a panorama looks: from the middle of a cell to the first obstacle, or out of the array.
+
+    Args:
+        occupied: True on obstacles, of the world or of what is known of it.
+        cell: where the camera is.
+        config: its geometry; static.
+
+    Returns:
+        Distances in cells.
+    """
+    # Beyond the array everything hides: rays end there, as the tables want it.
+    closed = jnp.pad(occupied, 1, constant_values=True)
+    rays, _ = _tables(config, *closed.shape)
+    base = (cell[0] + 1) * jnp.int32(closed.shape[1]) + cell[1] + 1
+    hides = jnp.take(closed.ravel(), base + rays.offset, mode="clip")
+    # The robot's own cell, step 0, hides nothing.
+    first = jnp.argmax(hides[1:], axis=0).astype(jnp.int32) + 1
+    return jnp.take_along_axis(jnp.asarray(rays.enter), first[None], axis=0)[0]
 
 
 def _render_elsewhere(world: World, cell: Int32[Array, "2"], config: CameraConfig) -> UInt8[Array, "rows columns 3"]:
