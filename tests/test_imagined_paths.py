@@ -100,6 +100,13 @@ def house() -> tuple[np.ndarray, np.ndarray]:
     return cells, letters
 
 
+def left_part(cells: np.ndarray) -> np.ndarray:
+    """What is seen of the house from its left room: the room and where both hallways begin."""
+    seen = np.zeros(cells.shape, bool)
+    seen[:, :10] = True
+    return seen
+
+
 def beyond(cells: np.ndarray, letters: np.ndarray, seen: np.ndarray, places: list[tuple[int, int]]) -> Outlook:
     """The outlook from some places of a building that is imagined as it is; the hazard is avoided."""
     belief = belief_of(np.where(seen, cells, BeliefMap.UNKNOWN), np.where(seen, letters, 0))
@@ -110,8 +117,7 @@ def beyond(cells: np.ndarray, letters: np.ndarray, seen: np.ndarray, places: lis
 
 def test_a_goal_is_reached_through_the_open_hallway_alone() -> None:
     cells, letters = house()
-    seen = np.zeros(cells.shape, bool)
-    seen[:, :10] = True
+    seen = left_part(cells)
     found = beyond(cells, letters, seen, [(4, 9), (14, 9)])
     assert found.goal[0, 0, SHARE] == 0.0
     assert found.goal[1, 0, SHARE] == 1.0
@@ -124,16 +130,14 @@ def test_what_is_avoided_closes_a_hallway() -> None:
     cells, letters = house()
     letters = letters.copy()
     letters[13:16, 20] = 2
-    seen = np.zeros(cells.shape, bool)
-    seen[:, :10] = True
+    seen = left_part(cells)
     found = beyond(cells, letters, seen, [(14, 9)])
     assert found.goal[0, 0, SHARE] == 0.0
 
 
 def test_a_goal_that_was_seen_counts_where_a_way_comes_out_by_another_frontier() -> None:
     cells, letters = house()
-    seen = np.zeros(cells.shape, bool)
-    seen[:, :10] = True
+    seen = left_part(cells)
     # Seen from afar, as through a fire.
     seen[8:12, 30:39] = True
     found = beyond(cells, letters, seen, [(14, 9), (4, 9)])
@@ -145,8 +149,7 @@ def test_a_way_does_not_come_back_by_its_own_frontier() -> None:
     cells, letters = house()
     letters = np.zeros_like(letters)
     letters[10, 3] = 1
-    seen = np.zeros(cells.shape, bool)
-    seen[:, :10] = True
+    seen = left_part(cells)
     found = beyond(cells, letters, seen, [(14, 9)])
     assert found.goal[0, 0, SEEN] == 0.0
 
@@ -156,8 +159,7 @@ def test_a_goal_before_a_wall_is_not_reached_from_behind_it() -> None:
     letters = np.zeros_like(letters)
     # Beside the wall at column 22, in the same squares.
     letters[3:6, 21] = 1
-    seen = np.zeros(cells.shape, bool)
-    seen[:, :10] = True
+    seen = left_part(cells)
     before, behind = np.asarray(beyond(cells, letters, seen, [(4, 9), (14, 9)]).goal[:, 0, SHARE])
     assert before == 1.0
     assert behind == 0.0

@@ -187,7 +187,7 @@ def _of_goal(
             total(near) / share,
             _scaled(length),
             best,
-            jnp.where(best > 0, _scaled(jnp.where(best > 0, distance, 0.0)), 0.0),
+            _scaled(jnp.where(best > 0, distance, 0.0)),
         ],
         axis=-1,
     )
