@@ -4,7 +4,7 @@ Pairs of subgoals that one panorama shows, asked for the same outcome class, by 
 often both succeed and any does, beside what independent chances and their sum say. The
 ``exclusive_within`` of an estimator, and ``learning.exclusion.SURE``, come from here.
 
-    python -m eval.exclusion potlp_jax/learning/data/firefighting.npz data/validation data/calibration
+    python -m eval.exclusion potlp_jax/learning/data/firefighting-panorama.npz data/validation data/calibration
 """
 
 import argparse

@@ -130,7 +130,7 @@ def settings_from_words(words: Sequence[str]) -> dict[str, Any]:
 def shipped_settings(package: str) -> dict[str, Path]:
     """The YAML files that come with a package as its data, by name without the ending."""
     folder = Path(str(resources.files(package))) / "data"
-    return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    return {path.stem: path for path in sorted(folder.glob("*.yaml"), key=lambda path: path.stem)}
 
 
 def settings_file(given: str | Path, package: str) -> Path:

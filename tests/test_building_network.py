@@ -144,6 +144,35 @@ def test_answers_depend_on_map_paint_place_what_lies_beyond_and_phi(params):
     assert len({answer(), *others}) == 6
 
 
+@pytest.mark.parametrize("ablated", ["painting", "paths"])
+def test_what_a_network_is_made_without_does_not_enter_its_answers(params, ablated):
+    eyes, belief, subgoals, task = _asked(params, _world())
+    lacking = BuildingNetwork(dataclasses.replace(CONFIG, without=(ablated,)))
+    unpainted = dataclasses.replace(eyes, memory=blank_painting(*belief.cells.shape))
+
+    def answer(network, eyes=eyes, beyond=1.0):
+        places = network.places(params, network.encode(params, map_channels(belief, eyes.memory)), subgoals.cells)
+        modulation = network.modulation(params, task.arrays.class_phi[0, 0], task.arrays.class_phi[0, 1])
+        return float(network.answer(params, places[0], jnp.full(PROSPECTS, beyond), modulation).success_logit)
+
+    other = {"eyes": unpainted} if ablated == "painting" else {"beyond": 0.0}
+    assert answer(NETWORK) != answer(NETWORK, **other)
+    assert answer(lacking) == answer(lacking, **other) == pytest.approx(answer(NETWORK, **other), abs=1e-5)
+
+
+def test_a_map_is_not_confused_with_its_painting(params):
+    """Without the painting, everything known of the map still counts."""
+    eyes, belief, _, _ = _asked(params, _world())
+    lacking = BuildingNetwork(dataclasses.replace(CONFIG, without=("painting",)))
+    channels = map_channels(belief, eyes.memory)
+    whole = lacking.encode(params, channels).whole
+    known = 4 + len(NAMES) + 1
+    for index in (*range(4), *range(5, known)):
+        assert not np.array_equal(whole, lacking.encode(params, channels.at[:, :, index].add(1.0)).whole)
+    for index in (4, *range(known, channels.shape[-1])):
+        np.testing.assert_array_equal(whole, lacking.encode(params, channels.at[:, :, index].add(1.0)).whole)
+
+
 def test_a_maps_answers_do_not_depend_on_the_others_in_the_batch(params):
     random = np.random.default_rng(0)
     maps = jnp.asarray(random.normal(size=(3, 12, 26, channel_count(CONFIG))), jnp.float32)
@@ -193,6 +222,11 @@ def test_trials_with_the_network_are_the_same_alone_and_in_a_batch(params):
     assert [trial.outcome for trial in trials] == [alone.outcome] * 3
     for trial in trials:
         np.testing.assert_array_equal(trial.path, np.asarray(alone.path))
+
+
+def test_a_network_cannot_be_made_without_what_is_not_known():
+    with pytest.raises(NetworkError, match="without has doors; known: painting, paths"):
+        dataclasses.replace(CONFIG, without=("doors",))
 
 
 def test_operations_are_about_those_that_xla_counts(params):

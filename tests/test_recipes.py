@@ -16,13 +16,13 @@ from potlp_jax.errors import ConfigurationError
 from potlp_jax.learning.architectures import architecture_of
 from potlp_jax.learning.dataset import read_dataset, read_metadata
 from potlp_jax.learning.domain import Domain
-from potlp_jax.learning.estimator import read_estimator, shipped_estimator
+from potlp_jax.learning.estimator import read_estimator, shipped_files
 from potlp_jax.learning.serialization import load_estimator
 from potlp_jax.recipes.fitting import ESTIMATOR
 from potlp_jax.recipes.journal import Display
-from potlp_jax.recipes.recipe import PACKAGE, follow, read_recipe
+from potlp_jax.recipes.recipe import PACKAGE, TIMES, follow, read_recipe
 
-SHIPPED = ("delivery", "firefighting", "parcels")
+SHIPPED = ("delivery", "firefighting", "firefighting-panorama", "parcels")
 
 # One pass over a few small pictures of two-room worlds: the code of a whole training in seconds.
 SMALL = {
@@ -53,13 +53,15 @@ def test_every_shipped_estimator_has_its_recipe():
 def test_a_shipped_recipe_is_what_made_the_shipped_file(name):
     recipe = read_recipe(name)
     world = make(recipe.environment).world(0, Split.TRAINING)
-    estimator = shipped_estimator(world.propositions, Domain.of_world(world, recipe.collect.camera))
-    assert estimator is not None
+    estimator = read_estimator(shipped_files()[name])
+    assert estimator.config.propositions == world.propositions
+    assert not estimator.domain.misfits(Domain.of_world(world, recipe.collect.camera))
     made, data = estimator.metadata["training"], estimator.metadata["data"]
     options = _as_of_old(json_copy(dataclasses.asdict(recipe.fit.training)), made)
     assert options == {key: value for key, value in made.items() if key != "steps"}
     per_epoch = estimator.metadata["panoramas"] // recipe.fit.training.views_per_batch
-    assert abs(made["steps"] - recipe.fit.epochs * per_epoch) <= recipe.fit.epochs
+    epochs = recipe.rounds[-1].epochs if recipe.rounds else recipe.fit.epochs
+    assert abs(made["steps"] - epochs * per_epoch) <= epochs
     assert architecture_of(estimator.config).name == recipe.fit.network.kind
     for field in dataclasses.fields(recipe.fit.network):
         assert field.name == "kind" or getattr(recipe.fit.network, field.name) == getattr(estimator.config, field.name)
@@ -70,9 +72,17 @@ def test_a_shipped_recipe_is_what_made_the_shipped_file(name):
     assert data["camera"].items() <= collected["camera"].items()
     for field in ("seed", "held_out", "views_per_world", "tasks_per_world", "classes", "staying_sets", "spacing"):
         assert data["collection"][field] == collected[field]
-    # No world gives more views than this; most give as many.
+    # No world gives more views than this; many give as many, but some drives end early.
     most = recipe.training_worlds * recipe.collect.views_per_world
-    assert 0.9 * most < estimator.metadata["panoramas"] <= most
+    most += sum((part.explored + part.worlds) * part.views_per_world for part in recipe.rounds)
+    assert 0.8 * most < estimator.metadata["panoramas"] <= most
+    explored = [(recipe.collect.driver, recipe.training_worlds)]
+    further = [
+        found for part in recipe.rounds for found in (("potlp", part.worlds), ("explorer", part.explored)) if found[1]
+    ]
+    sources = estimator.metadata.get("training_data", {}).values()
+    assert [(source["driver"], source["worlds"]) for source in sources] == (explored + further if sources else [])
+    assert len(sources) > 1 or not recipe.rounds
 
 
 def _as_of_old(options, made):
@@ -142,6 +152,12 @@ def test_rounds_drive_with_what_was_fitted_and_learn_from_all_records(tmp_path):
     assert metadata["initial"] in shown
     # The scales of costs stay those of the first fit, with which its parameters mean something.
     assert config == load_estimator(first / ESTIMATOR)[1]
+    steps = [line.split(",") for line in (last / TIMES).read_text().splitlines()]
+    assert [(int(stage), step) for stage, step, _ in steps] == [
+        *((0, step) for step in ("training", "validation", "fit")),
+        *((1, step) for step in ("training", "validation", "explored", "fit")),
+    ]
+    assert all(float(seconds) > 0 for _, _, seconds in steps)
     again = len(lines)
     follow(recipe, tmp_path / "out", display=Display(say=lines.append))
     assert any(line.startswith("resumed at step") for line in lines[again:])
@@ -208,7 +224,7 @@ def test_what_is_wrong_with_a_recipe_is_named(tmp_path, changes, message):
 
 
 def test_a_recipe_that_is_not_there_is_named_beside_those_that_are(tmp_path):
-    with pytest.raises(ConfigurationError, match=r"soup: neither a file nor .*delivery, firefighting, parcels"):
+    with pytest.raises(ConfigurationError, match=rf"soup: neither a file nor .*{', '.join(SHIPPED)}"):
         read_recipe("soup")
     (tmp_path / "empty.yaml").write_text("environment: toy")
     with pytest.raises(ConfigurationError, match="training_worlds, validation_worlds is missing"):

@@ -140,6 +140,7 @@ class BuildingOptions:
     head: int = BuildingConfig.head
     condition: int = BuildingConfig.condition
     exclusive_within: float = BuildingConfig.exclusive_within
+    without: tuple[str, ...] = BuildingConfig.without
 
     def learner(self, samples: Samples) -> BuildingLearner:
         """The network for a data set.

@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float32, Int8, Int32, PRNGKeyArray
+from jaxtyping import Array, Bool, Float32, Int8, Int32, PRNGKeyArray
 
 from potlp_jax.errors import NetworkError
 from potlp_jax.learning.imagined_paths import PROSPECTS
@@ -43,6 +43,9 @@ from potlp_jax.world.grid import BeliefMap
 
 Params = Any
 """Parameters of the network: nested dictionaries of float32 arrays."""
+
+ABLATABLE: tuple[str, ...] = ("painting", "paths")
+"""What a network can be made without: the colours on its map, and the paths through what it imagines."""
 
 # The logit of P_S, and R_S and R_F before they are made positive.
 _OUTPUTS = 3
@@ -74,6 +77,7 @@ class BuildingConfig:
             (standard deviations over the training data).
         step: the least R_S, one step of the grid, in the unit of cost.
         exclusive_within: as in ``NetworkConfig``.
+        without: of ``ABLATABLE``, what the network is not shown; for measuring what each is good for.
     """
 
     propositions: tuple[str, ...]
@@ -90,6 +94,7 @@ class BuildingConfig:
     failure_cost_scale: float = 30.0
     step: float = 1.0
     exclusive_within: float = 0.0
+    without: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.propositions:
@@ -107,6 +112,9 @@ class BuildingConfig:
                 raise NetworkError(f"{name} is {getattr(self, name)}; give a positive number")
         if not (math.isfinite(self.exclusive_within) and self.exclusive_within >= 0):
             raise NetworkError(f"exclusive_within is {self.exclusive_within}; give a number of cells, 0 for none")
+        unknown = [name for name in self.without if name not in ABLATABLE]
+        if unknown:
+            raise NetworkError(f"without has {', '.join(unknown)}; known: {', '.join(ABLATABLE)}")
 
     @property
     def camera(self) -> CameraConfig:
@@ -153,6 +161,12 @@ def map_channels(belief: BeliefMap, painting: Painting) -> Float32[Array, "H W K
 def channel_count(config: BuildingConfig) -> int:
     """Channels of ``map_channels``: five flags, one for each proposition, the nearness and two colours."""
     return 5 + len(config.propositions) + 1 + 6
+
+
+def _of_painting(channels: int) -> Bool[np.ndarray, " K"]:
+    """Which of the channels of ``map_channels`` hold what was painted: a flag, the nearness and the colours."""
+    index = np.arange(channels)
+    return (index == 4) | (index >= channels - 7)
 
 
 def _dense(width: int, gain: float) -> nn.Dense:
@@ -278,6 +292,8 @@ class _Network(nn.Module):
         return self.answer(places, prospects, self.modulate(phi))
 
     def encode(self, channels: Array) -> EncodedMap:
+        if "painting" in self.config.without:
+            channels = jnp.where(_of_painting(channels.shape[-1]), 0.0, channels)
         rows, columns = channels.shape[-3:-1]
         batch = ((0, 0),) * (channels.ndim - 3)
         side = self.config.side
@@ -290,6 +306,8 @@ class _Network(nn.Module):
         return self.modulation(phi)
 
     def answer(self, places: Array, prospects: Array, modulation: Array) -> Array:
+        if "paths" in self.config.without:
+            prospects = jnp.zeros_like(prospects)
         return self.head(places, prospects, modulation)
 
 

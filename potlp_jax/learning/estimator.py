@@ -115,7 +115,7 @@ def identity_of(estimator: TrainedEstimator | Estimator) -> str:
 def shipped_files() -> dict[str, Path]:
     """The files of the estimators that come with the package, by name."""
     folder = Path(str(resources.files("potlp_jax.learning"))) / "data"
-    return {path.stem: path for path in sorted(folder.glob("*.npz"))}
+    return {path.stem: path for path in sorted(folder.glob("*.npz"), key=lambda path: path.stem)}
 
 
 def shipped_estimators() -> tuple[TrainedEstimator, ...]:
@@ -126,21 +126,29 @@ def shipped_estimators() -> tuple[TrainedEstimator, ...]:
 
 def shipped_estimator(propositions: tuple[str, ...], here: Domain) -> TrainedEstimator | None:
     """The estimator that comes with the package for these propositions, in this order, and serves these worlds."""
-    found = (
-        estimator
-        for estimator in shipped_estimators()
-        if estimator.config.propositions == propositions and not estimator.domain.misfits(here)
-    )
-    return next(found, None)
+    knowing = _defaults_knowing(propositions)
+    return next((estimator for estimator in knowing if not estimator.domain.misfits(here)), None)
 
 
 def why_none_is_shipped(propositions: tuple[str, ...], here: Domain) -> str:
     """Why ``shipped_estimator`` finds none, in words: none knows the propositions, or those that do serve others."""
-    knowing = [estimator for estimator in shipped_estimators() if estimator.config.propositions == propositions]
+    knowing = _defaults_knowing(propositions)
     if not knowing:
         return f"no estimator is shipped for the propositions {', '.join(propositions)}"
     reasons = {estimator.name: " and ".join(estimator.domain.misfits(here)) for estimator in knowing}
     return "; ".join(f"the shipped estimator {name} knows the propositions, but {why}" for name, why in reasons.items())
+
+
+def _defaults_knowing(propositions: tuple[str, ...]) -> list[TrainedEstimator]:
+    """Of the shipped estimators those with these propositions that have the name of their family.
+
+    Others of a family, such as ``firefighting-panorama``, are there to be compared with, and asked by name alone.
+    """
+    return [
+        estimator
+        for estimator in shipped_estimators()
+        if estimator.config.propositions == propositions and estimator.name == estimator.domain.family
+    ]
 
 
 def estimator_for(

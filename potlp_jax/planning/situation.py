@@ -38,7 +38,7 @@ class DecisionConfig:
       dead_end_factor: times ``(H + W)`` times the resolution it is the cost of a dead end (docs/model.md).
       commitment: hysteresis: fraction of its expected cost by which another action must be cheaper before the robot
         switches to it. 0: it switches at once, as published. The default was chosen on validation worlds, against
-        0, 30 % and fixed numbers of cells (docs/results/estimator.md, "Commitment").
+        0, 30 % and fixed numbers of cells (docs/results/panorama.md, "Commitment").
       path_horizon: moves in the path of one decision, at most; None means ``4 (H + W)``.
     """
 

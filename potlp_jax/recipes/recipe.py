@@ -10,7 +10,9 @@ rounds:                         # optional: PO-TLP drives with what was fitted, 
 """
 
 import dataclasses
+import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +29,9 @@ from potlp_jax.recipes.journal import Display
 
 PACKAGE: str = "potlp_jax.recipes"
 """Where the shipped recipes are, as package data."""
+
+TIMES: str = "times.csv"
+"""In the folder of a recipe that is followed: the stage, its step, and how many seconds a run spent on it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -112,7 +117,8 @@ def follow(
     Args:
         recipe: what to make.
         out: gets ``training`` and ``validation``, the datasets, and what ``fit`` writes. With rounds these are of the
-            last one, and ``round-0`` and so on in it hold those of the stages before.
+            last one, and ``round-0`` and so on in it hold those of the stages before. ``times.csv`` says how long each
+            step took; who resumes finds a line for each run that ended a step, and none for one that was killed.
         processes: explore at the same time.
         tell: called as worlds are explored.
         display: shows how the fits go.
@@ -127,16 +133,26 @@ def follow(
     for number, (folder, stage) in enumerate(zip(folders, _stages(recipe, folders), strict=True)):
         for part in stage.parts:
             config = dataclasses.replace(part.config, first_world=part.first)
-            generator, tell_of = make(recipe.environment), partial(tell, part.split)
-            collect(
-                generator, recipe.environment, part.split, part.worlds, folder / part.name, config, processes, tell_of
-            )
+            generator, name = make(recipe.environment), recipe.environment
+            with _timed(out, number, part.name):
+                into, told = folder / part.name, partial(tell, part.split)
+                collect(generator, name, part.split, part.worlds, into, config, processes, told)
         records += [read_dataset(folder / part.name) for part in stage.parts if part.split == Split.TRAINING]
         validation = read_dataset(folder / Split.VALIDATION.value)
         initial = folders[number - 1] / ESTIMATOR if number else None
-        trained = fit(joined(records), validation, folder, stage.fit, display, initial)
+        with _timed(out, number, "fit"):
+            trained = fit(joined(records), validation, folder, stage.fit, display, initial)
     assert trained is not None
     return trained
+
+
+@contextmanager
+def _timed(out: Path, stage: int, step: str) -> Iterator[None]:
+    began = time.perf_counter()
+    yield
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / TIMES).open("a", encoding="utf-8") as file:
+        file.write(f"{stage},{step},{time.perf_counter() - began:.1f}\n")
 
 
 @dataclasses.dataclass(frozen=True)
