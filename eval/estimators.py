@@ -1,8 +1,7 @@
 """Estimators beside each other: what each saves in the same worlds, how good its answers are, what it took to make.
 
     python -m eval.estimators --recipe out/building --out out/estimators                 # after every stage of a recipe
-    python -m eval.estimators --named panorama=firefighting-panorama --named no-paint=out/no-paint/estimator.npz \\
-        --data out/building/validation --out out/estimators --report docs/results/estimator/trials
+    python -m eval.estimators --named panorama=firefighting-panorama --out out/estimators --data out/building/validation
 
 Every estimator has a sweep of its own in ``--out``, with known map, baseline and PO-TLP in the same worlds and
 settings; the same command goes on. Worlds are of the split validation, from number 1000 on, which no recipe uses.

@@ -2,7 +2,8 @@
 
     python -m eval.table1 --out out/table1                       # 4 tasks × 750 test worlds × 5 policies
     python -m eval.table1 --out out/rehearsal --split validation --first-world 1000 --worlds 60
-    python -m eval.table1 --out out/table1 --report docs/results/table1
+    python -m eval.table1 --out out/table1 --report docs/results/table1/test
+    python -m eval.table1 --out out/panorama --estimator firefighting-panorama
     python -m eval.table1 --out out/table1 --as-it-is            # what is finished so far; nothing is run
 
 The sweep is killed once with SIGKILL, workers and all, and started again; the same command goes on where it stopped.
@@ -47,7 +48,7 @@ PAPER = {
 """Averages of the paper's Table I: known map, baseline, share of the attainable savings, net and per-trial savings."""
 
 
-def run(folder: Path, split: Split, worlds: int, first_world: int, processes: int) -> None:
+def run(folder: Path, split: Split, worlds: int, first_world: int, processes: int, estimator: str | None) -> None:
     """Run the sweep to its end, with one kill on the way, and keep when it ran."""
     specification = {
         "environments": [ENVIRONMENT],
@@ -57,6 +58,8 @@ def run(folder: Path, split: Split, worlds: int, first_world: int, processes: in
         "split": split.value,
         "first_world": first_world,
     }
+    if estimator is not None:
+        specification["estimator"] = estimator
     file = write_specification(folder, specification)
     command = [*SWEEP_COMMAND, str(file), "--out", str(folder), "--processes", str(processes)]
     kill_at = len(PAPER) * len(POLICIES) * worlds // 3
@@ -188,12 +191,14 @@ def main() -> None:
     parser.add_argument("--split", type=Split, default=Split.TEST)
     parser.add_argument("--worlds", type=int, default=750, help="per task")
     parser.add_argument("--first-world", type=int, default=0)
+    parser.add_argument("--estimator", help="what potlp asks; default: the shipped one")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--report", type=Path, help="without suffix: where results and picture go")
     parser.add_argument("--as-it-is", action="store_true", help="report what is finished in the folder, run nothing")
     arguments = parser.parse_args()
     if not arguments.as_it_is:
-        run(arguments.out, arguments.split, arguments.worlds, arguments.first_world, arguments.processes)
+        asked = (arguments.processes, arguments.estimator)
+        run(arguments.out, arguments.split, arguments.worlds, arguments.first_world, *asked)
     found = results(arguments.out)
     print(markdown(found))
     for problem in found["problems"]:

@@ -30,9 +30,12 @@ from potlp_jax.learning.serialization import load_estimator, save_estimator
 from potlp_jax.learning.training import (
     TrainingConfig,
     batches_of,
+    devices_for,
+    divide_processor,
     initial_state,
     learning_rate_schedule,
     make_train_step,
+    shared_sums,
     train,
 )
 from potlp_jax.world.camera import CameraConfig
@@ -408,6 +411,55 @@ def test_killed_and_resumed_it_reaches_the_same_parameters_bit_for_bit(tmp_path)
         assert len(one.files) > 20
         for name in one.files:
             np.testing.assert_array_equal(one[name], other[name])
+
+
+def _shared(folder: str) -> None:
+    """The training of the test below, in a process of its own, with two devices."""
+    divide_processor(2)
+    samples = synthetic(8, 5, 10)
+    config = _config(6, augmentation=Augmentation(brightness=0.1, colour=0.1))
+    assert devices_for(config.views_per_batch) == 2
+    assert devices_for(3) == 1
+    learner = _learner(samples, TINY)
+    done = train(learner, samples, samples, config, folder=Path(folder) / "checkpoints")
+    np.savez(f"{folder}/done.npz", *(np.asarray(leaf) for leaf in jax.tree.leaves(done.params)), str(done.best_loss))
+    np.savez(f"{folder}/gradient.npz", *(np.asarray(leaf) for leaf in jax.tree.leaves(_gradient(learner, samples))))
+
+
+def _gradient(learner: PanoramaLearner, samples: Samples):
+    """Of the loss; a training alone would not tell it from its double, which Adam scales away."""
+    batch, scale = _batch(samples, 8, 5), DataScale.of(samples)
+
+    def loss(params):
+        return total_loss(shared_sums(learner, scale, 0.4, params, batch), 0.5, 1.0)
+
+    return jax.jit(jax.grad(loss))(learner.init(jax.random.key(3)))
+
+
+def test_two_devices_share_a_batch_and_learn_the_same(tmp_path):
+    code = f"from tests.test_training import _shared; _shared({str(tmp_path)!r})"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=_environment(tmp_path), check=True, timeout=400)
+    samples = synthetic(8, 5, 10)
+    learner = _learner(samples, TINY)
+    config = _config(6, augmentation=Augmentation(brightness=0.1, colour=0.1))
+    alone = train(learner, samples, samples, config)
+    with np.load(tmp_path / "done.npz") as shared:
+        *params, loss = (shared[name] for name in shared.files)
+    for one, other in zip(jax.tree.leaves(alone.params), params, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5)
+    assert float(loss) == pytest.approx(alone.best_loss, rel=1e-5)
+    with np.load(tmp_path / "gradient.npz") as shared:
+        for one, name in zip(jax.tree.leaves(_gradient(learner, samples)), shared.files, strict=True):
+            np.testing.assert_allclose(one, shared[name], rtol=1e-3, atol=1e-5)
+    # Their bits differ, and so no training goes on with another number of them.
+    with pytest.raises(CheckpointError, match="devices"):
+        train(learner, samples, samples, config, folder=tmp_path / "checkpoints")
+
+
+def test_a_processor_in_use_is_not_divided():
+    jax.block_until_ready(jnp.zeros(1) + 1)
+    with pytest.raises(TrainingError, match="cannot be divided into 7 devices any more"):
+        divide_processor(7)
 
 
 def test_resuming_with_other_options_or_data_names_the_difference(tmp_path):

@@ -65,6 +65,7 @@ def fit(
     require_training_extra()
     from potlp_jax.codec import settings_from_words, with_settings
     from potlp_jax.learning.dataset import joined, read_dataset
+    from potlp_jax.learning.training import divide_processor
     from potlp_jax.recipes import fitting
     from potlp_jax.recipes.recipe import follow, read_recipe
 
@@ -83,6 +84,8 @@ def fit(
     options = {"epochs": epochs, "minutes": minutes}
     config = with_settings(config, _given(**options) | {"training": _given(seed=seed)}, "options")
     folder = make_folder(out)
+    if processes > 1:
+        divide_processor(processes)
     with progress_bar() as progress:
         if datasets and validation is not None:
             training = joined([read_dataset(dataset) for dataset in datasets])

@@ -114,8 +114,8 @@ RecipeName = Annotated[
     typer.Option(
         "--recipe",
         "-r",
-        help="What makes an estimator: the name of a shipped recipe ([cyan]firefighting[/cyan], [cyan]delivery[/cyan], "
-        "[cyan]parcels[/cyan]) or a file of your own.",
+        help="What makes an estimator: the name of a shipped recipe ([cyan]firefighting[/cyan], "
+        "[cyan]firefighting-panorama[/cyan], [cyan]delivery[/cyan], [cyan]parcels[/cyan]) or a file of your own.",
         autocompletion=complete_recipe,
     ),
 ]
@@ -125,7 +125,14 @@ Settings = Annotated[
         "--set", metavar="NAME=VALUE", help="Change a setting, such as training.patience=10; may be repeated."
     ),
 ]
-Processes = Annotated[int, typer.Option("--processes", min=1, help="Collect in so many processes, each on a core.")]
+Processes = Annotated[
+    int,
+    typer.Option(
+        "--processes",
+        min=1,
+        help="Collect in so many processes, each on a core; fit on so many cores, if they divide a batch's views.",
+    ),
+]
 
 
 def spread(parameter: str, group: type[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -33,21 +33,21 @@ from potlp_jax.learning.network import Answers
 
 @struct.dataclass(kw_only=True)
 class Sums:
-    """Sums over samples, from which losses and scores follow; sums of several batches add up."""
+    """Sums over samples, from which losses and scores follow; sums of several batches, and of devices, add up."""
 
-    count: Float32[Array, ""]
-    cross_entropy: Float32[Array, ""]
+    count: Float32[Array, "*B"]
+    cross_entropy: Float32[Array, "*B"]
     """Weighted."""
-    success_error: Float32[Array, ""]
+    success_error: Float32[Array, "*B"]
     """Squared, in squared scales."""
-    failure_error: Float32[Array, ""]
-    successes: Float32[Array, ""]
-    failures: Float32[Array, ""]
-    brier: Float32[Array, ""]
-    prior_brier: Float32[Array, ""]
+    failure_error: Float32[Array, "*B"]
+    successes: Float32[Array, "*B"]
+    failures: Float32[Array, "*B"]
+    brier: Float32[Array, "*B"]
+    prior_brier: Float32[Array, "*B"]
     """Of the constant answer: the mean P_S of the training data."""
-    views: Float32[Array, ""]
-    view_loss: Float32[Array, ""]
+    views: Float32[Array, "*B"]
+    view_loss: Float32[Array, "*B"]
     """Of what the network says of a view beside its answers."""
 
 

@@ -2,7 +2,10 @@
 
 **Order.** The batch of a step depends on (seed, step) alone: every epoch has its own permutation of the views and its
 own choice of samples. Augmentation depends on (key, step). So a training that is resumed from a checkpoint does what it
-would have done, bit for bit, on the same machine and versions.
+would have done, bit for bit, on the same machine, devices and versions.
+
+**Devices.** The views of a batch are shared out between all devices at hand. A processor is one device, most of whose
+cores idle in steps as small as these, unless it is divided first (``divide_processor``).
 """
 
 import dataclasses
@@ -18,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import struct
+from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
 from potlp_jax.checks import AT_LEAST_ONE, SHARE, require_fields
@@ -205,9 +209,9 @@ def make_train_step(
     optimizer = make_optimizer(config)
 
     def loss(params: Params, batch: Batch, key: PRNGKeyArray) -> tuple[Array, Sums]:
+        # All views at once, so that what is drawn does not depend on how they are shared out.
         inputs = learner.augmented(batch.inputs, key, config.augmentation)
-        answers, view_loss = learner.answers(params, inputs, batch.phi_stay, batch.phi_go)
-        sums = loss_sums(answers, view_loss, batch, learner.config, scale, config.weighting)
+        sums = shared_sums(learner, scale, config.weighting, params, dataclasses.replace(batch, inputs=inputs))
         return total_loss(sums, config.cost_share, config.view_share), sums
 
     @jax.jit
@@ -250,10 +254,52 @@ def make_evaluate_step(learner: Learner, scale: DataScale, weighting: float) -> 
 
     @jax.jit
     def evaluate_step(params: Params, batch: Batch) -> Sums:
-        answers, view_loss = learner.answers(params, batch.inputs, batch.phi_stay, batch.phi_go)
-        return loss_sums(answers, view_loss, batch, learner.config, scale, weighting)
+        return shared_sums(learner, scale, weighting, params, batch)
 
     return evaluate_step
+
+
+def divide_processor(parts: int) -> None:
+    """Have the processor count as so many devices, which share the views of a batch. Accelerators stay as they are.
+
+    Raises:
+        TrainingError: jax has computed something before, and its devices are what they are.
+    """
+    try:
+        jax.config.update("jax_num_cpu_devices", parts)
+    except RuntimeError as error:
+        raise TrainingError(f"the processor cannot be divided into {parts} devices any more: {error}") from error
+
+
+def devices_for(views: int) -> int:
+    """How many devices share a batch of so many views: the most of those at hand that divide it."""
+    return max(count for count in range(1, jax.local_device_count() + 1) if views % count == 0)
+
+
+def shared_sums(learner: Learner, scale: DataScale, weighting: float, params: Params, batch: Batch) -> Sums:
+    """The sums of a batch, of whose views each device takes as many (``devices_for``).
+
+    Args:
+        learner: whose answers are judged.
+        scale, weighting: as for ``loss_sums``.
+        params: of its network.
+        batch: of any number of views.
+
+    Returns:
+        Sums of the whole batch.
+    """
+    devices = jax.local_devices()[: devices_for(batch.mask.shape[0])]
+    shared, whole = PartitionSpec("views"), PartitionSpec()
+
+    def sums_of(params: Params, part: Batch) -> Sums:
+        answers, view_loss = learner.answers(params, part.inputs, part.phi_stay, part.phi_go)
+        sums = loss_sums(answers, view_loss, part, learner.config, scale, weighting)
+        return jax.tree.map(lambda value: value[None], sums)
+
+    mesh = jax.sharding.Mesh(np.array(devices), ("views",))
+    # Without the check: loops in the networks begin with constants, which it takes for equal on all devices.
+    parts = jax.shard_map(sums_of, mesh=mesh, in_specs=(whole, shared), out_specs=shared, check_vma=False)
+    return jax.tree.map(jnp.sum, parts(params, batch))
 
 
 def check_data(training: Samples, validation: Samples) -> None:
@@ -335,11 +381,13 @@ def training_identity(
         initial: what it goes on from.
 
     Returns:
-        JSON-able; differences are named on loading. Versions are part of it: others would end with other bits.
+        JSON-able; differences are named on loading. Versions are part of it, and the number of devices that share a
+        batch: with others it would end with other bits.
     """
     return {
         "network": dataclasses.asdict(learner.config),
         "training": dataclasses.asdict(config),
+        "devices": devices_for(config.views_per_batch),
         **provenance(training, validation, initial),
         "versions": {name: version(name) for name in ("jax", "jaxlib", "flax", "optax", "numpy")},
     }
