@@ -32,7 +32,7 @@ FOLDER = Path(__file__).parents[1] / "docs" / "images"
 FACTS = "pictures.json"
 
 ENVIRONMENT, TASK, WORLD = "firefighting", 2, 2
-"""The trial of the pictures: PO-TLP tries the alarm's hallway first, the baseline the nearest frontier."""
+"""The trial of the pictures: PO-TLP soon turns to the alarm's hallway, the baseline to the nearest frontier."""
 
 POLICIES = {"baseline": "nearest frontier (baseline)", "potlp": "PO-TLP"}
 """Policies that are drawn, with their titles."""
@@ -74,10 +74,10 @@ def draw_comparison(file: Path) -> list[Trial]:
 
 
 def photograph_replay(file: Path) -> list[Trial]:
-    """The replay of PO-TLP's trial, at a later decision with several actions to weigh."""
+    """The replay of PO-TLP's trial, at a decision with several actions to weigh, the task not yet in reach."""
     trial = picture_trial("potlp")
-    later = trial.decisions[len(trial.decisions) // 3 :]
-    decision = max(later, key=lambda decision: len(decision.actions))
+    exploring = [decision for decision in trial.decisions if decision.kind == "action"]
+    decision = max(exploring[len(exploring) // 3 :], key=lambda decision: len(decision.actions))
     page = replay_page(trial, views_of(trial))
     # The page's slider moves as if a person had drawn it there.
     move = (
