@@ -155,7 +155,8 @@ def _answer(results: Mapping[str, Any]) -> str:
         )
         sentences.append(f"Task {name}: {limit}PO-TLP {100 * shares[Arm.POTLP]:.0f} %{'; ' + told if told else ''}.")
     counts = [table["satisfied"]["pairs"] for table in results["tables"].values()]
-    return f"In {min(counts)} to {max(counts)} {results['split']} worlds a task: {' '.join(sentences)}"
+    number = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
+    return f"In {number} {results['split']} worlds a task: {' '.join(sentences)}"
 
 
 def _shares(results: Mapping[str, Any], data: str) -> Iterator[str]:
