@@ -144,20 +144,27 @@ def test_answers_depend_on_map_paint_place_what_lies_beyond_and_phi(params):
     assert len({answer(), *others}) == 6
 
 
-@pytest.mark.parametrize("ablated", ["painting", "paths"])
+@pytest.mark.parametrize("ablated", ["painting", "paths", "position"])
 def test_what_a_network_is_made_without_does_not_enter_its_answers(params, ablated):
     eyes, belief, subgoals, task = _asked(params, _world())
     lacking = BuildingNetwork(dataclasses.replace(CONFIG, without=(ablated,)))
     unpainted = dataclasses.replace(eyes, memory=blank_painting(*belief.cells.shape))
 
-    def answer(network, eyes=eyes, beyond=1.0):
-        places = network.places(params, network.encode(params, map_channels(belief, eyes.memory)), subgoals.cells)
+    def answer(network, eyes=eyes, beyond=1.0, moved=0):
+        encoded = network.encode(params, map_channels(belief, eyes.memory))
+        # The same squares around another cell.
+        features = jax.tree.map(lambda scale: jnp.ones_like(scale), encoded)
+        places = network.places(params, features, subgoals.cells + moved)
+        seen = network.places(params, encoded, subgoals.cells)
         modulation = network.modulation(params, task.arrays.class_phi[0, 0], task.arrays.class_phi[0, 1])
-        return float(network.answer(params, places[0], jnp.full(PROSPECTS, beyond), modulation).success_logit)
+        told = jnp.full(PROSPECTS, beyond)
+        return [float(network.answer(params, place[0], told, modulation).success_logit) for place in (places, seen)]
 
-    other = {"eyes": unpainted} if ablated == "painting" else {"beyond": 0.0}
+    other = {"painting": {"eyes": unpainted}, "paths": {"beyond": 0.0}, "position": {"moved": 1}}[ablated]
     assert answer(NETWORK) != answer(NETWORK, **other)
-    assert answer(lacking) == answer(lacking, **other) == pytest.approx(answer(NETWORK, **other), abs=1e-5)
+    assert answer(lacking) == answer(lacking, **other)
+    if ablated != "position":
+        assert answer(lacking) == pytest.approx(answer(NETWORK, **other), abs=1e-5)
 
 
 def test_a_map_is_not_confused_with_its_painting(params):
@@ -225,7 +232,7 @@ def test_trials_with_the_network_are_the_same_alone_and_in_a_batch(params):
 
 
 def test_a_network_cannot_be_made_without_what_is_not_known():
-    with pytest.raises(NetworkError, match="without has doors; known: painting, paths"):
+    with pytest.raises(NetworkError, match="without has doors; known: painting, paths, position"):
         dataclasses.replace(CONFIG, without=("doors",))
 
 

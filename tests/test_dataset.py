@@ -280,6 +280,9 @@ def test_data_sets_of_one_family_are_joined(tmp_path):
     assert both.view_of.tolist() == one.view_of.tolist() + (two.view_of + 3).tolist()
     assert both.world_of.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2]
     np.testing.assert_array_equal(both.distance, np.concatenate([one.distance, two.distance]))
+    larger = dataclasses.replace(two, metadata=dataclasses.replace(two.metadata, shape=(5, 90)))
+    assert METADATA.shape == (6, 8)
+    assert joined([one, larger]).metadata == dataclasses.replace(one.metadata, shape=(6, 90))
     other = dataclasses.replace(two, metadata=dataclasses.replace(two.metadata, resolution=0.5))
     with pytest.raises(DatasetError, match=r"differ in resolution cannot be joined: 1\.0 and 0\.5"):
         joined([one, other])

@@ -20,7 +20,8 @@ from potlp_jax.learning.estimator import read_estimator, shipped_files
 from potlp_jax.learning.serialization import load_estimator
 from potlp_jax.recipes.fitting import ESTIMATOR
 from potlp_jax.recipes.journal import Display
-from potlp_jax.recipes.recipe import PACKAGE, TIMES, follow, read_recipe
+from potlp_jax.recipes.recipe import PACKAGE, TIMES, _stages, follow, read_recipe
+from potlp_jax.trials.config import trial_config_for
 
 SHIPPED = ("delivery", "firefighting", "firefighting-panorama", "parcels")
 
@@ -161,6 +162,54 @@ def test_rounds_drive_with_what_was_fitted_and_learn_from_all_records(tmp_path):
     again = len(lines)
     follow(recipe, tmp_path / "out", display=Display(say=lines.append))
     assert any(line.startswith("resumed at step") for line in lines[again:])
+
+
+def test_worlds_of_another_family_are_recorded_beside_those_of_the_recipe(tmp_path):
+    rounds = [{"worlds": 2, "validation_worlds": 2, "views_per_world": 2, "drives": 1, "epochs": 1, "explored": 2}]
+    # The family itself serves as the other one: its worlds are counted on.
+    small = {**SMALL, "rounds": rounds, "beside": [{"environment": "toy", "share": 0.25}]}
+    (tmp_path / "small.yaml").write_text(json.dumps(small))
+    follow(read_recipe(tmp_path / "small.yaml"), tmp_path / "out")
+    found = [
+        (str(path.parent.relative_to(tmp_path / "out")), read_metadata(path.parent), read_dataset(path.parent))
+        for path in sorted((tmp_path / "out").rglob("samples-00000.parquet"))
+    ]
+    assert {
+        name: (metadata.split, metadata.collection["driver"], metadata.collection["first_world"], len(data.worlds))
+        for name, metadata, data in found
+    } == {
+        "round-0/training": ("training", "explorer", 0, 4),
+        "round-0/training-toy": ("training", "explorer", 4, 2),
+        "round-0/validation": ("validation", "explorer", 0, 2),
+        "training": ("training", "potlp", 6, 2),
+        "training-toy": ("training", "potlp", 8, 2),
+        "explored": ("training", "explorer", 10, 2),
+        "explored-toy": ("training", "explorer", 12, 2),
+        "validation": ("validation", "potlp", 2, 2),
+    }
+    training = [data for _, metadata, data in found if metadata.split == "training"]
+    made = load_estimator(tmp_path / "out" / ESTIMATOR)[3]
+    assert made["panoramas"] == sum(len(data.images) for data in training)
+
+
+def test_other_families_look_alike_and_have_subgoals_as_in_their_trials(tmp_path):
+    given = {"environment": "delivery", "training_worlds": 4, "validation_worlds": 4}
+    (tmp_path / "mine.yaml").write_text(
+        json.dumps({**given, "beside": [{"environment": "campus-small", "share": 0.5}]})
+    )
+    recipe = read_recipe(tmp_path / "mine.yaml")
+    own, _, other = next(_stages(recipe, [tmp_path])).parts
+    assert (own.environment, other.environment, own.worlds, other.worlds) == ("delivery", "campus-small", 4, 4)
+    for part in (own, other):
+        wanted = trial_config_for(make(part.environment)).decision.frontiers
+        assert part.config.frontiers == part.config.explorer.frontiers == wanted
+    assert own.config.frontiers != other.config.frontiers
+    (tmp_path / "mine.yaml").write_text(json.dumps({**given, "beside": [{"environment": "toy", "share": 0.5}]}))
+    with pytest.raises(ConfigurationError, match="toy cannot stand beside delivery: its worlds are of toy with"):
+        read_recipe(tmp_path / "mine.yaml")
+    (tmp_path / "mine.yaml").write_text(json.dumps({**given, "beside": [{"environment": "campus-small", "share": 0}]}))
+    with pytest.raises(ConfigurationError, match="share is 0"):
+        read_recipe(tmp_path / "mine.yaml")
 
 
 def _potlp(*arguments):

@@ -44,8 +44,9 @@ from potlp_jax.world.grid import BeliefMap
 Params = Any
 """Parameters of the network: nested dictionaries of float32 arrays."""
 
-ABLATABLE: tuple[str, ...] = ("painting", "paths")
-"""What a network can be made without: the colours on its map, and the paths through what it imagines."""
+ABLATABLE: tuple[str, ...] = ("painting", "paths", "position")
+"""What a network can be made without: the colours on its map, the paths through what it imagines, and where in the
+array a subgoal lies, which says something only where all buildings lie alike."""
 
 # The logit of P_S, and R_S and R_F before they are made positive.
 _OUTPUTS = 3
@@ -77,7 +78,8 @@ class BuildingConfig:
             (standard deviations over the training data).
         step: the least R_S, one step of the grid, in the unit of cost.
         exclusive_within: as in ``NetworkConfig``.
-        without: of ``ABLATABLE``, what the network is not shown; for measuring what each is good for.
+        without: of ``ABLATABLE``, what the network is not shown; for measuring what each is good for, and for
+            buildings of all sizes, among which a position says nothing.
     """
 
     propositions: tuple[str, ...]
@@ -288,7 +290,7 @@ class _Network(nn.Module):
         self.head = _Head(self.config)
 
     def __call__(self, channels: Array, cells: Array, prospects: Array, phi: Array) -> Array:
-        places = self.place_of(_read_at(self.encode(channels), cells))
+        places = self.place_of(_read_at(self.encode(channels), cells, self.config))
         return self.answer(places, prospects, self.modulate(phi))
 
     def encode(self, channels: Array) -> EncodedMap:
@@ -311,12 +313,13 @@ class _Network(nn.Module):
         return self.head(places, prospects, modulation)
 
 
-def _read_at(encoded: EncodedMap, cells: Int32[Array, "*B S 2"]) -> Float32[Array, "*B S F"]:
+def _read_at(encoded: EncodedMap, cells: Int32[Array, "*B S 2"], config: BuildingConfig) -> Float32[Array, "*B S F"]:
     """What the first stage says around cells, at every scale, and of the whole building."""
     close = _around(encoded.close, cells // 2, _CLOSE)
     near = [_around(scale, cells // (SQUARE * 2**level), _NEAR) for level, scale in enumerate(encoded.scales)]
     whole = jnp.broadcast_to(encoded.whole[..., None, :], (*cells.shape[:-1], encoded.whole.shape[-1]))
-    return jnp.concatenate([close, *near, whole, cells.astype(jnp.float32) / _COORDINATE], axis=-1)
+    position = jnp.float32("position" not in config.without) * cells.astype(jnp.float32) / _COORDINATE
+    return jnp.concatenate([close, *near, whole, position], axis=-1)
 
 
 def _around(features: Float32[Array, "*B h w F"], at: Int32[Array, "*B S 2"], reach: int) -> Float32[Array, "*B S N"]:
@@ -354,7 +357,7 @@ class BuildingNetwork:
 
     def places(self, params: Params, encoded: EncodedMap, cells: Int32[Array, "*B S 2"]) -> Float32[Array, "*B S U"]:
         """What the network knows of subgoals, whatever is asked of them."""
-        return self._apply(params, "place_of", _read_at(encoded, cells))
+        return self._apply(params, "place_of", _read_at(encoded, cells, self.config))
 
     def modulation(
         self, params: Params, phi_stay: Int8[Array, "*B P"], phi_go: Int8[Array, "*B P"]

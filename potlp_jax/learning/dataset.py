@@ -273,7 +273,7 @@ def read_dataset(folder: Path | str) -> Samples:
 
 
 def joined(parts: Sequence[Samples]) -> Samples:
-    """Several data sets as one, in this order; the metadata are the first one's.
+    """Several data sets as one, in this order; the metadata are the first one's, with arrays as large as any has.
 
     Raises:
         DatasetError: what decides the meaning of a row differs: propositions, family, camera, unit or resolution.
@@ -285,7 +285,9 @@ def joined(parts: Sequence[Samples]) -> Samples:
             if mine != other:
                 raise DatasetError(f"data sets that differ in {name} cannot be joined: {mine} and {other}")
     sources = tuple(source for part in parts for source in part.sources)
-    return dataclasses.replace(_one_after_another(parts), joined_from=sources)
+    rows, columns = (max(sides) for sides in zip(*(part.metadata.shape for part in parts), strict=True))
+    metadata = dataclasses.replace(first, shape=(rows, columns))
+    return dataclasses.replace(_one_after_another(parts), metadata=metadata, joined_from=sources)
 
 
 def _one_after_another(parts: Sequence[Samples]) -> Samples:

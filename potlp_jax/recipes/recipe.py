@@ -5,17 +5,22 @@ training_worlds: 1300           # of the split training
 validation_worlds: 60           # of the split validation
 collect: {disturbance: {noise: 6}}              # optional: fields of CollectConfig
 fit: {epochs: 7, training: {patience: 10}}      # optional: fields of FitConfig
+beside:                         # optional: training worlds of other families that look alike
+  - {environment: campus-small, share: 0.5}
 rounds:                         # optional: PO-TLP drives with what was fitted, and all is fitted again
   - {worlds: 300, validation_worlds: 20, epochs: 4}
 """
 
 import dataclasses
+import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
+from potlp_jax.checks import POSITIVE, require_fields
 from potlp_jax.codec import read_settings, settings_file, with_settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
@@ -57,6 +62,26 @@ class Round:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Beside:
+    """Another family of worlds, from which an estimator learns as well; validation has none of them.
+
+    Attributes:
+        environment: its name; what the worlds look like and what there is to find must be as in the recipe's own.
+        share: training worlds of it for each of the recipe's own, when they are explored and when they are driven.
+    """
+
+    environment: str
+    share: float
+
+    def __post_init__(self) -> None:
+        require_fields(self, ["share"], POSITIVE, ConfigurationError)
+
+    def worlds(self, own: int, per_shard: int) -> int:
+        """How many training worlds of it stand beside ``own`` of the recipe's, in whole shards."""
+        return math.ceil(own * self.share / per_shard) * per_shard
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Recipe:
     """What makes an estimator.
 
@@ -66,6 +91,7 @@ class Recipe:
         collect: what is recorded in them.
         fit: what is fitted to the records.
         rounds: are made after that, in order.
+        beside: other families, training worlds of which are recorded as well, in every stage.
     """
 
     environment: str
@@ -74,6 +100,7 @@ class Recipe:
     collect: CollectConfig
     fit: FitConfig = FitConfig()
     rounds: tuple[Round, ...] = ()
+    beside: tuple[Beside, ...] = ()
 
     def worlds(self, split: Split) -> int:
         """How many worlds of a split are explored; 0 for the splits that training never sees."""
@@ -95,7 +122,22 @@ def read_recipe(given: str | Path) -> Recipe:
     if missing:
         raise ConfigurationError(f"{path}: {', '.join(missing)} is missing")
     # The environment first: what is not said is as its family wants it.
-    return with_settings(recipe_for(str(data["environment"])), data, str(path))
+    recipe = with_settings(recipe_for(str(data["environment"])), data, str(path))
+    _require_alike(recipe, str(path))
+    return recipe
+
+
+def _require_alike(recipe: Recipe, where: str) -> None:
+    """Before anything is collected: data sets that differ in this cannot be joined."""
+    own = make(recipe.environment)
+    for chosen in recipe.beside:
+        other = make(chosen.environment)
+        mine, its = ((generator.family or generator.name, generator.propositions) for generator in (own, other))
+        if mine != its:
+            raise ConfigurationError(
+                f"{where}: {chosen.environment} cannot stand beside {recipe.environment}: its worlds are of "
+                f"{its[0]} with {', '.join(its[1])}, and not of {mine[0]} with {', '.join(mine[1])}"
+            )
 
 
 def recipe_for(environment: str) -> Recipe:
@@ -133,10 +175,11 @@ def follow(
     for number, (folder, stage) in enumerate(zip(folders, _stages(recipe, folders), strict=True)):
         for part in stage.parts:
             config = dataclasses.replace(part.config, first_world=part.first)
-            generator, name = make(recipe.environment), recipe.environment
             with _timed(out, number, part.name):
                 into, told = folder / part.name, partial(tell, part.split)
-                collect(generator, name, part.split, part.worlds, into, config, processes, told)
+                collect(
+                    make(part.environment), part.environment, part.split, part.worlds, into, config, processes, told
+                )
         records += [read_dataset(folder / part.name) for part in stage.parts if part.split == Split.TRAINING]
         validation = read_dataset(folder / Split.VALIDATION.value)
         initial = folders[number - 1] / ESTIMATOR if number else None
@@ -157,9 +200,10 @@ def _timed(out: Path, stage: int, step: str) -> Iterator[None]:
 
 @dataclasses.dataclass(frozen=True)
 class _Part:
-    """One collection: its folder's name, the split, the first world and how many, and what is recorded."""
+    """One collection: its folder's name, the worlds' family and split, the first and how many, and what is recorded."""
 
     name: str
+    environment: str
     split: Split
     first: int
     worlds: int
@@ -174,17 +218,44 @@ class _Stage:
     fit: FitConfig
 
 
+class _Parts:
+    """Makes the parts of a recipe; worlds are counted through all stages, so that none is recorded twice."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        self._recipe = recipe
+        self._taken: Counter[tuple[str, Split]] = Counter()
+
+    def of_own(self, name: str, split: Split, worlds: int, config: CollectConfig) -> _Part:
+        """Of the recipe's own family."""
+        return self._part(name, self._recipe.environment, split, worlds, config)
+
+    def of_others(self, name: str, worlds: int, config: CollectConfig) -> Iterator[_Part]:
+        """Training worlds of the families beside it, where there are so many of its own."""
+        for chosen in self._recipe.beside:
+            # Subgoals as the trials of the family have them.
+            frontiers = collection_of(make(chosen.environment)).frontiers
+            explorer = dataclasses.replace(config.explorer, frontiers=frontiers)
+            own = dataclasses.replace(config, frontiers=frontiers, explorer=explorer)
+            count = chosen.worlds(worlds, config.worlds_per_shard)
+            yield self._part(f"{name}-{chosen.environment}", chosen.environment, Split.TRAINING, count, own)
+
+    def _part(self, name: str, environment: str, split: Split, worlds: int, config: CollectConfig) -> _Part:
+        first = self._recipe.collect.first_world + self._taken[environment, split]
+        self._taken[environment, split] += worlds
+        return _Part(name, environment, split, first, worlds, config)
+
+
 def _stages(recipe: Recipe, folders: Sequence[Path]) -> Iterator[_Stage]:
-    """The stages in order; worlds are counted through all of them, so that none is recorded twice."""
-    splits: tuple[Split, ...] = (Split.TRAINING, Split.VALIDATION)
-    next_world: dict[Split, int] = dict.fromkeys(splits, recipe.collect.first_world)
+    """The stages in order."""
+    training, validation = Split.TRAINING, Split.VALIDATION
+    parts = _Parts(recipe)
 
-    def part(name: str, split: Split, worlds: int, config: CollectConfig) -> _Part:
-        first = next_world[split]
-        next_world[split] += worlds
-        return _Part(name, split, first, worlds, config)
+    def recorded(config: CollectConfig, worlds: int, validation_worlds: int) -> Iterator[_Part]:
+        yield parts.of_own(training.value, training, worlds, config)
+        yield parts.of_own(validation.value, validation, validation_worlds, config)
+        yield from parts.of_others(training.value, worlds, config)
 
-    yield _Stage(tuple(part(split.value, split, recipe.worlds(split), recipe.collect) for split in splits), recipe.fit)
+    yield _Stage(tuple(recorded(recipe.collect, recipe.training_worlds, recipe.validation_worlds)), recipe.fit)
     for number, chosen in enumerate(recipe.rounds):
         driven = dataclasses.replace(
             recipe.collect,
@@ -193,10 +264,10 @@ def _stages(recipe: Recipe, folders: Sequence[Path]) -> Iterator[_Stage]:
             drives=chosen.drives,
             views_per_world=chosen.views_per_world,
         )
-        counts = {Split.TRAINING: chosen.worlds, Split.VALIDATION: chosen.validation_worlds}
-        parts = [part(split.value, split, counts[split], driven) for split in splits]
+        collected = list(recorded(driven, chosen.worlds, chosen.validation_worlds))
         if chosen.explored:
             changes = {"pursued": chosen.pursued, "views_per_world": chosen.views_per_world}
             explored = dataclasses.replace(recipe.collect, **changes)
-            parts.append(part("explored", Split.TRAINING, chosen.explored, explored))
-        yield _Stage(tuple(parts), dataclasses.replace(recipe.fit, epochs=chosen.epochs))
+            collected.append(parts.of_own("explored", training, chosen.explored, explored))
+            collected.extend(parts.of_others("explored", chosen.explored, explored))
+        yield _Stage(tuple(collected), dataclasses.replace(recipe.fit, epochs=chosen.epochs))
