@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 
 from potlp_jax.learning import square_ways
-from potlp_jax.learning.imagined_paths import OF_GOAL, OF_WAY, PROSPECTS, Outlook, outlook, prospects, scenery
+from potlp_jax.learning.imagined_paths import (
+    OF_GOAL,
+    OF_WAY,
+    PROSPECTS,
+    Outlook,
+    outlook,
+    outlook_of_first,
+    prospects,
+    scenery,
+)
 from potlp_jax.learning.squares import EAST, NORTH, PASSAGES, SOUTH, SQUARE, WEST, true_squares
 from potlp_jax.world.grid import BeliefMap
 
@@ -109,10 +118,27 @@ def left_part(cells: np.ndarray) -> np.ndarray:
 
 def beyond(cells: np.ndarray, letters: np.ndarray, seen: np.ndarray, places: list[tuple[int, int]]) -> Outlook:
     """The outlook from some places of a building that is imagined as it is; the hazard is avoided."""
+    scene, subgoals, stay = asked(cells, letters, seen, places)
+    return jax.jit(outlook)(scene, subgoals, stay)
+
+
+def asked(cells: np.ndarray, letters: np.ndarray, seen: np.ndarray, places: list[tuple[int, int]]):
+    """What ``beyond`` asks."""
     belief = belief_of(np.where(seen, cells, BeliefMap.UNKNOWN), np.where(seen, letters, 0))
     _, imagined = true_squares(jnp.asarray(cells), jnp.asarray(letters), len(NAMES))
     stay = jnp.tile(jnp.array([[0, -1]], jnp.int8), (len(places), 1))
-    return jax.jit(outlook)(scenery(belief, imagined), jnp.asarray(places, jnp.int32), stay)
+    return scenery(belief, imagined), jnp.asarray(places, jnp.int32), stay
+
+
+@pytest.mark.parametrize("count", [0, 1, 16, 17, 20])
+def test_the_first_lanes_have_the_outlook_that_they_have_together(count) -> None:
+    cells, letters = house()
+    scene, subgoals, stay = asked(cells, letters, left_part(cells), [(row % 18 + 1, 9) for row in range(20)])
+    found = jax.jit(outlook_of_first)(jnp.int32(count), scene, subgoals, stay)
+    for some, every in zip(jax.tree.leaves(found), jax.tree.leaves(outlook(scene, subgoals, stay)), strict=True):
+        assert np.any(np.asarray(every) != 0, axis=tuple(range(1, every.ndim))).all()
+        np.testing.assert_allclose(some[:count], every[:count], rtol=1e-5, atol=1e-5)
+        assert not np.asarray(some[count:]).any()
 
 
 def test_a_goal_is_reached_through_the_open_hallway_alone() -> None:

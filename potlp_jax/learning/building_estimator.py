@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float32, Int8, Int32, UInt8
 
 from potlp_jax.learning.building_network import BuildingConfig, BuildingNetwork, EncodedMap, Params, map_channels
 from potlp_jax.learning.exclusion import exclusive_chances
-from potlp_jax.learning.imagined_paths import OF_GOAL, OF_WAY, Outlook, Scenery, outlook, prospects, scenery
+from potlp_jax.learning.imagined_paths import Outlook, Scenery, outlook_of_first, prospects, scenery
 from potlp_jax.learning.network import require_propositions
 from potlp_jax.learning.overlays import Overlay, imagined_overlay, painting_overlays
 from potlp_jax.learning.painting import Painting, paint
@@ -18,9 +18,6 @@ from potlp_jax.planning.estimates import Estimates
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.world.frontiers import Subgoals
 from potlp_jax.world.grid import BeliefMap
-
-# Pairs of a subgoal and a class for which paths are solved side by side: a vector of the widest units.
-_LANES = 16
 
 
 @struct.dataclass(kw_only=True)
@@ -94,22 +91,11 @@ def _outlook_of_classes(
     same = jnp.all(stay[:, None, :] == stay[None, :, :], axis=2) & class_mask[None, :]
     first = jnp.argmax(same, axis=1).astype(jnp.int32)
     asked = class_mask & (first == jnp.arange(classes, dtype=jnp.int32))
-    # Pairs of a subgoal and the first class that avoids something, real ones first: padding costs nothing.
+    # Pairs of a subgoal and the first class that avoids something, real ones first.
     real = (subgoals.mask[:, None] & asked[None, :]).reshape(-1)
-    lanes = min(_LANES, count * classes)
     order = jnp.argsort(~real, stable=True).astype(jnp.int32)
-    pairs = jnp.pad(order, (0, -order.size % lanes))
-
-    def solve(chunk: Int32[Array, ""], found: Outlook) -> Outlook:
-        chosen = jax.lax.dynamic_slice_in_dim(pairs, chunk * lanes, lanes)
-        solved = outlook(scene, subgoals.cells[chosen // classes], stay[chosen % classes])
-        return jax.tree.map(
-            lambda into, rows: jax.lax.dynamic_update_slice_in_dim(into, rows, chunk * lanes, axis=0), found, solved
-        )
-
-    nothing = Outlook(way=jnp.zeros((pairs.size, OF_WAY)), goal=jnp.zeros((pairs.size, stay.shape[1], OF_GOAL)))
-    chunks = -(-jnp.sum(real, dtype=jnp.int32) // lanes)
-    solved = jax.lax.fori_loop(0, chunks, solve, nothing)
+    cells, avoided = subgoals.cells[order // classes], stay[order % classes]
+    solved = outlook_of_first(jnp.sum(real, dtype=jnp.int32), scene, cells, avoided)
     # From the order of work to that of the pairs, and from the first class to all that avoid the same.
     back = jnp.argsort(order)
     return jax.tree.map(lambda rows: rows[back].reshape(count, classes, *rows.shape[1:])[:, first], solved)

@@ -16,7 +16,7 @@ from potlp_jax.learning.batches import Choice
 from potlp_jax.learning.building_network import BuildingConfig, BuildingNetwork, Params, map_channels
 from potlp_jax.learning.data_figures import camera_geometry, cost_scales, image_shape
 from potlp_jax.learning.dataset import Samples
-from potlp_jax.learning.imagined_paths import Outlook, outlook, prospects, scenery
+from potlp_jax.learning.imagined_paths import Outlook, outlook_of_first, prospects, scenery
 from potlp_jax.learning.map_images import DecodedView, decode_view
 from potlp_jax.learning.network import Answers
 from potlp_jax.learning.painting import Painting
@@ -168,7 +168,8 @@ def _outlook_of_samples(
     def of_view(view: tuple[BeliefMap, Squares, BuildingInputs, Int8[Array, "K P"]]) -> Outlook:
         belief, imagined, inputs, stay = view
         cells = inputs.subgoals[inputs.subgoal_of[inputs.lanes]]
-        lanes = outlook(scenery(belief, imagined), cells, stay[inputs.lanes])
+        asked = jnp.max(inputs.lane_of) + 1
+        lanes = outlook_of_first(asked, scenery(belief, imagined), cells, stay[inputs.lanes])
         return jax.tree.map(lambda array: array[inputs.lane_of], lanes)
 
     # One view after the other: side by side all would be swept until the last one is done.

@@ -28,6 +28,8 @@ OF_GOAL: int = 7
 PROSPECTS: int = OF_WAY + OF_GOAL + 1
 """Numbers that the head of a network is told of a pair of a subgoal and a class (``prospects``)."""
 
+# Lanes for which paths are solved side by side: a vector of the widest units.
+_LANES = 16
 # Which numbers of a way to a proposition are costs, and not chances.
 _IS_COST = (False, False, False, False, True, False, True)
 # From this share of cells on that nobody has seen, of those that are not known to be occupied, a square is a part of
@@ -137,6 +139,33 @@ def outlook(scene: Scenery, subgoals: Int32[Array, "L 2"], stay: Int8[Array, "L 
     seen = ways_into_squares(cheapest_ways(out, [jnp.where(inside, 1 - chance, jnp.inf) for chance in passages]))
     goals = [_of_goal(scene, hidden, seen, away == 0, bit) for bit in range(stay.shape[-1])]
     return Outlook(way=_of_way(scene, clear, ways_into_squares(hidden)), goal=jnp.stack(goals, axis=-2))
+
+
+def outlook_of_first(
+    count: Int32[Array, ""], scene: Scenery, subgoals: Int32[Array, "L 2"], stay: Int8[Array, "L P"]
+) -> Outlook:
+    """The outlook of the first ``count`` lanes, as ``outlook``; of those behind them nothing is asked, and 0 is said.
+
+    A part of the lanes at a time, so that padding costs nothing and the last of few does not wait for many.
+    """
+    scene = jax.tree.map(jax.lax.stop_gradient, scene)
+    total = stay.shape[0]
+    size = min(_LANES, total)
+    spare = ((0, -total % size), (0, 0))
+    subgoals, stay = jnp.pad(subgoals, spare), jnp.pad(stay, spare)
+
+    def solve(part: Int32[Array, ""], found: Outlook) -> Outlook:
+        cells, avoided = (jax.lax.dynamic_slice_in_dim(array, part * size, size) for array in (subgoals, stay))
+        solved = outlook(scene, cells, avoided)
+        return jax.tree.map(
+            lambda into, rows: jax.lax.dynamic_update_slice_in_dim(into, rows, part * size, axis=0), found, solved
+        )
+
+    lanes, propositions = stay.shape
+    nothing = Outlook(way=jnp.zeros((lanes, OF_WAY)), goal=jnp.zeros((lanes, propositions, OF_GOAL)))
+    solved = jax.lax.fori_loop(0, -(-count // size), solve, nothing)
+    said = jnp.arange(total, dtype=jnp.int32) < count
+    return jax.tree.map(lambda rows: jnp.where(jnp.expand_dims(said, range(1, rows.ndim)), rows[:total], 0.0), solved)
 
 
 def _squares_away(scene: Scenery, subgoals: Int32[Array, "L 2"]) -> Int32[Array, "rows columns L"]:

@@ -69,6 +69,14 @@ MUTANTS = (
     ),
     Mutant(
         PART,
+        "imagined: the last lanes are not solved",
+        _PATHS,
+        "fori_loop(0, -(-count // size), solve",
+        "fori_loop(0, count // size, solve",
+        ("tests/test_imagined_paths.py",),
+    ),
+    Mutant(
+        PART,
         "imagined: classes share the outlook of the first",
         _ESTIMATOR,
         "*rows.shape[1:])[:, first], solved)",
