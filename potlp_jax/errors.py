@@ -128,6 +128,10 @@ class SpecificationError(ConfigurationError):
     """A specification of a sweep cannot be used: names the file, the entry and what to do."""
 
 
+class EngineError(PotlpError):
+    """Work cannot be done where it was asked for: names the cluster and what to do."""
+
+
 class SweepError(PotlpError):
     """A sweep has ended before its end; the message says why, and that what is finished is kept."""
 

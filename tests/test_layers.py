@@ -17,6 +17,7 @@ ORDER = (
     "plugins",
     "codec",
     "cache",
+    "engine",
     "task",
     "world",
     "environments",
@@ -66,7 +67,13 @@ def test_a_package_imports_only_from_packages_above(path):
 
 def test_only_one_module_imports_each_heavy_neighbour():
     # Spot is imported where formulas become automata, typer by the command line alone, rosbags where logs are read.
-    for library, packages in {"spot": {"task"}, "typer": {"cli"}, "matplotlib": {"view"}, "rosbags": {"logs"}}.items():
+    for library, packages in {
+        "spot": {"task"},
+        "typer": {"cli"},
+        "matplotlib": {"view"},
+        "rosbags": {"logs"},
+        "distributed": {"engine"},
+    }.items():
         users = {
             path.relative_to(PACKAGE).with_suffix("").parts[0]
             for path in SOURCES

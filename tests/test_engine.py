@@ -1,0 +1,188 @@
+"""Engines: every unit is done once, wherever, whoever dies meanwhile; what kills its workers is given up."""
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from eval.faults.kills import workers_of
+from potlp_jax.engine.engine import MOST_KILLED, Broken, Engine, Here
+from potlp_jax.engine.opening import open_engine
+from potlp_jax.errors import EngineError, WorldError
+
+
+def squares(shared: int, unit: int):
+    """Results one by one."""
+    for step in range(2):
+        yield shared + unit * unit + step
+
+
+def slow_squares(shared: Path, unit: int):
+    """A stand-in that says who began it."""
+    with (shared / f"{unit}.txt").open("a", encoding="utf-8") as file:
+        file.write(f"{os.getpid()}\n")
+    time.sleep(0.1)
+    yield unit * unit
+
+
+def deadly(shared: Path, unit: int):
+    """Kills its process, in the unit 3."""
+    yield from slow_squares(shared, unit)
+    if unit == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def failing(shared: None, unit: int):
+    """Ends with an error of the library."""
+    raise WorldError(f"no world {unit}")
+    yield
+
+
+def cores(shared: None, unit: int):
+    """Where the process may run, and who it is."""
+    time.sleep(0.2)
+    yield os.getpid(), sorted(os.sched_getaffinity(0))
+
+
+@pytest.fixture(scope="module")
+def two():
+    """Two processes of this machine."""
+    with open_engine(2) as engine:
+        yield engine
+
+
+def test_engines_keep_the_protocol(two):
+    assert isinstance(Here(), Engine)
+    assert isinstance(two, Engine)
+    assert Here().workers == 1
+
+
+def test_here_results_come_one_by_one_and_units_are_asked_for_late():
+    asked = []
+
+    def units():
+        for unit in range(3):
+            asked.append(unit)
+            yield unit
+
+    results = Here().run(squares, 100, units())
+    assert [next(results), list(asked)] == [(0, [100]), [0]]
+    assert list(results) == [(0, [101]), (1, [101]), (1, [102]), (2, [104]), (2, [105])]
+
+
+def test_in_processes_every_unit_is_done_and_units_are_asked_for_late(two):
+    asked = []
+
+    def units():
+        for unit in range(20):
+            asked.append(unit)
+            yield unit
+
+    results = two.run(squares, 100, units())
+    first = next(results)
+    assert len(asked) < 20
+    found = dict([first, *results])
+    assert found == {unit: [100 + unit * unit, 101 + unit * unit] for unit in range(20)}
+    assert list(two.run(squares, 100, [])) == []
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores can be chosen on Linux alone")
+def test_each_worker_keeps_to_a_core(two):
+    found = {pid: allowed for _, ((pid, allowed),) in two.run(cores, None, range(8))}
+    assert len(found) == 2
+    assert all(len(allowed) == 1 for allowed in found.values())
+    if len(os.sched_getaffinity(0)) > 1:
+        assert len({tuple(allowed) for allowed in found.values()}) == 2
+
+
+def test_what_a_unit_raises_is_raised_here(two):
+    with pytest.raises(WorldError, match="no world 5"):
+        list(two.run(failing, None, [5]))
+    # And the workers are there for others.
+    assert list(two.run(squares, 0, [3])) == [(3, [9, 10])]
+
+
+def test_a_unit_that_kills_its_workers_is_given_up_and_the_others_are_done(two, tmp_path):
+    found = dict(two.run(deadly, tmp_path, range(6)))
+    assert isinstance(found[3], Broken)
+    assert found[3].error == "3 workers that began it died"
+    assert {unit: result for unit, result in found.items() if unit != 3} == {u: [u * u] for u in (0, 1, 2, 4, 5)}
+    begun = (tmp_path / "3.txt").read_text().split()
+    assert len(begun) == len(set(begun)) == MOST_KILLED
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="processes are found in /proc")
+def test_units_of_a_worker_that_is_killed_go_to_others(two, tmp_path):
+    results = two.run(slow_squares, tmp_path, range(30))
+    found = dict([next(results)])
+    os.kill(workers_of(os.getpid())[0], signal.SIGKILL)
+    found |= dict(results)
+    assert found == {unit: [unit * unit] for unit in range(30)}
+
+
+def _free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]
+
+
+@contextlib.contextmanager
+def _begun(*words: str):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "distributed.cli." + words[0], *words[1:]], stderr=subprocess.DEVNULL
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_a_scheduler_that_is_killed_and_comes_back_loses_nothing(tmp_path, caplog):
+    address = f"tcp://127.0.0.1:{(port := _free_port())}"
+    scheduler = "dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"
+    worker = "dask_worker", address, "--nthreads", "1", "--no-dashboard", "--death-timeout", "60"
+    with contextlib.ExitStack() as stack:
+        first = stack.enter_context(_begun(*scheduler))
+        stack.enter_context(_begun(*worker))
+        engine = stack.enter_context(open_engine(cluster=address))
+        results = engine.run(slow_squares, tmp_path, range(20))
+        found = dict([next(results)])
+        first.send_signal(signal.SIGKILL)
+        first.wait()
+        stack.enter_context(_begun(*scheduler))
+        stack.enter_context(_begun(*worker))
+        found |= dict(results)
+    assert found == {unit: [unit * unit] for unit in range(20)}
+    assert "they begin again" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("cluster", "message"),
+    [
+        ("mars", r"--cluster mars: unknown; give one of tcp://HOST:PORT, ssh:HOST,HOST, slurm:OPTION=VALUE"),
+        ("slurm:partition", "'partition' is no OPTION=VALUE"),
+        ("slurm:workers=0", "workers: give a whole number of at least 1, found 0"),
+        ("slurm:workers=many", "workers: give a whole number of at least 1, found many"),
+        ("slurm:workers=1,colour=red", "workers cannot be begun as jobs of slurm"),
+        ("ssh:", "name the machines"),
+    ],
+)
+def test_clusters_that_cannot_be_are_named(cluster, message):
+    pytest.importorskip("dask_jobqueue")
+    pytest.importorskip("asyncssh")
+    with pytest.raises(EngineError, match=message), open_engine(cluster=cluster):
+        pass
+
+
+def test_a_scheduler_that_does_not_answer_is_named(monkeypatch):
+    monkeypatch.setattr("potlp_jax.engine.cluster.ANSWER", 0.5)
+    where, message = f"tcp://127.0.0.1:{_free_port()}", r"no Dask scheduler answers at tcp://127.0.0.1:\d+ .*scheduler"
+    with pytest.raises(EngineError, match=message), open_engine(cluster=where):
+        pass
