@@ -15,6 +15,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from potlp_jax.engine.engine import Broken, Here
+from potlp_jax.engine.opening import open_engine
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import DatasetError
@@ -47,8 +49,8 @@ WORLDS = 8
 REPOSITORY = Path(__file__).parent.parent
 
 
-def _collect(folder, processes=1):
-    collect(GENERATOR, "firefighting", Split.TRAINING, WORLDS, folder, CONFIG, processes)
+def _collect(folder):
+    collect(GENERATOR, "firefighting", Split.TRAINING, WORLDS, folder, CONFIG)
 
 
 @pytest.fixture(scope="module")
@@ -178,11 +180,12 @@ def test_a_killed_collection_continues_and_nothing_is_there_twice(dataset, tmp_p
 
 
 def test_several_processes_take_whole_shards(tmp_path):
-    # Worlds without views cost nothing: what counts is that other processes write the shards that are missing.
+    # Worlds without views cost nothing: what counts is that the shards that are missing come from other processes.
     config = dataclasses.replace(CONFIG, views_per_world=0)
     collect(GENERATOR, "firefighting", Split.TRAINING, 2, tmp_path, config)
     first = samples_file(tmp_path, 0).stat().st_mtime_ns
-    collect(GENERATOR, "firefighting", Split.TRAINING, WORLDS, tmp_path, config, processes=2)
+    with open_engine(2) as engine:
+        collect(GENERATOR, "firefighting", Split.TRAINING, WORLDS, tmp_path, config, engine)
     assert finished_shards(tmp_path) == set(range(WORLDS // config.worlds_per_shard))
     assert samples_file(tmp_path, 0).stat().st_mtime_ns == first
     assert len(read_dataset(tmp_path).images) == 0
@@ -206,9 +209,16 @@ def test_a_folder_with_other_settings_is_not_continued(dataset):
 def test_worlds_fill_whole_shards(tmp_path):
     with pytest.raises(DatasetError, match="ask for 4 worlds"):
         collect(GENERATOR, "firefighting", Split.TRAINING, 5, tmp_path, CONFIG)
-    with pytest.raises(DatasetError, match="ask for at least 1"):
-        collect(GENERATOR, "firefighting", Split.TRAINING, 4, tmp_path, CONFIG, processes=0)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_shard_that_kills_its_workers_is_named(tmp_path):
+    class Dying(Here):
+        def run(self, work, shared, units):
+            yield 1, Broken("3 workers that began it died")
+
+    with pytest.raises(DatasetError, match=r"shard 1 of .* cannot be collected: 3 workers that began it died"):
+        collect(GENERATOR, "firefighting", Split.TRAINING, 4, tmp_path, CONFIG, Dying())
 
 
 def _wander(index, seed=0):

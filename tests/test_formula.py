@@ -7,8 +7,8 @@ import time
 
 import pytest
 
+from eval.faults.kills import process_start
 from potlp_jax.errors import TaskError
-from potlp_jax.sweep.store import process_start
 from potlp_jax.task import spot_process
 from potlp_jax.task.formula import parse_formula
 from potlp_jax.task.task import Task

@@ -1,9 +1,9 @@
 """Sweeps: the specification's errors, the store under several processes and kills, rows, tables and export."""
 
+import contextlib
 import csv
 import dataclasses
 import json
-import multiprocessing
 import os
 import re
 import shutil
@@ -11,25 +11,25 @@ import signal
 import subprocess
 import sys
 import time
-from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import cast
 
 import jax
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from eval.faults.kills import process_start, workers_of
 from eval.savings import decisions_of
 from potlp_jax.cli import app
 from potlp_jax.cli.report import page_title
 from potlp_jax.codec import shipped_settings
+from potlp_jax.engine.engine import Broken, Here
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
-from potlp_jax.errors import ConfigurationError, StoreError, SweepError
+from potlp_jax.errors import ConfigurationError, EngineError, StoreError, SweepError
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.rows import path_text, read_path
-from potlp_jax.sweep.runner import RESULTS, Sweep, _Workers, run_sweep
+from potlp_jax.sweep.runner import RESULTS, Sweep, run_sweep
 from potlp_jax.sweep.specification import (
     configuration_hash,
     own_settings,
@@ -37,7 +37,7 @@ from potlp_jax.sweep.specification import (
     specification_from_dict,
     specification_from_store,
 )
-from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store, process_start
+from potlp_jax.sweep.store import Item, Row, Store
 from potlp_jax.task.task import Task
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.rules import trial_key
@@ -108,8 +108,7 @@ def test_a_policy_may_have_settings_of_its_own():
 
 def test_trials_of_a_policy_have_its_settings_and_a_sweep_with_others_is_another(tmp_path):
     sweep = Sweep(_specification(policy_settings={"baseline": {"replan_distance": 2}}), tmp_path)
-    while sweep.step():
-        pass
+    sweep.run(Here(), lambda progress: None)
     hashes = {row.item.policy: row.configuration for row in sweep.store.rows()}
     common = configuration_hash(sweep.specification.config)
     assert hashes["optimistic"] == hashes["known-map"] == common
@@ -182,43 +181,32 @@ def test_rows_come_back_as_they_were_written(tmp_path):
     row = _row(ITEMS[0], cost=0.1 + 0.2)
     store.finish([row])
     assert Store(tmp_path / "a.sqlite").rows() == [row]
-    store.finish([dataclasses.replace(row, cost=9.0)])
+    assert store.items() == {ITEMS[0]}
+
+
+def test_a_trial_that_is_run_twice_must_give_the_same_row(tmp_path):
+    store = Store(tmp_path / "a.sqlite")
+    row = _row(ITEMS[0], cost=0.1 + 0.2)
+    store.finish([row])
+    store.finish([dataclasses.replace(row, seconds=9.0)])
     assert store.rows() == [row]
-    assert store.count() == 1
+    for change in ({"cost": 0.3}, {"path": "2,3:71"}, {"versions": {"jax": "2"}}):
+        with pytest.raises(
+            StoreError, match=rf"baseline in world 0 was run twice with different .*{next(iter(change))}"
+        ):
+            store.finish([_row(ITEMS[1]), dataclasses.replace(row, **change)])
+    # All or nothing.
+    assert store.rows() == [row]
 
 
-def test_an_item_is_claimed_once_until_it_is_finished_or_its_owner_is_gone(tmp_path):
+def test_what_was_given_up_is_kept_until_it_is_to_be_tried_again(tmp_path):
     store = Store(tmp_path / "a.sqlite")
-    assert store.claim(ITEMS, 3) == ITEMS[:3]
-    assert Store(tmp_path / "a.sqlite").claim(ITEMS, 2) == ITEMS[3:5]
-    store.finish([_row(ITEMS[0])])
-    assert store.claim(ITEMS[:2], 5) == []
-    context = multiprocessing.get_context("spawn")
-    other = context.Process(target=_claim_and_die, args=(tmp_path / "a.sqlite",))
-    other.start()
-    other.join()
-    assert other.exitcode == -signal.SIGKILL
-    assert store.claim(ITEMS, 10) == ITEMS[5:]
-
-
-def _claim_and_die(file):
-    assert Store(file).claim(ITEMS, 2) == ITEMS[5:7]
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def test_worlds_are_claimed_like_trials(tmp_path):
-    store = Store(tmp_path / "a.sqlite")
-    worlds = [Item("toy", "F goal", POSSIBLE, world) for world in range(4)]
-    assert store.claim(worlds, 2) == worlds[:2]
-    store.set_possible("toy", "F goal", {0: True, 1: False})
-    assert store.claim(worlds, 9) == worlds[2:]
-    assert store.possible("toy", "F goal") == {0: True, 1: False}
+    store.set_broken(ITEMS[2], "it died")
+    store.set_broken(ITEMS[1], "it died too")
+    assert Store(tmp_path / "a.sqlite", read_only=True).broken() == {ITEMS[1]: "it died too", ITEMS[2]: "it died"}
+    store.forget_broken()
+    assert store.broken() == {}
     assert store.count() == 0
-
-
-def test_a_process_that_takes_over_a_number_is_another():
-    assert process_start(os.getpid()) == process_start(os.getpid())
-    assert process_start(2**22 + 1) is None
 
 
 def test_a_store_of_another_sweep_is_refused_by_name(tmp_path):
@@ -239,7 +227,7 @@ def test_other_files_are_no_store(tmp_path):
     old = Store(tmp_path / "b")
     old._connection.execute("UPDATE facts SET value = 'potlp-sweep-0' WHERE name = 'format'")
     old.close()
-    with pytest.raises(StoreError, match=r"'potlp-sweep-0'.*'potlp-sweep-4'"):
+    with pytest.raises(StoreError, match=r"'potlp-sweep-0'.*'potlp-sweep-5'"):
         Store(tmp_path / "b")
 
 
@@ -249,6 +237,7 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sweep")
     reports = []
     run_sweep(_specification(), folder, 1, reports.append)
+    assert [report.done for report in reports] == sorted(report.done for report in reports)
     assert reports[-1].done == reports[-1].total == 9
     return folder
 
@@ -292,50 +281,44 @@ def test_a_sweep_can_be_made_longer(finished, tmp_path):
 MANY_KILLS = """
 import os, random, signal, sys, time
 from pathlib import Path
-from potlp_jax.environments.splits import Split
 from potlp_jax.planning.policies import Policy
-from potlp_jax.sweep.runner import RESULTS, Sweep
+from potlp_jax.sweep.runner import run_sweep
 from potlp_jax.sweep.specification import Cell, Specification
-from potlp_jax.sweep.store import Row, Store
+from potlp_jax.sweep.store import POSSIBLE, Row
+from potlp_jax.sweep.work import Examined, Work
 
-def rows(self, items, environment, policy):
-    for item in items:
+def do(self, unit):
+    for item in unit.items:
         time.sleep(0.002)
-        yield Row(item, "satisfied", item.world / 7, 9.0, 1, 1, 0, 0, (1, 2), "p", "c", {}, "", 0.0, "d")
+        if item.policy == POSSIBLE:
+            yield Examined(item, item.world % 3 != 1)
+        else:
+            yield Row(item, "satisfied", item.world / 7, 9.0, 1, 1, 0, 0, (1, 2), "p", "c", {}, "", 0.0, "d")
 
-Sweep.rows = rows
-Sweep.possible = lambda self, items: {item.world: item.world % 3 != 1 for item in items}
+Work.do = do
 specification = Specification(
     cells=(Cell("toy", "F goal"), Cell("toy", "F hazard")),
     policies=(Policy.KNOWN_MAP, Policy.BASELINE, Policy.ORACLE),
     worlds=40,
 )
-folder, draw, kills, processes = Path(sys.argv[1]), random.Random(5), 0, []
-def start():
+folder, draw, kills = Path(sys.argv[1]), random.Random(5), 0
+while True:
     pid = os.fork()
-    if pid:
-        return pid
-    sweep = Sweep(specification, folder)
-    while not sweep.finished():
-        sweep.step() or time.sleep(0.01)
-    os._exit(0)
-while kills < 60:
-    processes = processes or [start(), start()]
-    time.sleep(draw.random() * 0.05)
-    victim = processes.pop(draw.randrange(2))
-    os.kill(victim, signal.SIGKILL)
-    kills += os.WIFSIGNALED(os.waitpid(victim, 0)[1])
-    processes.append(start())
-    if Sweep(specification, folder).finished():
+    if not pid:
+        run_sweep(specification, folder)
+        os._exit(0)
+    if kills < 60:
+        time.sleep(draw.random() * 0.08)
+        os.kill(pid, signal.SIGKILL)
+    if not os.WIFSIGNALED(os.waitpid(pid, 0)[1]):
         break
-for process in processes:
-    os.waitpid(process, 0)
+    kills += 1
 print(kills)
 """
 
 
 def test_killed_many_times_at_random_moments_nothing_is_lost_and_nothing_is_there_twice(tmp_path):
-    # The work is a stand-in, so that hundreds of trials and tens of kills take seconds; two workers share the store.
+    # The work is a stand-in, so that hundreds of trials and tens of kills take seconds.
     done = subprocess.run([sys.executable, "-c", MANY_KILLS, str(tmp_path)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) >= 8
@@ -348,7 +331,62 @@ def test_killed_many_times_at_random_moments_nothing_is_lost_and_nothing_is_ther
     ]
     rows = _rows(tmp_path)
     assert [(row.item.task, row.item.policy, row.item.world, row.cost) for row in rows] == expected
-    assert not Store(tmp_path / RESULTS)._connection.execute("SELECT * FROM claims").fetchall()
+
+
+class _Fragile:
+    """An engine of whose workers each dies of one trial."""
+
+    workers = 2
+
+    def __init__(self, deadly: int | None) -> None:
+        self.deadly, self.asked = deadly, []
+
+    def run(self, work, shared, units):
+        for unit in units:
+            self.asked.append(len(unit.items))
+            if any(item.world == self.deadly and item.policy == "optimistic" for item in unit.items):
+                yield unit, Broken("every worker that began it died: out of memory")
+            else:
+                yield unit, list(work(shared, unit))
+
+    def close(self):
+        pass
+
+
+def test_a_trial_that_kills_its_workers_is_found_listed_and_not_run_for_ever(finished, tmp_path, monkeypatch):
+    fragile = _Fragile(deadly=6)
+    monkeypatch.setattr("potlp_jax.sweep.runner.open_engine", lambda *where: contextlib.nullcontext(fragile))
+    monkeypatch.setattr("potlp_jax.sweep.runner._UNITS_A_WORKER", 1)
+    run_sweep(_specification(), tmp_path)
+    whole = _rows(finished)
+    rest = [row for row in whole if (row.item.world, row.item.policy) != (6, "optimistic")]
+    assert _rows(tmp_path) == rest
+    # The unit with the trial, then each of its trials by itself.
+    assert max(fragile.asked) > 1
+    assert fragile.asked[-max(fragile.asked) :] == [1] * max(fragile.asked)
+    fragile.asked.clear()
+    run_sweep(_specification(), tmp_path)
+    assert not fragile.asked
+    told = _potlp("sweep", "show", tmp_path)
+    assert "given up: optimistic in world 6 of toy" in told.stdout
+    assert "out of memory" in told.stdout
+    fragile.deadly = None
+    (tmp_path / "sweep.yaml").write_text(json.dumps(SMALL))
+    told = _potlp("sweep", tmp_path / "sweep.yaml", "--out", tmp_path, "--retry-broken")
+    assert told.exit_code == 0, told.stderr
+    assert "given up" not in told.stdout
+    assert _rows(tmp_path) == whole
+
+
+def test_a_world_that_cannot_be_examined_ends_the_sweep(tmp_path, monkeypatch):
+    class Dying(_Fragile):
+        def run(self, work, shared, units):
+            for unit in units:
+                yield unit, Broken("it died")
+
+    monkeypatch.setattr("potlp_jax.sweep.runner.open_engine", lambda *where: contextlib.nullcontext(Dying(None)))
+    with pytest.raises(SweepError, match="toy, world 5: cannot be examined: it died; what is finished is kept"):
+        run_sweep(_specification(), tmp_path)
 
 
 def _flip(file, table, column, value):
@@ -426,7 +464,7 @@ def test_a_full_disk_is_named_and_loses_nothing(tmp_path):
     (pages,) = store._connection.execute("PRAGMA page_count").fetchone()
     store._connection.execute(f"PRAGMA max_page_count = {pages}")
     with pytest.raises(StoreError, match=r"the disk is full .*make room"):
-        store.finish([dataclasses.replace(_row(item), path="2,3:" + "7" * 9000) for item in ITEMS])
+        store.finish([dataclasses.replace(_row(item), path="2,3:" + "7" * 9000) for item in ITEMS[1:]])
     assert store.rows() == [_row(ITEMS[0])]
     store._connection.execute("PRAGMA max_page_count = 100000")
     store.finish([_row(ITEMS[1])])
@@ -507,16 +545,12 @@ def test_killed_after_its_first_trials_it_goes_on_in_two_workers(finished, comma
     assert _rows(tmp_path / "out") == _rows(finished)
 
 
-def _workers_of(process):
+def _two_workers_of(process):
     """The workers of a running command, once there are two."""
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-    while True:
+    while len(workers := workers_of(process.pid)) < 2:
         assert process.poll() is None
-        found = [int(child) for child in children.read_text().split()]
-        workers = [pid for pid in found if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
-        if len(workers) == 2:
-            return workers
         time.sleep(0.05)
+    return workers
 
 
 needs_proc = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="processes are found in /proc")
@@ -525,7 +559,7 @@ needs_proc = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="pr
 @needs_proc
 def test_after_sigterm_the_command_ends_with_its_workers_and_says_so(command):
     process = subprocess.Popen([*command, "2"], stderr=subprocess.PIPE, text=True)
-    workers = _workers_of(process)
+    workers = _two_workers_of(process)
     starts = [process_start(worker) for worker in workers]
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=60)
@@ -538,56 +572,26 @@ def test_after_sigterm_the_command_ends_with_its_workers_and_says_so(command):
 def test_a_sweep_goes_on_when_a_worker_is_killed_and_says_so(finished, command, tmp_path):
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": os.environ["POTLP_TEST_CACHE"]}
     process = subprocess.Popen([*command, "2"], env=environment, stderr=subprocess.PIPE, text=True)
-    os.kill(_workers_of(process)[0], signal.SIGKILL)
+    workers = _two_workers_of(process)
+    while not (tmp_path / "out" / RESULTS).exists() or not Store(tmp_path / "out" / RESULTS).possible(
+        "toy", make("toy").tasks["2"]
+    ):
+        assert process.poll() is None
+        time.sleep(0.05)
+    os.kill(workers[0], signal.SIGKILL)
     _, errors = process.communicate()
-    assert process.returncode == 0
-    assert "was killed by SIGKILL; another takes its place" in errors
+    assert process.returncode == 0, errors
+    assert "1 of 2 workers ended; what they had begun begins again elsewhere" in errors
     assert _rows(tmp_path / "out") == _rows(finished)
 
 
 def test_where_no_worker_can_be_started_the_message_says_what_to_do(tmp_path, monkeypatch):
-    def start(self):
+    def start(*arguments, **options):
         raise BlockingIOError(11, "Resource temporarily unavailable")
 
-    monkeypatch.setattr("multiprocessing.context.SpawnProcess.start", start)
-    with pytest.raises(SweepError, match=r"no worker could be started .*fewer --processes; what is finished is kept"):
+    monkeypatch.setattr("distributed.LocalCluster", start)
+    with pytest.raises(EngineError, match=r"no workers could be started .*fewer --processes"):
         run_sweep(_specification(), tmp_path, 2)
-
-
-class _Dead:
-    """A process that has ended."""
-
-    def __init__(self, code):
-        self.exitcode = code
-
-
-@pytest.mark.parametrize(
-    ("code", "told", "message"),
-    [
-        (1, "the task is impossible", "ended with an error: the task is impossible; what is finished is kept"),
-        (-9, None, "was killed by SIGKILL, and so did 1 before it with no trial finished"),
-        (3, None, "ended with code 3, and so did 1 before it"),
-    ],
-)
-def test_what_a_worker_died_of_is_said(code, told, message, tmp_path, monkeypatch):
-    monkeypatch.setattr("potlp_jax.sweep.runner.MOST_DEATHS", 2)
-    workers = _Workers(Sweep(_specification(), tmp_path), tmp_path, 2)
-    begun = []
-    monkeypatch.setattr(workers, "_start", begun.append)
-
-    def die():
-        ours, theirs = multiprocessing.Pipe(duplex=False)
-        if told is not None:
-            theirs.send(told)
-        theirs.close()
-        workers._running[1] = cast("BaseProcess", _Dead(code)), ours
-        workers._look_after(1)
-
-    if told is None:
-        die()
-        assert begun == [1]
-    with pytest.raises(SweepError, match=message):
-        die()
 
 
 def _potlp(*arguments):
@@ -649,7 +653,7 @@ def test_a_report_writes_each_policy_in_its_colour():
 
 
 def test_a_report_without_replays_runs_nothing_again(finished, tmp_path, monkeypatch):
-    monkeypatch.delattr("potlp_jax.sweep.runner.run_trial")
+    monkeypatch.delattr("potlp_jax.sweep.work.run_trial")
     told = _potlp("report", finished, "--out", tmp_path / "report.html", "--replays", 0)
     assert told.exit_code == 0, told.stderr
     assert 'id="replay-' not in (tmp_path / "report.html").read_text("utf-8")

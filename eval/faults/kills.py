@@ -22,7 +22,7 @@ import numpy as np
 
 from eval.faults import LIMIT, Kind, LostRowsError, WrongAnswerError
 from potlp_jax.sweep.runner import RESULTS
-from potlp_jax.sweep.store import Item, Row, Store, process_start
+from potlp_jax.sweep.store import Item, Row, Store
 
 _SPECIFICATION = {"environments": ["toy"], "tasks": [1, 2], "policies": ["optimistic"], "worlds": 60, "seed": 3}
 
@@ -64,14 +64,14 @@ def _whole(parent: Path) -> dict[Item, Row]:
 
 def _kill_command(number: signal.Signals, random: np.random.Generator, process: subprocess.Popen[bytes]) -> None:
     """One signal to the command; its workers have to end with it."""
-    workers = _children(process.pid)
+    workers = workers_of(process.pid)
     process.send_signal(number)
     _require_end(process, workers, number)
 
 
 def _kill_worker(random: np.random.Generator, process: subprocess.Popen[bytes]) -> None:
     """A worker dies, the sweep goes on with another for a while; then all is ended."""
-    workers = [child for child in _children(process.pid) if "spawn_main" in _words_of(child)]
+    workers = workers_of(process.pid)
     if workers:
         with contextlib.suppress(ProcessLookupError):
             os.kill(workers[random.integers(len(workers))], signal.SIGKILL)
@@ -81,11 +81,27 @@ def _kill_worker(random: np.random.Generator, process: subprocess.Popen[bytes]) 
     _kill_command(signal.SIGTERM, random, process)
 
 
-def _children(parent: int) -> list[int]:
+def workers_of(parent: int) -> list[int]:
+    """The processes that a command has spawned, by whichever of its threads."""
+    found = []
+    for children in Path("/proc", str(parent), "task").glob("*/children"):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            found += [int(child) for child in children.read_text().split()]
+    return [child for child in found if "spawn_main" in _words_of(child)]
+
+
+def process_start(process: int) -> str | None:
+    """When a process was started, in the system's own units; None where there is none.
+
+    The system uses the number of a process again after a while, but not with the same start.
+    """
     try:
-        return [int(child) for child in Path(f"/proc/{parent}/task/{parent}/children").read_text().split()]
+        stat = Path(f"/proc/{process}/stat").read_text()
     except FileNotFoundError:
-        return []
+        return None
+    # Fields of /proc/PID/stat: number, name in brackets (which may hold anything), state, and as the 22nd the start.
+    state, *fields = stat.rpartition(")")[2].split()
+    return None if state == "Z" else fields[18]
 
 
 def _words_of(process: int) -> str:

@@ -10,7 +10,7 @@ import typer
 
 from potlp_jax.cli.completion import complete_environment, complete_split
 from potlp_jax.cli.group import Command, command_app
-from potlp_jax.cli.options import Processes, RecipeName, Settings
+from potlp_jax.cli.options import ClusterName, Processes, RecipeName, Settings
 from potlp_jax.cli.output import FAILED, console, fail, make_folder, progress_bar
 
 if TYPE_CHECKING:
@@ -61,12 +61,14 @@ def collect(
         ),
     ] = "training",
     processes: Processes = 1,
+    cluster: ClusterName = None,
     settings: Settings = None,
 ) -> None:
     """Record panoramas of simulated worlds with the true answers about what lies beyond each frontier."""
     require_training_extra()
     from potlp_jax.cli.inputs import read_split
     from potlp_jax.codec import settings_from_words, with_settings
+    from potlp_jax.engine.opening import open_engine
     from potlp_jax.environments.registry import make
     from potlp_jax.learning.dataset import read_dataset
     from potlp_jax.recipes import collection
@@ -78,7 +80,7 @@ def collect(
     if not number:
         fail(f"how many worlds of the split {split}? Give --worlds")
     folder = make_folder(out)
-    with progress_bar() as progress:
+    with progress_bar() as progress, open_engine(processes, cluster) as engine:
         collection.collect(
             generator,
             chosen.environment,
@@ -86,7 +88,7 @@ def collect(
             number,
             folder,
             with_settings(chosen.collect, settings_from_words(settings or []), "--set"),
-            processes=processes,
+            engine,
             tell=partial(collection_bars(progress), of_split),
         )
     console().print(collection.summary(read_dataset(folder)))

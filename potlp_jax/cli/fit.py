@@ -9,7 +9,7 @@ import typer
 
 from potlp_jax.cli.collect import collection_bars, require_training_extra
 from potlp_jax.cli.group import Command, command_app
-from potlp_jax.cli.options import Processes, RecipeName, Settings
+from potlp_jax.cli.options import ClusterName, Processes, RecipeName, Settings
 from potlp_jax.cli.output import console, fail, make_folder, progress_bar
 
 if TYPE_CHECKING:
@@ -59,6 +59,7 @@ def fit(
         Path | None, typer.Option("--initial", help="An estimator to go on from. Not with a recipe that collects.")
     ] = None,
     processes: Processes = 1,
+    cluster: ClusterName = None,
     settings: Settings = None,
 ) -> None:
     """Fit an estimator to a dataset, or make one from nothing with --recipe."""
@@ -78,6 +79,8 @@ def fit(
     if initial is not None and any(word.startswith("network") for word in settings or []):
         fail("--initial keeps the network of its estimator as it is: leave out --set network")
     given = None if recipe is None else read_recipe(recipe)
+    if cluster is not None and datasets:
+        fail("--cluster is for collecting, as a recipe does: a fit runs on the devices of this machine")
     config = with_settings(
         fitting.FitConfig() if given is None else given.fit, settings_from_words(settings or []), "--set"
     )
@@ -95,7 +98,7 @@ def fit(
         else:
             assert given is not None
             chosen = dataclasses.replace(given, fit=config)
-            trained = follow(chosen, folder, processes, collection_bars(progress), _display(progress))
+            trained = follow(chosen, folder, processes, cluster, collection_bars(progress), _display(progress))
     console().print(
         f"{folder / fitting.ESTIMATOR}: step {trained.best_step} of {trained.steps}, validation loss "
         f"{trained.best_loss:.4f}; ended by {trained.reason} after {trained.seconds / 60:.1f} min",

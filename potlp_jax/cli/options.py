@@ -125,6 +125,15 @@ Settings = Annotated[
         "--set", metavar="NAME=VALUE", help="Change a setting, such as training.patience=10; may be repeated."
     ),
 ]
+ClusterName = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        metavar="WHERE",
+        help="Other machines: tcp://HOST:PORT of a Dask scheduler, ssh:HOST,HOST or slurm:partition=...,workers=N "
+        "(docs/clusters.md).",
+    ),
+]
 Processes = Annotated[
     int,
     typer.Option(

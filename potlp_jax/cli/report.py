@@ -113,7 +113,7 @@ def _shown(sweep: "Sweep", reason: str, row: "Row", baseline: "Row") -> "Shown":
         world=row.item.world,
         cost=row.cost,
         baseline=baseline.cost,
-        data=replay_data(trial, views_of(trial, sweep.asked(row.item.environment, row.item.policy))),
+        data=replay_data(trial, views_of(trial, sweep.work.asked(row.item.environment, row.item.policy))),
     )
 
 

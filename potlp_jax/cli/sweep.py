@@ -4,7 +4,6 @@ import csv
 import dataclasses
 import json as json_module
 import logging
-import os
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,10 +13,11 @@ from rich.console import Console
 from typer.core import TyperGroup
 
 from potlp_jax.cli.group import Command, command_app
-from potlp_jax.cli.options import Json, SweepFolder
+from potlp_jax.cli.options import ClusterName, Json, SweepFolder
 from potlp_jax.cli.output import console, fail, make_folder, print_json, progress_bar
 
 if TYPE_CHECKING:
+    from potlp_jax.engine.engine import Engine
     from potlp_jax.sweep.results import CellResults
     from potlp_jax.sweep.runner import Progress
     from potlp_jax.sweep.specification import Specification
@@ -56,8 +56,10 @@ app = command_app(
 
 [cyan]potlp sweep mine.yaml --out out/mine --processes 1[/cyan]
 
-[dim]Killed or interrupted, the same command again continues; several may run on one folder. docs/sweeps.md describes
-the file.[/dim]
+[cyan]potlp sweep mine.yaml --out out/mine --cluster slurm:partition=cpu,walltime=04:00:00,workers=64[/cyan]
+
+[dim]Killed or interrupted, the same command again continues. docs/sweeps.md describes the file, docs/clusters.md
+--cluster.[/dim]
 """,
 )
 def run(
@@ -72,6 +74,10 @@ def run(
     processes: Annotated[
         int | None, typer.Option(min=1, help="Workers, each on a core of its own; default: one per core.")
     ] = None,
+    cluster: ClusterName = None,
+    retry_broken: Annotated[
+        bool, typer.Option("--retry-broken", help="Begin again the trials that were given up.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Run environments × tasks × policies × worlds, or what is missing of it."""
@@ -83,7 +89,9 @@ def run(
     # `potlp run` and `potlp compare` say so where they read the split; here the file names it.
     if specification.split is Split.TEST:
         warn_of_test_worlds()
-    run_reported(specification, make_folder(out), processes)
+    if retry_broken:
+        forget_broken(out)
+    run_reported(specification, make_folder(out), processes, cluster)
     # From the store, so that a sweep shows the same tables whether it has just ended or is shown again.
     show(out, json)
 
@@ -96,7 +104,7 @@ def show(folder: SweepFolder, json: Json = False) -> None:
     from potlp_jax.sweep.specification import own_settings
 
     with open_store(folder) as store:
-        results = read_results(store)
+        results, broken = read_results(store), store.broken()
     if json:
         print_json(results.to_dict())
         return
@@ -104,23 +112,36 @@ def show(folder: SweepFolder, json: Json = False) -> None:
         print_cell(console(), cell, results.specification["split"])
     for policy, told in own_settings(results.specification).items():
         console().print(f"settings of {policy}: {told}")
+    for item, error in sorted(broken.items()):
+        console().print(f"given up: {item.policy} in world {item.world} of {item.environment}, {item.task}: {error}")
 
 
-def run_reported(specification: "Specification", folder: Path, processes: int | None) -> None:
+def forget_broken(folder: Path) -> None:
+    """Make the trials of a sweep that were given up missing ones."""
+    from potlp_jax.sweep.runner import RESULTS
+    from potlp_jax.sweep.store import Store
+
+    if (folder / RESULTS).is_file():
+        store = Store(folder / RESULTS)
+        store.forget_broken()
+        store.close()
+
+
+def run_reported(
+    specification: "Specification", folder: Path, processes: int | None, cluster: str | None = None
+) -> None:
     """Run what is missing of a sweep, with progress on stderr.
 
     Args:
         specification: what to run.
         folder: of the store.
-        processes: workers; None: one per core.
+        processes, cluster: where (``engine.opening.open_engine``).
     """
     from potlp_jax.sweep.runner import run_sweep
 
-    # The cores that this process may use, which on a cluster are fewer than the machine has.
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     reporter = _Reporter()
     try:
-        run_sweep(specification, folder, processes or cores, reporter.report)
+        run_sweep(specification, folder, processes, reporter.report, cluster, reporter.begun)
     finally:
         reporter.close()
 
@@ -134,7 +155,14 @@ class _Reporter:
         self._bar = progress_bar()
         self._task: Any = None
 
+    def begun(self, engine: "Engine") -> None:
+        """Say where the work can be looked at, where it can."""
+        page = getattr(engine, "dashboard", None)
+        if page:
+            logger.info(f"Dask's page of the work: {page}")
+
     def report(self, progress: "Progress") -> None:
+        """Where the sweep stands."""
         if self._done_before < 0:
             # A sweep that continues has trials from before, which say nothing about the rate of this run.
             self._done_before = progress.done
@@ -158,7 +186,8 @@ class _Reporter:
         if done < 1:
             return ""
         remaining = (progress.total - progress.done) * seconds / done
-        return f" ({done / seconds:.2f} a second, {_duration(remaining)} remaining)"
+        workers = f"{progress.workers} workers, " if progress.workers != 1 else ""
+        return f" ({workers}{done / seconds:.2f} a second, {_duration(remaining)} remaining)"
 
 
 def _duration(seconds: float) -> str:

@@ -9,12 +9,8 @@ the split, the index of the world and the driver alone.
 """
 
 import dataclasses
-import multiprocessing
-import os
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Literal
 
@@ -23,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int32, PRNGKeyArray, UInt8
 
-from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.checks import AT_LEAST_ONE, require_fields
 from potlp_jax.codec import json_copy
+from potlp_jax.engine.engine import Broken, Engine, Here
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import DatasetError
@@ -38,7 +34,7 @@ from potlp_jax.learning.dataset import (
 )
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.domain import unit_of
-from potlp_jax.learning.estimator import identity_of, named_estimator
+from potlp_jax.learning.estimator import TrainedEstimator, identity_of, named_estimator
 from potlp_jax.learning.questions import HELD_OUT, TaskDistribution
 from potlp_jax.learning.recording import (
     Pose,
@@ -49,6 +45,7 @@ from potlp_jax.learning.recording import (
     recording_metadata,
 )
 from potlp_jax.learning.sample_weights import WeightBounds
+from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.recipes.exploration import Explorer, ExplorerConfig
 from potlp_jax.recipes.policy_drives import policy_drives
@@ -107,14 +104,14 @@ class Collected:
 
 @dataclasses.dataclass(frozen=True)
 class _Job:
-    """One shard to collect; goes to another process."""
+    """What the shards of a collection have in common; goes to other processes and machines."""
 
-    folder: Path
-    shard: int
     generator: Generator
     split: Split
     config: CollectConfig
     metadata: DatasetMetadata
+    # Itself, because another machine may not have its file.
+    estimator: TrainedEstimator | Estimator | None
 
 
 def collection_of(generator: Generator) -> CollectConfig:
@@ -136,7 +133,7 @@ def collect(
     worlds: int,
     folder: Path,
     config: CollectConfig,
-    processes: int = 1,
+    engine: Engine | None = None,
     tell: Callable[[Collected], None] = lambda collected: None,
 ) -> None:
     """Collect what is missing of ``worlds`` worlds of a split, from ``config.first_world`` on.
@@ -148,7 +145,7 @@ def collect(
         worlds: a multiple of ``config.worlds_per_shard``.
         folder: the dataset; may hold a part of it already.
         config: what is recorded.
-        processes: work at the same time, each on a core of its own.
+        engine: does the work; this process by default. It makes the records, and this process writes them.
         tell: called at the start and after every shard.
 
     Raises:
@@ -156,8 +153,6 @@ def collect(
     """
     size = config.worlds_per_shard
     shards = _whole_shards(worlds, size)
-    if processes < 1:
-        raise DatasetError(f"{processes} processes are too few: ask for at least 1")
     # Before anything is made: a collection with other settings must not mix with what is there.
     metadata = dataset_metadata(generator, environment, split, config)
     finished = finished_shards(folder)
@@ -172,11 +167,16 @@ def collect(
     remove_unfinished_files(folder)
     # What is finished stays as it is; a larger number of worlds adds shards.
     missing = [shard for shard in range(shards) if shard not in finished]
-    jobs = [_Job(folder, shard, generator, split, config, metadata) for shard in missing]
-    views, done = 0, worlds - len(jobs) * size
+    estimator = named_estimator(config.estimator) if config.estimator else None
+    job = _Job(generator, split, config, metadata, estimator)
+    views, done = 0, worlds - len(missing) * size
     tell(Collected(done, worlds, views))
-    for count in _run(jobs, processes):
-        views, done = views + count, done + size
+    for shard, found in (engine or Here()).run(_recorded, job, missing):
+        if isinstance(found, Broken):
+            raise DatasetError(f"shard {shard} of {folder} cannot be collected: {found.error}")
+        (recorder,) = found
+        write_shard(folder, shard, recorder.worlds, recorder.views, recorder.samples, metadata)
+        views, done = views + len(recorder.views["view"]), done + size
         tell(Collected(done, worlds, views))
 
 
@@ -222,17 +222,16 @@ def dataset_metadata(generator: Generator, environment: str, split: Split, confi
     )
 
 
-def _collect_shard(job: _Job) -> int:
-    """Collect and write one shard; returns the number of its views."""
+def _recorded(job: _Job, shard: int) -> Iterator[Recorder]:
+    """The rows of one shard."""
     tasks = TaskDistribution(job.generator.propositions, job.config.held_out)
     # The bounds from the metadata: of the family's first world, so that all shards share them.
-    recorder = Recorder(job.shard, job.config, WeightBounds(**job.metadata.weights))
-    first = job.config.first_world + job.shard * job.config.worlds_per_shard
+    recorder = Recorder(shard, job.config, WeightBounds(**job.metadata.weights))
+    first = job.config.first_world + shard * job.config.worlds_per_shard
     for index in range(first, first + job.config.worlds_per_shard):
         world = job.generator.generate(world_key(job.split, index, job.generator.name))
         _collect_world(recorder, world, index, tasks, job)
-    write_shard(job.folder, job.shard, recorder.worlds, recorder.views, recorder.samples, job.metadata)
-    return len(recorder.views["view"])
+    yield recorder
 
 
 def _collect_world(recorder: Recorder, world: World, index: int, tasks: TaskDistribution, job: _Job) -> None:
@@ -250,7 +249,7 @@ def _collect_world(recorder: Recorder, world: World, index: int, tasks: TaskDist
     pursued = pool[: config.pursued if config.driver == "explorer" else config.drives]
     asked = [*pool, *pursued * (len(pool) // len(pursued))]
     recorded = 0
-    drives, count = _drives(world, index, pool, rng, config)
+    drives, count = _drives(world, index, pool, rng, job)
     for number, poses in enumerate(drives, start=1):
         # What the drives before left over is for those that follow.
         most = config.views_per_world * number // count - recorded
@@ -258,15 +257,15 @@ def _collect_world(recorder: Recorder, world: World, index: int, tasks: TaskDist
 
 
 def _drives(
-    world: World, index: int, pool: Sequence[Task], rng: np.random.Generator, config: CollectConfig
+    world: World, index: int, pool: Sequence[Task], rng: np.random.Generator, job: _Job
 ) -> tuple[Iterable[Iterable[Pose]], int]:
     """The drives through a world, and their number."""
+    config = job.config
     if config.driver == "explorer":
         return [Explorer(world, pool[: config.pursued], rng, config.explorer).poses()], 1
     tasks, key = pool[: config.drives], jax.random.fold_in(jax.random.key(config.seed), index)
-    asked = named_estimator(config.estimator) if config.estimator else None
     settings = dataclasses.replace(trial_config_for(world), camera=config.camera, disturbance=config.disturbance)
-    return policy_drives(world, tasks, Policy(config.driver), asked, settings, key), len(tasks)
+    return policy_drives(world, tasks, Policy(config.driver), job.estimator, settings, key), len(tasks)
 
 
 @partial(jax.jit, static_argnames="config")
@@ -274,42 +273,6 @@ def _image(
     world: World, cell: Int32[Array, "2"], key: PRNGKeyArray, config: CollectConfig
 ) -> UInt8[Array, "rows columns 3"]:
     return disturb(render(world, cell, config.camera), key, config.disturbance)
-
-
-def _run(jobs: Sequence[_Job], processes: int) -> Iterator[int]:
-    """Views of each shard as it is done."""
-    if processes == 1:
-        # In this process, where errors have their traceback and a debugger works.
-        yield from map(_collect_shard, jobs)
-        return
-    # XLA's threads do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    cores = context.SimpleQueue()
-    allowed = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [None]
-    # Each worker takes one number when it starts; more workers than cores share them in turn.
-    for index in range(processes):
-        cores.put(allowed[index % len(allowed)])
-    with context.Pool(processes, _start_worker, (cores,)) as pool:
-        yield from pool.imap_unordered(_collect_shard, jobs)
-
-
-def _start_worker(cores) -> None:
-    """A process keeps to one core where the system lets it choose, and ends with its parent however that ends."""
-    core = cores.get()
-    if core is not None:
-        # Before XLA starts, which then uses one thread.
-        os.sched_setaffinity(0, {core})
-    enable_compilation_cache()
-    # A parent that is killed cannot stop its workers, so they watch it.
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        wait([parent.sentinel])
-        # From a thread sys.exit would end the thread alone.
-        os._exit(1)
 
 
 def summary(samples: Samples) -> str:

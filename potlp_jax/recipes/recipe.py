@@ -22,6 +22,7 @@ from pathlib import Path
 
 from potlp_jax.checks import POSITIVE, require_fields
 from potlp_jax.codec import read_settings, settings_file, with_settings
+from potlp_jax.engine.opening import open_engine
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
 from potlp_jax.errors import ConfigurationError
@@ -150,7 +151,8 @@ def recipe_for(environment: str) -> Recipe:
 def follow(
     recipe: Recipe,
     out: Path,
-    processes: int = 1,
+    processes: int | None = 1,
+    cluster: str | None = None,
     tell: Callable[[Split, Collected], None] = lambda split, collected: None,
     display: Display = Display(),
 ) -> Trained:
@@ -161,7 +163,7 @@ def follow(
         out: gets ``training`` and ``validation``, the datasets, and what ``fit`` writes. With rounds these are of the
             last one, and ``round-0`` and so on in it hold those of the stages before. ``times.csv`` says how long each
             step took; who resumes finds a line for each run that ended a step, and none for one that was killed.
-        processes: explore at the same time.
+        processes, cluster: where worlds are explored and driven through (``engine.opening.open_engine``).
         tell: called as worlds are explored.
         display: shows how the fits go.
 
@@ -173,13 +175,14 @@ def follow(
     records: list[Samples] = []
     trained = None
     for number, (folder, stage) in enumerate(zip(folders, _stages(recipe, folders), strict=True)):
-        for part in stage.parts:
-            config = dataclasses.replace(part.config, first_world=part.first)
-            with _timed(out, number, part.name):
+        # Let go of before the fit, which wants all cores and their memory.
+        with open_engine(processes, cluster) as engine:
+            for part in stage.parts:
+                config = dataclasses.replace(part.config, first_world=part.first)
                 into, told = folder / part.name, partial(tell, part.split)
-                collect(
-                    make(part.environment), part.environment, part.split, part.worlds, into, config, processes, told
-                )
+                with _timed(out, number, part.name):
+                    generator = make(part.environment)
+                    collect(generator, part.environment, part.split, part.worlds, into, config, engine, told)
         records += [read_dataset(folder / part.name) for part in stage.parts if part.split == Split.TRAINING]
         validation = read_dataset(folder / Split.VALIDATION.value)
         initial = folders[number - 1] / ESTIMATOR if number else None

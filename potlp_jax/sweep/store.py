@@ -1,10 +1,9 @@
-"""Results of a sweep in one SQLite file: one row a trial, written whole or not at all, shared by several processes.
+"""Results of a sweep in one SQLite file: one row a trial, written whole or not at all.
 
-Work is handed out as claims. A claim belongs to a process. It is void once that process is gone or, of another host,
-once it is ``LEASE`` seconds old. So what a killed process had begun is begun again by another, and two processes on one
-store do not run the same trial. If two should run the same trial nevertheless, the first row stays.
+One process writes; others may read meanwhile. A trial that is run twice, as after a worker was lost, must give the same
+row: the first one stays, and another one is refused.
 
-Everything but claims carries a checksum, so that what a disk or a program has changed is not taken for a result.
+Everything carries a checksum, so that what a disk or a program has changed is not taken for a result.
 Whatever SQLite raises becomes one ``StoreError`` that says what to do.
 """
 
@@ -12,14 +11,10 @@ import contextlib
 import dataclasses
 import errno
 import hashlib
-import itertools
 import json
-import os
 import shutil
-import socket
 import sqlite3
 import tempfile
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,11 +24,7 @@ from potlp_jax.errors import StoreError
 from potlp_jax.files import one_line, short
 
 # Counts up whenever the tables change; a store of another format is refused, not converted.
-FORMAT = "potlp-sweep-4"
-
-# Ten minutes: trials take seconds, so that only a worker that is gone holds a claim so long.
-LEASE: float = 600.0
-"""Seconds after which a claim of another host is void."""
+FORMAT = "potlp-sweep-5"
 
 PATIENCE: float = 60.0
 """Seconds to wait for another process that is writing."""
@@ -92,17 +83,23 @@ CREATE TABLE trials (
     seconds REAL NOT NULL, world_digest TEXT NOT NULL, checksum TEXT NOT NULL,
     PRIMARY KEY (environment, task, policy, world)
 ) WITHOUT ROWID;
-CREATE TABLE claims (
+CREATE TABLE broken (
     environment TEXT NOT NULL, task TEXT NOT NULL, policy TEXT NOT NULL, world INTEGER NOT NULL,
-    host TEXT NOT NULL, process INTEGER NOT NULL, started REAL NOT NULL, claimed REAL NOT NULL,
-    PRIMARY KEY (environment, task, policy, world)
+    error TEXT NOT NULL, checksum TEXT NOT NULL, PRIMARY KEY (environment, task, policy, world)
 ) WITHOUT ROWID;
 """
 
 
+# "commit" is a word of SQL, so that names of columns are quoted.
+_COLUMNS = ", ".join(
+    ["environment", "task", "policy", "world"]
+    + [f'"{field.name}"' for field in dataclasses.fields(Row) if field.name != "item"]
+)
+"""Of a trial, in the order of the fields of ``Item`` and ``Row``."""
+
 # All four, so that SQLite looks the row up by the primary key instead of reading the table.
 _THE_ITEM = "environment = ? AND task = ? AND policy = ? AND world = ?"
-"""Condition on the primary key of a trial or a claim."""
+"""Condition on the primary key of a trial."""
 
 
 class Store:
@@ -257,7 +254,7 @@ class Store:
             )
 
     def set_possible(self, environment: str, task: str, possible: Mapping[int, bool]) -> None:
-        """Write down in which worlds a task is possible, and give up the claims on finding out.
+        """Write down in which worlds a task is possible.
 
         Args:
             environment: of the cell.
@@ -265,11 +262,10 @@ class Store:
             possible: by the number of the world.
         """
         with self._transaction():
-            # Two processes find the same, so that the first answer may stay.
+            # What is there is the same: it was found twice.
             for world, is_possible in possible.items():
                 values = (environment, task, world, int(is_possible))
                 self._execute("INSERT OR IGNORE INTO worlds VALUES (?, ?, ?, ?, ?)", (*values, _checksum(*values)))
-                self._give_up(Item(environment, task, POSSIBLE, world))
 
     def possible(self, environment: str, task: str) -> dict[int, bool]:
         """In which worlds a task is possible, of those that were looked at, by number."""
@@ -281,33 +277,55 @@ class Store:
             self._check(checksum, f"what is known of world {world}", environment, task, world, possible)
         return {world: bool(possible) for world, possible, _ in rows}
 
-    def claim(self, items: Sequence[Item], count: int) -> list[Item]:
-        """Up to ``count`` of the items, in their order, that have no row and that no living process has claimed."""
-        with self._transaction():
-            # Lazily, up to as many as are wanted: each question reads the store, which may hold 10,000s of rows.
-            free = list(itertools.islice(filter(self._is_free, items), count))
-            now = time.time()
-            for item in free:
-                owner = (socket.gethostname(), os.getpid(), process_start(os.getpid()), now)
-                self._execute("INSERT OR REPLACE INTO claims VALUES (?, ?, ?, ?, ?, ?, ?, ?)", (*_key(item), *owner))
-        return free
-
     def finish(self, rows: Iterable[Row]) -> None:
-        """Write rows and give up their claims, all or nothing. A row that is there stays."""
+        """Write rows, all or nothing. Raises StoreError where a trial has a row already that says something else."""
         with self._transaction():
             # Columns are in the order of the fields of `Row`, after those of `Item`.
             for row in rows:
                 values = [*_key(row.item), *_values(row)]
                 marks = ", ".join("?" * (len(values) + 1))
                 self._execute(f"INSERT OR IGNORE INTO trials VALUES ({marks})", (*values, _checksum(*values)))
-                self._give_up(row.item)
+                if self._execute("SELECT changes()") == [(0,)]:
+                    self._require_same(row)
+
+    def _require_same(self, row: Row) -> None:
+        """Raises StoreError where a trial was run twice with different results."""
+        (there,) = self._execute(f"SELECT {_COLUMNS} FROM trials WHERE {_THE_ITEM}", _key(row.item))
+        # As SQLite gives it back, numbers of the same kind.
+        one, other = (_result(_row(entry)) for entry in (there, (*_key(row.item), *_values(row))))
+        if one != other:
+            names = ", ".join(differences(one, other))
+            raise StoreError(
+                f"{self.file}: {row.item.policy} in world {row.item.world} was run twice with different results "
+                f"({names}): its workers have other versions, or other processors"
+            )
+
+    def set_broken(self, item: Item, error: str) -> None:
+        """Write down that a trial was given up, and why."""
+        values = (*_key(item), error)
+        with self._transaction():
+            self._execute("INSERT OR REPLACE INTO broken VALUES (?, ?, ?, ?, ?, ?)", (*values, _checksum(*values)))
+
+    def forget_broken(self) -> None:
+        """Begin again what was given up."""
+        with self._transaction():
+            self._execute("DELETE FROM broken")
+
+    def broken(self) -> dict[Item, str]:
+        """The trials that were given up, each with its error."""
+        rows = self._execute("SELECT environment, task, policy, world, error, checksum FROM broken")
+        for *values, checksum in rows:
+            self._check(checksum, f"what is known of {values[2]} in world {values[3]}", *values)
+        return {Item(*values[:4]): error for *values, error, _ in rows}
+
+    def items(self) -> set[Item]:
+        """The trials that have rows."""
+        return {Item(*values) for values in self._execute("SELECT environment, task, policy, world FROM trials")}
 
     def rows(self, environment: str | None = None, task: str | None = None) -> list[Row]:
         """Finished trials of an environment and task (None: of all), ordered by environment, task, policy, world."""
-        # "commit" is a word of SQL, so that names of columns are quoted.
-        names = ", ".join(f'"{field.name}"' for field in dataclasses.fields(Row) if field.name != "item")
         found = self._execute(
-            f"SELECT environment, task, policy, world, {names}, checksum FROM trials "
+            f"SELECT {_COLUMNS}, checksum FROM trials "
             "WHERE environment = coalesce(?, environment) AND task = coalesce(?, task) "
             "ORDER BY environment, task, policy, world",
             (environment, task),
@@ -317,25 +335,9 @@ class Store:
             self._check(checksum, f"the row of {policy} in world {world}", *values)
         return [_row(entry[:-1]) for entry in found]
 
-    def _give_up(self, item: Item) -> None:
-        self._execute(f"DELETE FROM claims WHERE {_THE_ITEM}", _key(item))
-
     def count(self) -> int:
         """Finished trials."""
         return self._execute("SELECT count(*) FROM trials")[0][0]
-
-    def _is_free(self, item: Item) -> bool:
-        """Whether the item is neither finished nor claimed: looked up by itself, however large the store has grown."""
-        if item.policy == POSSIBLE:
-            finished = "SELECT 1 FROM worlds WHERE environment = ? AND task = ? AND world = ?"
-            values = (item.environment, item.task, item.world)
-        else:
-            finished = f"SELECT 1 FROM trials WHERE {_THE_ITEM}"
-            values = _key(item)
-        if self._execute(finished, values):
-            return False
-        claim = f"SELECT host, process, started, claimed FROM claims WHERE {_THE_ITEM}"
-        return not any(_alive(*owner) for owner in self._execute(claim, _key(item)))
 
 
 def _key(item: Item) -> tuple[str, str, str, int]:
@@ -393,35 +395,9 @@ def _row(entry: tuple[Any, ...]) -> Row:
     return Row(item=Item(*entry[:4]), **values)
 
 
-def _alive(host: str, process: int, started: float, claimed: float) -> bool:
-    """Whether the owner of a claim still works on it."""
-    # Processes of another host cannot be seen, so that only the age of their claims counts.
-    if host == socket.gethostname():
-        return process_start(process) == started
-    return time.time() - claimed < LEASE
-
-
-def process_start(process: int) -> float | None:
-    """When a process of this host was started, in the system's own units; None where there is none.
-
-    The system uses the number of a process again after a while, but not with the same start. Where the system does not
-    report starts, 0 stands for any.
-    """
-    if not Path("/proc/self/stat").exists():
-        try:
-            os.kill(process, 0)
-        except ProcessLookupError:
-            return None
-        except PermissionError:
-            return 0.0
-        return 0.0
-    try:
-        stat = Path(f"/proc/{process}/stat").read_text()
-    except FileNotFoundError:
-        return None
-    # Fields of /proc/PID/stat: number, name in brackets (which may hold anything), state, and as the 22nd the start.
-    state, *fields = stat.rpartition(")")[2].split()
-    return None if state == "Z" else float(fields[18])
+def _result(row: Row) -> dict[str, Any]:
+    """What must be the same however often a trial is run."""
+    return {name: value for name, value in json_copy(dataclasses.asdict(row)).items() if name != "seconds"}
 
 
 def _is_longer(given: Any, written: Any) -> bool:

@@ -1,0 +1,60 @@
+"""The end of a sweep that is asked to end (SIGTERM): soon, and with nothing lost."""
+
+import contextlib
+import logging
+import os
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from typing import NoReturn
+
+logger = logging.getLogger(__name__)
+
+KEPT: str = "what is finished is kept: the same command goes on"
+"""What messages say about rows."""
+
+# With the reading of the store and the end of the process that is less than two seconds.
+_GRACE: float = 1.0
+"""Seconds between asking a process to end and ending it."""
+
+
+@contextlib.contextmanager
+def ending_when_asked() -> Iterator[None]:
+    """End the block by SIGTERM as by an error, so that it can tidy up, and the process soon, whatever it does.
+
+    Python runs a handler between its own steps alone, and compiling a program may be one step of a minute. So a thread
+    ends the process if the handler has not done so in time: nothing is lost, as rows are written as they end.
+    """
+    # Elsewhere than in the main thread no handler can be set, and whoever runs it has an own way to end it.
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    ended = threading.Event()
+    thread = threading.Thread(target=_end_late, args=(reader, ended), daemon=True)
+    before_fd, before = signal.set_wakeup_fd(writer.fileno()), signal.signal(signal.SIGTERM, _end)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        signal.set_wakeup_fd(before_fd)
+        signal.signal(signal.SIGTERM, before)
+        writer.close()
+        thread.join()
+        reader.close()
+
+
+def _end(number: int, frame: object) -> NoReturn:
+    logger.warning(f"ended by {signal.Signals(number).name}; {KEPT}")
+    # What a shell reports of a process that a signal has ended.
+    raise SystemExit(128 + number)
+
+
+def _end_late(reader: socket.socket, ended: threading.Event) -> None:
+    """Wait for SIGTERM, and end the process if nothing else has a while after it. Ends when the other side closes."""
+    while signals := reader.recv(1):
+        if signals[0] == signal.SIGTERM and not ended.wait(_GRACE):
+            os._exit(128 + signal.SIGTERM)

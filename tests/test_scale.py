@@ -1,0 +1,55 @@
+"""``eval.scale``: what is measured of the engine and of the store."""
+
+import sys
+import time
+
+import pytest
+
+from eval.scale.disturbed import Kept, require_same, rows_of
+from eval.scale.overhead import efficiency, row, store_of
+from potlp_jax.sweep.runner import RESULTS
+from potlp_jax.sweep.store import Store
+
+
+def test_efficiency_counts_what_workers_sleep_of_all_their_time():
+    found = efficiency(workers=3, seconds=0.05, each=4)
+    assert (found["workers"], found["units"]) == (3, 12)
+    assert found["wall"] >= 4 * 0.05
+    assert found["efficiency"] == pytest.approx(12 * 0.05 / (3 * found["wall"]))
+
+
+def test_a_store_is_measured_with_all_its_rows():
+    found = store_of(100, per_commit=32)
+    assert found["rows"] == 100
+    assert found["bytes_a_row"] > 300
+    assert all(value > 0 for value in found.values())
+
+
+def test_rows_that_are_lost_or_differ_are_noticed(tmp_path):
+    store = Store(tmp_path / RESULTS)
+    store.finish([row(number) for number in range(4)])
+    store.close()
+    whole = rows_of(tmp_path)
+    assert len(whole) == 4
+    require_same(whole, dict(whole), tmp_path)
+    first, *rest = whole
+    with pytest.raises(AssertionError, match="1 rows lost"):
+        require_same({item: whole[item] for item in rest}, whole, tmp_path)
+    with pytest.raises(AssertionError, match="rows differ"):
+        require_same({**whole, first: whole[rest[0]]}, whole, tmp_path)
+
+
+def test_what_is_kept_is_begun_again_when_it_was_killed():
+    kept = Kept(sys.executable, "-c", "import time; time.sleep(60)", pause=0.0)
+    try:
+        first = kept.process
+        kept.look()
+        assert kept.process is first
+        kept.kill()
+        kept.look()
+        time.sleep(0.05)
+        assert kept.process is not first
+        assert kept.process is not None
+        assert kept.process.poll() is None
+    finally:
+        kept.kill()
