@@ -41,6 +41,9 @@ KNOWN_PROGRAMS = {
     "pyright",
     "pytest",
     "python",
+    "apt-get",
+    "export",
+    "local_slurm.sh",
     ".",
 }
 FOLDERS = ("docs", "eval", "tests", "notebooks", "examples", "potlp_jax")

@@ -160,7 +160,7 @@ def test_a_scheduler_that_is_killed_and_comes_back_loses_nothing(tmp_path, caplo
         stack.enter_context(_begun(*worker))
         found |= dict(results)
     assert found == {unit: [unit * unit] for unit in range(20)}
-    assert "they begin again" in caplog.text
+    assert "was lost; what it had been given begins again" in caplog.text
 
 
 @pytest.mark.parametrize(

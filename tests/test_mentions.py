@@ -22,7 +22,13 @@ from tests.reference.command_line import all_commands
 from tests.reference.mentions import ROOT, found, known_options, parse_module, parse_potlp, texts, words_of
 
 FOLDERS = "docs|eval|tests|examples|notebooks|train|potlp_jax"
-OTHERS = {"pip": {"--no-deps"}, "git": {"--porcelain"}, "CSS": {"--faint"}}
+OTHERS = {
+    "pip": {"--no-deps"},
+    "git": {"--porcelain"},
+    "CSS": {"--faint"},
+    "dask": {"--nthreads", "--host", "--port", "--no-dashboard", "--no-nanny", "--death-timeout"},
+    "Slurm": {"--noheader", "--format", "--full", "--signal", "--user"},
+}
 """Options in our texts that are of others; those of the browser that draws pictures stand in one file of their own."""
 MADE = {
     "contributing.md": "docs/site_hooks.py",

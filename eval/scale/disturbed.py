@@ -24,8 +24,8 @@ SPECIFICATION = {"environments": ["toy"], "tasks": [1, 2], "policies": ["optimis
 class Kept:
     """A process that is begun again whenever it has ended, as a batch system or a service manager does."""
 
-    def __init__(self, *words: str, pause: float = 0.5) -> None:
-        self._words, self._pause, self._since = words, pause, 0.0
+    def __init__(self, *words: str, pause: float = 0.5, log: Path = Path(os.devnull)) -> None:
+        self._words, self._pause, self._log = words, pause, log
         self.process: subprocess.Popen[bytes] | None = None
         self.look()
 
@@ -34,7 +34,12 @@ class Kept:
         if self.process is None or self.process.poll() is not None:
             # A supervisor waits a little, too.
             time.sleep(self._pause if self.process else 0.0)
-            self.process = subprocess.Popen(self._words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            with self._log.open("a") as log:
+                self.process = subprocess.Popen(self._words, stdout=subprocess.DEVNULL, stderr=log)
+
+    def last_words(self) -> str:
+        """The end of what it wrote."""
+        return self._log.read_text(encoding="utf-8", errors="replace")[-500:]
 
     def kill(self) -> None:
         """The process, and whatever it has spawned."""
@@ -111,7 +116,8 @@ def on_a_scheduler(out: Path, kills: Mapping[str, int], workers: int = 4, seed: 
     with cluster(workers) as (address, scheduler, members):
         while left:
             folder = out / f"disturbed-{sweeps}"
-            driver = Kept(*SWEEP_COMMAND, str(file), "--out", str(folder), "--cluster", address, "--json")
+            command = (*SWEEP_COMMAND, str(file), "--out", str(folder), "--cluster", address, "--json")
+            driver = Kept(*command, log=out / "driver.log")
             try:
                 _disturb(driver, scheduler, members, left, draw)
             finally:
@@ -162,7 +168,7 @@ def _disturb(driver: Kept, scheduler: Kept, members: list[Kept], left: list[str]
     """Kill until the sweep has ended by itself; what was killed is begun again."""
     while driver.process is not None and (code := driver.process.poll()) != 0:
         if code is not None and code != -signal.SIGKILL:
-            raise AssertionError(f"the sweep ended with code {code}")
+            raise AssertionError(f"the sweep ended with code {code}: {driver.last_words()}")
         for member in (scheduler, *members, driver):
             member.look()
         if left:

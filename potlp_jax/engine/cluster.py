@@ -46,6 +46,9 @@ ANSWER: float = 10.0
 # Seconds that workers have to end.
 _GRACE = 1.0
 
+LOST: tuple[type[BaseException], ...] = (OSError, TimeoutError, FutureCancelledError)
+"""What Dask raises where a scheduler does not answer any more, or has forgotten what it was asked."""
+
 SETTINGS: Mapping[str, Any] = MappingProxyType(
     {
         # An XLA compilation may hold the interpreter for as long; a worker that is silent for longer is reported.
@@ -65,27 +68,31 @@ class DaskEngine:
     """Units go to the workers of a Dask cluster.
 
     Args:
-        connect: gives the address of a scheduler, or a cluster of one's own; asked again where a scheduler was lost.
+        where: the address of a scheduler, or a cluster that ends with the engine.
         cores: of this machine, one for each worker by its number; none where the workers are elsewhere.
+
+    Raises:
+        EngineError: no scheduler answers.
     """
 
     def __init__(self, where: str | Cluster, cores: tuple[int, ...] = ()) -> None:
         self._where, self._cores = where, cores
-        self._client = self._connected()
         self._known: frozenset[str] = frozenset()
         self._looked = -math.inf
+        self.client = self._connected()
+        """Connected, as far as is known."""
+        self.look_after_workers()
 
     @property
     def workers(self) -> int:
-        """Those that the scheduler knows, as of a moment ago."""
-        self._look_after_workers()
+        """Those that the scheduler knew a moment ago."""
         return len(self._known)
 
     @property
     def dashboard(self) -> str | None:
         """The address of Dask's own page; None where there is none."""
         # A scheduler without bokeh answers there too, with the advice to install it.
-        return self._client.dashboard_link if self._client.run_on_scheduler(_has_page) else None
+        return self.client.dashboard_link if self.client.run_on_scheduler(_has_page) else None
 
     def run(
         self, work: Callable[[Shared, Unit], Iterable[Result]], shared: Shared, units: Iterable[Unit]
@@ -111,69 +118,59 @@ class DaskEngine:
     def close(self) -> None:
         """End the workers that were begun here; those of a scheduler that was there stay."""
         with contextlib.suppress(Exception):
-            self._client.close(timeout=_GRACE)
+            self.client.close(timeout=_GRACE)
         if isinstance(self._where, Cluster):
             with contextlib.suppress(Exception):
                 self._where.close(timeout=_GRACE)
 
-    @property
-    def client(self) -> distributed.Client:
-        """Connected, as far as is known."""
-        return self._client
-
-    def is_connected(self) -> bool:
-        """Whether the scheduler is there."""
-        return self._client.status == "running"
-
     def reconnect(self) -> None:
-        """Wait for the scheduler to come back. Raises EngineError where it does not, or was one of this process."""
+        """Wait for a scheduler that was lost. Raises EngineError where it stays away, or was one of this process."""
         if isinstance(self._where, Cluster):
             raise EngineError("Dask's scheduler in this process has ended: give the same command again")
-        logger.warning(f"the scheduler at {self._where} does not answer; waiting for it for {_PATIENCE:g} s")
-        with contextlib.suppress(Exception):
-            self._client.close(timeout=_GRACE)
+        logger.warning(f"the scheduler at {self._where} was lost; what it had been given begins again")
         until = time.monotonic() + _PATIENCE
         while True:
+            with contextlib.suppress(Exception):
+                self.client.close(timeout=_GRACE)
             try:
-                self._client = self._connected()
-            except EngineError:
+                self.client = self._connected()
+                self._await_worker()
+            except (EngineError, *LOST):
                 if time.monotonic() > until:
                     raise
                 time.sleep(_LOOK)
             else:
-                self._await_worker()
                 return
+
+    def prepare(self, shared: Any, deaths: int) -> None:
+        """Tell workers, also those that come later, what units share, and the scheduler when a unit is given up."""
+        self.client.run_on_scheduler(_give_up_after, deaths)
+        self.client.register_plugin(_Prepared(self._cores, shared), name=_Prepared.name)
+
+    def look_after_workers(self) -> None:
+        """Ask who is there, not too often, and say who is gone."""
+        now = time.monotonic()
+        if now - self._looked < _LOOK:
+            return
+        self._looked, before = now, self._known
+        self._known = frozenset(self.client.scheduler_info(n_workers=-1)["workers"])
+        if lost := len(before - self._known):
+            logger.warning(f"{lost} of {len(before)} workers ended; what they had begun begins again elsewhere")
 
     def _connected(self) -> distributed.Client:
         try:
             with dask.config.set(SETTINGS):
-                client = distributed.Client(self._where, timeout=ANSWER, set_as_default=False)
-        except (OSError, TimeoutError) as error:
+                return distributed.Client(self._where, timeout=ANSWER, set_as_default=False)
+        except LOST as error:
             raise EngineError(
                 f"no Dask scheduler answers at {self._where} ({error}): start one with `dask scheduler`, and workers "
                 "with `dask worker --nthreads 1`"
             ) from error
-        return client
-
-    def prepare(self, shared: Any, deaths: int) -> None:
-        """Tell workers, also those that come later, what units share, and the scheduler when a unit is given up."""
-        self._client.run_on_scheduler(_give_up_after, deaths)
-        self._client.register_plugin(_Prepared(self._cores, shared), name=_Prepared.name)
-
-    def _look_after_workers(self) -> None:
-        """Ask who is there, and say who is gone."""
-        now = time.monotonic()
-        if now - self._looked < _LOOK or not self.is_connected():
-            return
-        self._looked, before = now, self._known
-        self._known = frozenset(self._client.scheduler_info(n_workers=-1)["workers"])
-        if lost := len(before - self._known):
-            logger.warning(f"{lost} of {len(before)} workers ended; what they had begun begins again elsewhere")
 
     def _await_worker(self) -> None:
         """Raises EngineError where no worker comes."""
         try:
-            self._client.wait_for_workers(1, timeout=_PATIENCE)
+            self.client.wait_for_workers(1, timeout=_PATIENCE)
         except TimeoutError as error:
             raise EngineError(f"no worker came within {_PATIENCE:g} s: look at what the cluster says of it") from error
 
@@ -185,19 +182,31 @@ class _Running:
         self._engine, self._work, self._shared = engine, work, shared
         self._reports: queue.SimpleQueue[distributed.Future] = queue.SimpleQueue()
         self._units: dict[distributed.Future, Any] = {}
-        self._deaths = 0
+        self._again: list[Any] = []
 
     def through(self, remaining: Iterator[Any], together: bool) -> Iterator[tuple[Any, list[Any] | Broken]]:
         """All that remain, several at a time or each alone: given up at the last death, or before it."""
-        self._deaths = MOST_KILLED - 1 if together else 1
-        self._engine.prepare(self._shared, self._deaths)
+        prepared = False
         while True:
-            most = _AHEAD * max(self._engine.workers, 1) if together else 1
-            while len(self._units) < most and (found := list(itertools.islice(remaining, 1))):
-                self._submit(found[0])
-            if not self._units:
-                return
-            yield from self._ended()
+            try:
+                if not prepared:
+                    self._engine.prepare(self._shared, MOST_KILLED - 1 if together else 1)
+                    prepared = True
+                self._engine.look_after_workers()
+                self._fill(remaining, _AHEAD * max(self._engine.workers, 1) if together else 1)
+                if not self._units:
+                    return
+                ended = self._ended()
+            # The scheduler was lost, in whatever was asked of it.
+            except LOST:
+                self._begin_again()
+                prepared = False
+                continue
+            if ended is not None:
+                unit, found = ended
+                if isinstance(found, BaseException):
+                    raise found
+                yield unit, found
 
     def cancel(self) -> None:
         """Nobody waits for the rest."""
@@ -205,52 +214,48 @@ class _Running:
             self._engine.client.cancel(list(self._units), force=True)
         self._units.clear()
 
-    def _ended(self) -> Iterator[tuple[Any, list[Any] | Broken]]:
-        """What has ended, at least after a while."""
+    def _fill(self, remaining: Iterator[Any], most: int) -> None:
+        """Hand out units until there are so many."""
+        while len(self._units) < most:
+            # What was lost first.
+            if not self._again:
+                self._again += itertools.islice(remaining, 1)
+            if not self._again:
+                return
+            # Not pure to Dask, which would otherwise give a unit that comes again its old result.
+            future = self._engine.client.submit(_done, self._work, self._again[-1], pure=False)
+            self._units[future] = self._again.pop()
+            future.add_done_callback(self._reports.put)
+
+    def _ended(self) -> tuple[Any, list[Any] | Broken | BaseException] | None:
+        """A unit that has ended; None where none has for a while."""
         try:
             future = self._reports.get(timeout=_LOOK)
         except queue.Empty:
-            self._look_after_the_lost()
-            return
+            if any(future.status in ("cancelled", "lost") for future in self._units):
+                raise ConnectionError("units were forgotten") from None
+            return None
         # Reported by a scheduler that is gone: begun again already.
         if future not in self._units:
-            return
+            return None
         if future.status == "finished":
-            # The bytes travel only now, and worker or scheduler may be lost meanwhile: then it is begun again.
-            with contextlib.suppress(FutureCancelledError, OSError):
-                results = future.result()
-                yield self._units.pop(future), results
-        elif future.status == "error":
-            # Dask's types know of the asynchronous method alone.
-            error: Any = future.exception()
-            unit = self._units.pop(future)
-            if isinstance(error, _UnpreparedError):
-                # By a scheduler that has come back.
-                self._engine.prepare(self._shared, self._deaths)
-                self._submit(unit)
-            elif isinstance(error, KilledWorker):
-                yield unit, Broken(f"{MOST_KILLED} workers that began it died")
-            else:
-                raise error
+            # The bytes travel only now; until they are here the unit counts as begun.
+            results = future.result()
+            return self._units.pop(future), results
+        if future.status != "error":
+            raise ConnectionError("a unit was forgotten")
+        # Dask's types know of the asynchronous method alone.
+        error: Any = future.exception()
+        if isinstance(error, _UnpreparedError):
+            raise ConnectionError("the scheduler has come back without what it was told")
+        unit = self._units.pop(future)
+        return unit, Broken(f"{MOST_KILLED} workers that began it died") if isinstance(error, KilledWorker) else error
 
-    def _submit(self, unit: Any) -> None:
-        # Not pure to Dask, which would otherwise give a unit that comes again its old result.
-        future = self._engine.client.submit(_done, self._work, unit, pure=False)
-        self._units[future] = unit
-        future.add_done_callback(self._reports.put)
-
-    def _look_after_the_lost(self) -> None:
-        """Hand out again what a scheduler has forgotten."""
-        if not self._engine.is_connected():
-            self._engine.reconnect()
-            gone = list(self._units)
-        else:
-            gone = [future for future in self._units if future.status in ("cancelled", "lost")]
-        if gone:
-            logger.warning(f"the scheduler was lost, or has forgotten {len(gone)} units; they begin again")
-            self._engine.prepare(self._shared, self._deaths)
-        for future in gone:
-            self._submit(self._units.pop(future))
+    def _begin_again(self) -> None:
+        """Everything that a scheduler had which was lost."""
+        self._engine.reconnect()
+        self._again += self._units.values()
+        self._units.clear()
 
 
 class _UnpreparedError(Exception):
