@@ -38,7 +38,7 @@ def main() -> None:
     parser.add_argument("--workers-killed", type=int, default=200)
     parser.add_argument("--drivers-killed", type=int, default=20)
     parser.add_argument("--schedulers-killed", type=int, default=5)
-    parser.add_argument("--jobs-killed", type=int, default=20)
+    parser.add_argument("--jobs-killed", type=int, default=10)
     parser.add_argument("--out", type=Path, default=Path("out/scale"))
     parser.add_argument("--report", type=Path, help="NAME of NAME.json")
     options = parser.parse_args()

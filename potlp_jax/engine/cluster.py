@@ -238,18 +238,23 @@ class _Running:
         # Reported by a scheduler that is gone: begun again already.
         if future not in self._units:
             return None
-        if future.status == "finished":
-            # The bytes travel only now; until they are here the unit counts as begun.
-            results = future.result()
-            return self._units.pop(future), results
-        if future.status != "error":
+        if future.status not in ("finished", "error"):
             raise ConnectionError("a unit was forgotten")
-        # Dask's types know of the asynchronous method alone.
-        error: Any = future.exception()
-        if isinstance(error, _UnpreparedError):
-            raise ConnectionError("the scheduler has come back without what it was told")
-        unit = self._units.pop(future)
-        return unit, Broken(f"{MOST_KILLED} workers that began it died") if isinstance(error, KilledWorker) else error
+        # The bytes travel only now; until they are here the unit counts as begun.
+        found: list[Any] | Broken | BaseException
+        try:
+            found = future.result()
+        except KilledWorker:
+            found = Broken(f"{MOST_KILLED} workers that began it died")
+        except (_UnpreparedError, *LOST) as error:
+            # Whether an error is the unit's or the cluster's is known by where it comes from.
+            if future.status == "error" and not isinstance(error, _UnpreparedError):
+                found = error
+            else:
+                raise ConnectionError("a unit was forgotten, or its scheduler what it was told") from error
+        except Exception as error:
+            found = error
+        return self._units.pop(future), found
 
     def _begin_again(self) -> None:
         """Everything that a scheduler had which was lost."""
