@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -161,6 +162,22 @@ def test_a_scheduler_that_is_killed_and_comes_back_loses_nothing(tmp_path, caplo
         found |= dict(results)
     assert found == {unit: [unit * unit] for unit in range(20)}
     assert "was lost; what it had been given begins again" in caplog.text
+
+
+def test_a_cluster_without_workers_is_waited_for_with_a_note(tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr("potlp_jax.engine.cluster._REMINDER", 0.5)
+    address = f"tcp://127.0.0.1:{(port := _free_port())}"
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(_begun("dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"))
+        engine = stack.enter_context(open_engine(cluster=address))
+        assert engine.workers == 0
+
+        worker = "dask_worker", address, "--nthreads", "1", "--no-dashboard"
+        later = threading.Timer(3.0, lambda: stack.enter_context(_begun(*worker)))
+        later.start()
+        assert list(engine.run(squares, 0, [3])) == [(3, [9, 10])]
+        later.join()
+    assert "no worker is there; waiting for one" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -146,7 +146,9 @@ def on_a_batch_system(out: Path, where: str, kills: int, seed: int = 0) -> dict[
     while left:
         folder = out / f"batch-{sweeps}"
         command = [*SWEEP_COMMAND, str(file), "--out", str(folder), "--cluster", where, "--json"]
-        driver = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        log = out / "driver.log"
+        with log.open("a") as errors:
+            driver = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors)
         since: dict[int, float] = {}
         while driver.poll() is None:
             time.sleep(draw.expovariate(1 / 2.0))
@@ -157,7 +159,7 @@ def on_a_batch_system(out: Path, where: str, kills: int, seed: int = 0) -> dict[
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(draw.choice(settled), signal.SIGKILL)
                     left -= 1
-        assert driver.returncode == 0, f"the sweep ended with code {driver.returncode}"
+        assert driver.returncode == 0, f"the sweep ended with code {driver.returncode}: {log.read_text()[-500:]}"
         require_same(rows_of(folder), whole, folder)
         sweeps += 1
     return {"cluster": where, "kills": kills, "sweeps": sweeps, "rows": len(whole), "lost": 0, "different": 0}

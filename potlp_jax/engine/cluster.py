@@ -38,8 +38,10 @@ logger = logging.getLogger(__name__)
 _AHEAD = 2
 # Seconds between looks at whether scheduler and workers are still there, while nothing is reported.
 _LOOK = 1.0
-# Seconds in which the first worker has to come: batch systems may let jobs wait for hours, and say so themselves.
+# Seconds in which a scheduler that was lost has to come back.
 _PATIENCE = 300.0
+# Seconds between notes that there is no worker.
+_REMINDER = 60.0
 ANSWER: float = 10.0
 """Seconds in which a scheduler has to answer."""
 
@@ -78,7 +80,7 @@ class DaskEngine:
     def __init__(self, where: str | Cluster, cores: tuple[int, ...] = ()) -> None:
         self._where, self._cores = where, cores
         self._known: frozenset[str] = frozenset()
-        self._looked = -math.inf
+        self._looked, self._missed = -math.inf, time.monotonic()
         self.client = self._connected()
         """Connected, as far as is known."""
         self.look_after_workers()
@@ -98,7 +100,6 @@ class DaskEngine:
         self, work: Callable[[Shared, Unit], Iterable[Result]], shared: Shared, units: Iterable[Unit]
     ) -> Iterator[tuple[Unit, list[Result] | Broken]]:
         """Each unit's results when it is done, in whatever order."""
-        self._await_worker()
         running = _Running(self, work, shared)
         suspects: list[Unit] = []
         try:
@@ -134,8 +135,7 @@ class DaskEngine:
                 self.client.close(timeout=_GRACE)
             try:
                 self.client = self._connected()
-                self._await_worker()
-            except (EngineError, *LOST):
+            except EngineError:
                 if time.monotonic() > until:
                     raise
                 time.sleep(_LOOK)
@@ -156,6 +156,12 @@ class DaskEngine:
         self._known = frozenset(self.client.scheduler_info(n_workers=-1)["workers"])
         if lost := len(before - self._known):
             logger.warning(f"{lost} of {len(before)} workers ended; what they had begun begins again elsewhere")
+        # A batch system may let jobs wait for hours, so that this is no error.
+        if self._known:
+            self._missed = now
+        elif now - self._missed >= _REMINDER:
+            self._missed = now
+            logger.warning("no worker is there; waiting for one: look at what the cluster says of them")
 
     def _connected(self) -> distributed.Client:
         try:
@@ -166,13 +172,6 @@ class DaskEngine:
                 f"no Dask scheduler answers at {self._where} ({error}): start one with `dask scheduler`, and workers "
                 "with `dask worker --nthreads 1`"
             ) from error
-
-    def _await_worker(self) -> None:
-        """Raises EngineError where no worker comes."""
-        try:
-            self.client.wait_for_workers(1, timeout=_PATIENCE)
-        except TimeoutError as error:
-            raise EngineError(f"no worker came within {_PATIENCE:g} s: look at what the cluster says of it") from error
 
 
 class _Running:
