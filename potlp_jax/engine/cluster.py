@@ -31,6 +31,7 @@ from distributed.scheduler import KilledWorker
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.engine.engine import MOST_KILLED, Broken, Result, Shared, Unit
 from potlp_jax.errors import EngineError
+from potlp_jax.files import one_line
 
 logger = logging.getLogger(__name__)
 
@@ -124,11 +125,10 @@ class DaskEngine:
             with contextlib.suppress(Exception):
                 self._where.close(timeout=_GRACE)
 
-    def reconnect(self) -> None:
-        """Wait for a scheduler that was lost. Raises EngineError where it stays away, or was one of this process."""
-        if isinstance(self._where, Cluster):
-            raise EngineError("Dask's scheduler in this process has ended: give the same command again")
-        logger.warning(f"the scheduler at {self._where} was lost; what it had been given begins again")
+    def reconnect(self, why: BaseException) -> None:
+        """Wait for a scheduler that was lost. Raises EngineError where it stays away."""
+        told = one_line(why) or type(why).__name__
+        logger.warning(f"the scheduler was lost ({told}); what it had been given begins again")
         until = time.monotonic() + _PATIENCE
         while True:
             with contextlib.suppress(Exception):
@@ -197,8 +197,8 @@ class _Running:
                     return
                 ended = self._ended()
             # The scheduler was lost, in whatever was asked of it.
-            except LOST:
-                self._begin_again()
+            except LOST as error:
+                self._begin_again(error)
                 prepared = False
                 continue
             if ended is not None:
@@ -255,9 +255,9 @@ class _Running:
             found = error
         return self._units.pop(future), found
 
-    def _begin_again(self) -> None:
+    def _begin_again(self, why: BaseException) -> None:
         """Everything that a scheduler had which was lost."""
-        self._engine.reconnect()
+        self._engine.reconnect(why)
         self._again += self._units.values()
         self._units.clear()
 
