@@ -102,6 +102,16 @@ def test_each_worker_keeps_to_a_core(two):
         assert len({tuple(allowed) for allowed in found.values()}) == 2
 
 
+def test_two_who_share_a_scheduler_do_not_share_what_their_units_need(two):
+    one, other = two.run(squares, 100, range(6)), two.run(squares, 200, range(6))
+    found = [next(one)], [next(other)]
+    for results, into in zip((one, other), found, strict=True):
+        into.extend(results)
+    assert [dict(into) for into in found] == [
+        {unit: [shared + unit * unit, shared + unit * unit + 1] for unit in range(6)} for shared in (100, 200)
+    ]
+
+
 def test_what_a_unit_raises_is_raised_here(two):
     with pytest.raises(WorldError, match="no world 5"):
         list(two.run(failing, None, [5]))

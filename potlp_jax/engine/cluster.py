@@ -18,11 +18,11 @@ import queue
 import signal
 import threading
 import time
+import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any
 
-import dask.config
 import distributed
 from distributed.client import FutureCancelledError
 from distributed.deploy.cluster import Cluster
@@ -142,10 +142,10 @@ class DaskEngine:
             else:
                 return
 
-    def prepare(self, shared: Any, deaths: int) -> None:
+    def prepare(self, name: str, shared: Any, deaths: int) -> None:
         """Tell workers, also those that come later, what units share, and the scheduler when a unit is given up."""
         self.client.run_on_scheduler(_give_up_after, deaths)
-        self.client.register_plugin(_Prepared(self._cores, shared), name=_Prepared.name)
+        self.client.register_plugin(_Prepared(name, self._cores, shared))
 
     def look_after_workers(self) -> None:
         """Ask who is there, not too often, and say who is gone."""
@@ -165,8 +165,7 @@ class DaskEngine:
 
     def _connected(self) -> distributed.Client:
         try:
-            with dask.config.set(SETTINGS):
-                return distributed.Client(self._where, timeout=ANSWER, set_as_default=False)
+            return distributed.Client(self._where, timeout=ANSWER, set_as_default=False)
         except LOST as error:
             raise EngineError(
                 f"no Dask scheduler answers at {self._where} ({error}): start one with `dask scheduler`, and workers "
@@ -179,6 +178,8 @@ class _Running:
 
     def __init__(self, engine: DaskEngine, work: Callable[[Any, Any], Iterable[Any]], shared: Any) -> None:
         self._engine, self._work, self._shared = engine, work, shared
+        # Of its own: others may use the same scheduler at the same time, for other work.
+        self._name = f"potlp-{uuid.uuid4().hex}"
         self._reports: queue.SimpleQueue[distributed.Future] = queue.SimpleQueue()
         self._units: dict[distributed.Future, Any] = {}
         self._again: list[Any] = []
@@ -189,7 +190,7 @@ class _Running:
         while True:
             try:
                 if not prepared:
-                    self._engine.prepare(self._shared, MOST_KILLED - 1 if together else 1)
+                    self._engine.prepare(self._name, self._shared, MOST_KILLED - 1 if together else 1)
                     prepared = True
                 self._engine.look_after_workers()
                 self._fill(remaining, _AHEAD * max(self._engine.workers, 1) if together else 1)
@@ -211,6 +212,7 @@ class _Running:
         """Nobody waits for the rest."""
         with contextlib.suppress(Exception):
             self._engine.client.cancel(list(self._units), force=True)
+            self._engine.client.unregister_worker_plugin(self._name)
         self._units.clear()
 
     def _fill(self, remaining: Iterator[Any], most: int) -> None:
@@ -222,7 +224,7 @@ class _Running:
             if not self._again:
                 return
             # Not pure to Dask, which would otherwise give a unit that comes again its old result.
-            future = self._engine.client.submit(_done, self._work, self._again[-1], pure=False)
+            future = self._engine.client.submit(_done, self._work, self._name, self._again[-1], pure=False)
             self._units[future] = self._again.pop()
             future.add_done_callback(self._reports.put)
 
@@ -266,8 +268,8 @@ class _UnpreparedError(Exception):
     """The worker has not been told what units share."""
 
 
-def _done(work: Callable[[Any, Any], Iterable[Any]], unit: Any) -> list[Any]:
-    prepared = distributed.get_worker().plugins.get(_Prepared.name)
+def _done(work: Callable[[Any, Any], Iterable[Any]], name: str, unit: Any) -> list[Any]:
+    prepared = distributed.get_worker().plugins.get(name)
     if not isinstance(prepared, _Prepared):
         raise _UnpreparedError
     return list(work(prepared.shared, unit))
@@ -285,10 +287,8 @@ def _has_page(dask_scheduler: Any) -> bool:
 class _Prepared(distributed.WorkerPlugin):
     """What a worker knows before its first unit."""
 
-    name = "potlp"
-
-    def __init__(self, cores: tuple[int, ...], shared: Any) -> None:
-        self._cores, self.shared = cores, shared
+    def __init__(self, name: str, cores: tuple[int, ...], shared: Any) -> None:
+        self.name, self._cores, self.shared = name, cores, shared
 
     def setup(self, worker: Any) -> None:
         """Keep to one core, and to what was compiled before."""

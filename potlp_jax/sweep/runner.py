@@ -51,6 +51,7 @@ class Sweep:
     def __init__(self, specification: Specification, folder: Path, read_only: bool = False) -> None:
         self.specification = specification
         self.work = Work(specification)
+        self._done = 0
         self.store = Store(folder / RESULTS, read_only)
         facts = {"specification": specification.to_dict(), "estimator": self._estimator_identity()}
         (self.store.compare if read_only else self.store.agree)(facts)
@@ -75,13 +76,15 @@ class Sweep:
         Raises:
             WorldError: a task is impossible in too many worlds in a row.
         """
+        self._done = self.store.count()
         report(self._progress(engine))
         while units := self._worlds_to_examine():
             self._do(engine, units, report)
         self._do(engine, self._missing_trials(engine.workers), report)
 
     def _progress(self, engine: Engine) -> Progress:
-        return Progress(self.store.count(), self.total, engine.workers)
+        # Not counted anew: a large store would be read for every row.
+        return Progress(self._done, self.total, engine.workers)
 
     def _do(self, engine: Engine, units: Iterable[Unit], report: Callable[[Progress], None]) -> None:
         """Do units and write their results. One that is given up is done again item by item, to find out which."""
@@ -109,6 +112,7 @@ class Sweep:
     def _write(self, found: Iterable[Row | Examined]) -> None:
         rows = [result for result in found if isinstance(result, Row)]
         self.store.finish(rows)
+        self._done += len(rows)
         for row in rows:
             logger.debug("world %d, %s: %s at cost %.1f", row.item.world, row.item.policy, row.outcome, row.cost)
         for result in found:
