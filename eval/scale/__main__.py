@@ -22,7 +22,8 @@ def measured(options: argparse.Namespace) -> dict[str, Any]:
     if options.subject == "store":
         return {"runs": [store_of(rows) for rows in (10_000, options.rows)]}
     if options.subject == "slurm":
-        where = "slurm:partition=cpu,walltime=01:00:00,workers=2,memory=2GB"
+        logs = options.out / "jobs"
+        where = f"slurm:partition=cpu,walltime=01:00:00,workers=2,memory=2GB,log_directory={logs}"
         return {"runs": [on_a_batch_system(options.out, where, options.jobs_killed)]}
     kills = {"worker": options.workers_killed, "driver": options.drivers_killed, "scheduler": options.schedulers_killed}
     return {"runs": [on_a_scheduler(options.out, kills)]}
