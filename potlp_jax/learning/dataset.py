@@ -10,6 +10,7 @@ in its schema, under the key ``potlp``. ``docs/dataset.md`` describes the column
 import contextlib
 import dataclasses
 import functools
+import itertools
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -39,6 +40,8 @@ _TEMPORARY = ".tmp"
 # Rows of a file, and bytes, that are read at once.
 _ROWS = 64
 _BUFFER = 1 << 20
+# Samples that are looked at together.
+_SAMPLES = 1 << 18
 
 _REMEDY = "delete all files of the shard and collect or convert it again"
 
@@ -144,8 +147,21 @@ class Samples:
         return self._most_in_a_view(self.cells, self.phi_stay)
 
     def _most_in_a_view(self, *columns: Int32[np.ndarray, "N _"] | Int8[np.ndarray, "N _"]) -> int:
-        distinct = np.unique(np.column_stack([self.view_of, *columns]), axis=0)
-        return int(np.unique(distinct[:, 0], return_counts=True)[1].max(initial=1))
+        most = 1
+        for block in self._blocks():
+            table = np.column_stack([self.view_of[block], *(column[block] for column in columns)])
+            distinct = np.unique(table, axis=0)
+            most = max(most, int(np.unique(distinct[:, 0], return_counts=True)[1].max(initial=1)))
+        return most
+
+    def _blocks(self) -> Iterator[slice]:
+        """All samples in pieces, each view in one of them: a table of all would be as large as memory allows."""
+        count, steps = len(self.view_of), np.diff(self.view_of)
+        # Where samples are not in the order of their views, as collections write them, one piece is the only safe one.
+        starts = np.flatnonzero(steps) + 1 if np.all(steps >= 0) else np.zeros(0, np.int64)
+        first = np.searchsorted(starts, np.arange(_SAMPLES, count, _SAMPLES))
+        cuts = starts[first[first < len(starts)]].tolist()
+        yield from itertools.starmap(slice, itertools.pairwise([0, *dict.fromkeys(cuts), count]))
 
 
 def encode(
