@@ -318,16 +318,18 @@ def test_the_most_that_a_view_is_asked_is_found_in_pieces(tmp_path, monkeypatch,
     _write(tmp_path, [0])
     view_of = draw.integers(0, 40, 400).astype(np.int32)
     read, rows = read_dataset(tmp_path), draw.integers(0, 6, 400)
-    columns = {name: value[rows] for name, value in vars(read).items() if isinstance(value, np.ndarray)}
-    del columns["world_of"]
-    columns |= dict(
-        view_of=np.sort(view_of) if sorted_by_view else view_of,
-        cells=draw.integers(0, 3, (400, 2)).astype(np.int32),
-        phi_stay=draw.integers(-1, 1, (400, 3)).astype(np.int8),
-    )
+    arrays = {name: value for name, value in vars(read).items() if isinstance(value, np.ndarray)}
+    columns = {name: array[rows] for name, array in arrays.items() if name != "world_of"}
+    columns |= {
+        "view_of": np.sort(view_of) if sorted_by_view else view_of,
+        "cells": draw.integers(0, 3, (400, 2)).astype(np.int32),
+        "phi_stay": draw.integers(-1, 1, (400, 3)).astype(np.int8),
+    }
     samples = dataclasses.replace(read, **columns)
     monkeypatch.setattr(dataset, "_SAMPLES", 16)
-    assert len(list(samples._blocks())) == (25 if sorted_by_view else 1)
+    views = [set(samples.view_of[block].tolist()) for block in samples._blocks()]
+    assert (len(views) > 10) == sorted_by_view
+    assert sum(map(len, views)) == len(set.union(*views)) == len(set(view_of.tolist()))
     asked = zip(samples.view_of.tolist(), samples.cells.tolist(), samples.phi_stay.tolist(), strict=True)
     asked = {(view, tuple(cell), tuple(stay)) for view, cell, stay in asked}
     lanes = Counter(view for view, _, _ in asked)
