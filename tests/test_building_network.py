@@ -55,10 +55,21 @@ TRIAL = TrialConfig(
 )
 
 
+# One program each: operation by operation they would be hundreds of small ones.
+_answers = jax.jit(lambda eyes, belief, subgoals, arrays: eyes(belief, subgoals, arrays))
+_encode = jax.jit(BuildingNetwork.encode, static_argnums=0)
+_places = jax.jit(BuildingNetwork.places, static_argnums=0)
+_painted = jax.jit(
+    lambda estimator, world, belief: observe_panorama(
+        estimator, render(world, world.start, CAMERA), belief, world.start
+    )
+)
+
+
 @pytest.fixture(scope="module")
 def params():
     """Parameters of which none is 0, so that everything that enters has an effect."""
-    initial = NETWORK.init(jax.random.key(0))
+    initial = jax.jit(NETWORK.init)(jax.random.key(0))
     leaves, structure = jax.tree.flatten(initial)
     keys = jax.random.split(jax.random.key(1), len(leaves))
     moved = [leaf + 0.05 * jax.random.normal(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
@@ -84,7 +95,7 @@ def _estimator(params, world: World) -> BuildingEstimator:
 def _asked(params, world: World, formula: str = "!hazard U goal"):
     task = Task.from_formula(formula, propositions=NAMES)
     belief = observe(BeliefMap.unobserved(world), world, world.start, SENSOR)
-    eyes = observe_panorama(_estimator(params, world), render(world, world.start, CAMERA), belief, world.start)
+    eyes = _painted(_estimator(params, world), world, belief)
     subgoals = find_subgoals(belief, belief.free, jnp.zeros(world.shape), FrontierConfig(max_subgoals=4))
     return eyes, belief, subgoals, task
 
@@ -94,7 +105,7 @@ def test_worlds_that_look_alike_so_far_get_equal_answers(params):
     for world in (_world(), _world(far_letter=2), _world(far_wall=True)):
         eyes, belief, subgoals, task = _asked(params, world)
         assert int(jnp.sum(subgoals.mask)) > 0
-        answers.append(jax.tree.leaves(jax.jit(eyes.__call__)(belief, subgoals, task.arrays)))
+        answers.append(jax.tree.leaves(_answers(eyes, belief, subgoals, task.arrays)))
     for other in answers[1:]:
         for mine, its in zip(answers[0], other, strict=True):
             np.testing.assert_array_equal(mine, its)
@@ -103,15 +114,21 @@ def test_worlds_that_look_alike_so_far_get_equal_answers(params):
 @pytest.mark.parametrize("formula", ["!hazard U goal", "(!hazard U goal) & F hazard"])
 def test_estimates_are_the_networks_answers_and_padding_cannot_succeed(params, formula):
     eyes, belief, subgoals, task = _asked(params, _world(), formula)
-    found = eyes(belief, subgoals, task.arrays)
-    encoded = NETWORK.encode(params, map_channels(belief, eyes.memory))
-    places = NETWORK.places(params, encoded, subgoals.cells)
-    stay, go = task.arrays.class_phi[:, 0], task.arrays.class_phi[:, 1]
-    # Each pair by itself, where the estimator solves what pairs share once.
-    scene = scenery(belief, jax.tree.map(jax.nn.sigmoid, encoded.squares))
-    beyond = jnp.stack([prospects(outlook(scene, jnp.tile(cell, (len(stay), 1)), stay), go) for cell in subgoals.cells])
-    modulation = NETWORK.modulation(params, stay, go)[None]
-    answers = NETWORK.answer(params, places[:, None], beyond, modulation)
+    found = _answers(eyes, belief, subgoals, task.arrays)
+
+    @jax.jit
+    def one_by_one(belief, memory, subgoals, phi):
+        encoded = NETWORK.encode(params, map_channels(belief, memory))
+        places = NETWORK.places(params, encoded, subgoals.cells)
+        stay, go = phi[:, 0], phi[:, 1]
+        # Each pair by itself, where the estimator solves what pairs share once.
+        scene = scenery(belief, jax.tree.map(jax.nn.sigmoid, encoded.squares))
+        beyond = jax.lax.map(
+            lambda cell: prospects(outlook(scene, jnp.tile(cell, (len(stay), 1)), stay), go), subgoals.cells
+        )
+        return NETWORK.answer(params, places[:, None], beyond, NETWORK.modulation(params, stay, go)[None])
+
+    answers = one_by_one(belief, eyes.memory, subgoals, task.arrays.class_phi)
     real = np.asarray(subgoals.mask)[:, None] & np.asarray(task.arrays.class_mask)[None, :]
     np.testing.assert_allclose(
         np.asarray(found.success_probability)[real], np.asarray(answers.success_probability)[real], atol=1e-6
@@ -127,8 +144,8 @@ def test_answers_depend_on_map_paint_place_what_lies_beyond_and_phi(params):
     eyes, belief, subgoals, task = _asked(params, _world())
 
     def answer(eyes=eyes, belief=belief, cells=subgoals.cells, beyond=0.0, phi=task.arrays.class_phi):
-        encoded = NETWORK.encode(params, map_channels(belief, eyes.memory))
-        places = NETWORK.places(params, encoded, cells)
+        encoded = _encode(NETWORK, params, map_channels(belief, eyes.memory))
+        places = _places(NETWORK, params, encoded, cells)
         modulation = NETWORK.modulation(params, phi[0, 0], phi[0, 1])
         return float(NETWORK.answer(params, places[0], jnp.full(PROSPECTS, beyond), modulation).success_logit)
 
@@ -151,11 +168,11 @@ def test_what_a_network_is_made_without_does_not_enter_its_answers(params, ablat
     unpainted = dataclasses.replace(eyes, memory=blank_painting(*belief.cells.shape))
 
     def answer(network, eyes=eyes, beyond=1.0, moved=0):
-        encoded = network.encode(params, map_channels(belief, eyes.memory))
+        encoded = _encode(network, params, map_channels(belief, eyes.memory))
         # The same squares around another cell.
         features = jax.tree.map(lambda scale: jnp.ones_like(scale), encoded)
-        places = network.places(params, features, subgoals.cells + moved)
-        seen = network.places(params, encoded, subgoals.cells)
+        places = _places(network, params, features, subgoals.cells + moved)
+        seen = _places(network, params, encoded, subgoals.cells)
         modulation = network.modulation(params, task.arrays.class_phi[0, 0], task.arrays.class_phi[0, 1])
         told = jnp.full(PROSPECTS, beyond)
         return [float(network.answer(params, place[0], told, modulation).success_logit) for place in (places, seen)]
@@ -172,37 +189,37 @@ def test_a_map_is_not_confused_with_its_painting(params):
     eyes, belief, _, _ = _asked(params, _world())
     lacking = BuildingNetwork(dataclasses.replace(CONFIG, without=("painting",)))
     channels = map_channels(belief, eyes.memory)
-    whole = lacking.encode(params, channels).whole
+    whole = _encode(lacking, params, channels).whole
     known = 4 + len(NAMES) + 1
     for index in (*range(4), *range(5, known)):
-        assert not np.array_equal(whole, lacking.encode(params, channels.at[:, :, index].add(1.0)).whole)
+        assert not np.array_equal(whole, _encode(lacking, params, channels.at[:, :, index].add(1.0)).whole)
     for index in (4, *range(known, channels.shape[-1])):
-        np.testing.assert_array_equal(whole, lacking.encode(params, channels.at[:, :, index].add(1.0)).whole)
+        np.testing.assert_array_equal(whole, _encode(lacking, params, channels.at[:, :, index].add(1.0)).whole)
 
 
 def test_a_maps_answers_do_not_depend_on_the_others_in_the_batch(params):
     random = np.random.default_rng(0)
     maps = jnp.asarray(random.normal(size=(3, 12, 26, channel_count(CONFIG))), jnp.float32)
     cells = jnp.asarray(random.integers(0, 12, (3, 4, 2)), jnp.int32)
-    together = NETWORK.encode(params, maps)
+    together = _encode(NETWORK, params, maps)
     # 26 columns are padded to 32, and 12 rows to 16.
     assert together.squares.holds.shape == (3, 16 // SQUARE, 32 // SQUARE, 2)
-    places = NETWORK.places(params, together, cells)
+    places = _places(NETWORK, params, together, cells)
     for index in range(3):
-        alone = NETWORK.places(params, NETWORK.encode(params, maps[index]), cells[index])
+        alone = _places(NETWORK, params, _encode(NETWORK, params, maps[index]), cells[index])
         np.testing.assert_allclose(places[index], alone, rtol=1e-4, atol=1e-5)
 
 
 def test_a_place_reads_the_squares_around_its_cell(params):
     """A change far from a cell and from its squares, of the first scale's features, changes nothing at this scale."""
     maps = jnp.zeros((32, 32, channel_count(CONFIG)))
-    encoded = NETWORK.encode(params, maps)
+    encoded = _encode(NETWORK, params, maps)
     cells = jnp.array([[9, 13]])
-    before = NETWORK.places(params, encoded, cells)
+    before = _places(NETWORK, params, encoded, cells)
 
     def after(row: int, column: int):
         close = encoded.close.at[row, column].add(1.0)
-        return NETWORK.places(params, dataclasses.replace(encoded, close=close), cells)
+        return _places(NETWORK, params, dataclasses.replace(encoded, close=close), cells)
 
     # Squares of two cells: that of the cell is (4, 6), and two on each side of it are read.
     assert not np.array_equal(before, after(6, 8))

@@ -1,8 +1,11 @@
 """Datasets on disk: what is written is read back, by this library and by pandas; what is damaged is named."""
 
 import dataclasses
+import subprocess
+import sys
 import tempfile
 import tracemalloc
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -13,6 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from potlp_jax.errors import DatasetError
+from potlp_jax.learning import dataset
 from potlp_jax.learning.dataset import (
     decode,
     encode,
@@ -30,6 +34,7 @@ from potlp_jax.learning.dataset import (
 from potlp_jax.learning.dataset_metadata import SCHEMA_VERSION, DatasetMetadata
 from tests.reference.data_sets import SHAPE, blank_columns, world_columns
 
+ROOT = Path(__file__).parents[1]
 METADATA = DatasetMetadata(
     propositions=("fire", "exit", "alarm"),
     environment="somewhere",
@@ -305,6 +310,60 @@ def test_images_stay_on_disk(tmp_path):
     with ThreadPoolExecutor(4) as pool:
         assert list(pool.map(both.images.__getitem__, range(32))) == images * 2
         assert [view.floor for view in pool.map(both.maps.__getitem__, range(32))] == images * 2
+
+
+@pytest.mark.parametrize("sorted_by_view", [True, False])
+def test_the_most_that_a_view_is_asked_is_found_in_pieces(tmp_path, monkeypatch, sorted_by_view):
+    draw = np.random.default_rng(3)
+    _write(tmp_path, [0])
+    view_of = draw.integers(0, 40, 400).astype(np.int32)
+    read, rows = read_dataset(tmp_path), draw.integers(0, 6, 400)
+    arrays = {name: value for name, value in vars(read).items() if isinstance(value, np.ndarray)}
+    columns = {name: array[rows] for name, array in arrays.items() if name != "world_of"}
+    columns |= {
+        "view_of": np.sort(view_of) if sorted_by_view else view_of,
+        "cells": draw.integers(0, 3, (400, 2)).astype(np.int32),
+        "phi_stay": draw.integers(-1, 1, (400, 3)).astype(np.int8),
+    }
+    samples = dataclasses.replace(read, **columns)
+    monkeypatch.setattr(dataset, "_SAMPLES", 16)
+    views = [set(samples.view_of[block].tolist()) for block in samples._blocks()]
+    assert (len(views) > 10) == sorted_by_view
+    assert sum(map(len, views)) == len(set.union(*views)) == len(set(view_of.tolist()))
+    asked = zip(samples.view_of.tolist(), samples.cells.tolist(), samples.phi_stay.tolist(), strict=True)
+    asked = {(view, tuple(cell), tuple(stay)) for view, cell, stay in asked}
+    lanes = Counter(view for view, _, _ in asked)
+    subgoals = Counter(view for view, _ in {(view, cell) for view, cell, _ in asked})
+    assert samples.most_lanes == max(lanes.values())
+    assert samples.most_subgoals == max(subgoals.values())
+
+
+READER = """
+import resource, sys
+from potlp_jax.learning.batches import Batches
+from potlp_jax.learning.dataset import read_dataset
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+samples = read_dataset(sys.argv[1])
+batches = Batches(samples, lambda samples, choice: [samples.images[view] for view in choice.views], 8, 2, 0)
+for step in range(batches.per_epoch):
+    batches.training_batch(step)
+print(batches.per_epoch, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+
+
+def test_a_data_set_larger_than_the_memory_allowed_is_read_and_shown_whole(tmp_path):
+    """One shard of 160 MB, which does not compress; the reader's memory must not grow by half of it."""
+    draw, count = np.random.default_rng(0), 1600
+    views, samples = _shard(0, views=count)
+    images = [draw.bytes(100_000) for _ in range(count)]
+    write_shard(tmp_path, 0, world_columns(7), {**views, "image": images}, samples, METADATA)
+    assert views_file(tmp_path, 0).stat().st_size > 150e6
+    del images, views
+    done = subprocess.run([sys.executable, "-c", READER, tmp_path], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    steps, kilobytes = map(int, done.stdout.split())
+    assert steps == count // 8
+    assert kilobytes < 80_000
 
 
 def test_a_shard_may_have_no_views(tmp_path):

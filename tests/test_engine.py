@@ -15,7 +15,8 @@ import pytest
 from eval.faults.kills import workers_of
 from potlp_jax.engine.engine import MOST_KILLED, Broken, Engine, Here
 from potlp_jax.engine.opening import open_engine
-from potlp_jax.errors import EngineError, WorldError
+from potlp_jax.engine.writer import only_writer
+from potlp_jax.errors import EngineError, StoreError, WorldError
 
 
 def squares(shared: int, unit: int):
@@ -212,4 +213,29 @@ def test_a_scheduler_that_does_not_answer_is_named(monkeypatch):
     monkeypatch.setattr("potlp_jax.engine.cluster.ANSWER", 0.5)
     where, message = f"tcp://127.0.0.1:{_free_port()}", r"no Dask scheduler answers at tcp://127.0.0.1:\d+ .*scheduler"
     with pytest.raises(EngineError, match=message), open_engine(cluster=where):
+        pass
+
+
+def test_a_folder_has_one_writer_until_its_process_ends_however_it_ends(tmp_path):
+    code = (
+        "import sys, time; from pathlib import Path; from potlp_jax.engine.writer import only_writer;"
+        "from potlp_jax.errors import StoreError\n"
+        "with only_writer(Path(sys.argv[1]), StoreError): print('held', flush=True); time.sleep(600)"
+    )
+    holder = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        refused = pytest.raises(StoreError, match=rf"another command works on it \(process {holder.pid} on .*: wait")
+        with refused, only_writer(tmp_path, StoreError):
+            pass
+    finally:
+        holder.kill()
+        holder.wait()
+    with only_writer(tmp_path, StoreError):
+        pass
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    with pytest.raises(StoreError, match=r"missing.*cannot be written"), only_writer(tmp_path / "missing", StoreError):
         pass

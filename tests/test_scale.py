@@ -6,6 +6,7 @@ import time
 import pytest
 
 from eval.scale.disturbed import Kept, require_same, rows_of
+from eval.scale.fits import Way, curve, difference, draw
 from eval.scale.overhead import efficiency, row, store_of
 from potlp_jax.sweep.runner import RESULTS
 from potlp_jax.sweep.store import Store
@@ -53,3 +54,17 @@ def test_what_is_kept_is_begun_again_when_it_was_killed():
         assert kept.process.poll() is None
     finally:
         kept.kill()
+
+
+def test_curves_of_fits_are_read_compared_and_drawn(tmp_path):
+    (tmp_path / "log.csv").write_text("step,epoch,training_loss,validation_loss\n3,1,2.0,4.0\n6,2,1.0,2.0\n")
+    found = curve(tmp_path)
+    assert found == {"step": [3, 6], "training_loss": [2, 1], "validation_loss": [4, 2]}
+    other = {**found, "validation_loss": [4.0, 2.5]}
+    assert difference(found, found) == 0
+    assert difference(other, found) == pytest.approx(0.25)
+    with pytest.raises(AssertionError):
+        difference({**found, "step": [3, 7]}, found)
+    draw([{"run": str(Way(1)), "curve": found}, {"run": str(Way(1, 2)), "curve": other}], tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").stat().st_size > 1000
+    assert [str(way) for way in (Way(1), Way(4), Way(1, 2))] == ["1 device", "4 devices", "2 processes, 1 device each"]

@@ -22,8 +22,10 @@ from eval.faults.kills import process_start, workers_of
 from eval.savings import decisions_of
 from potlp_jax.cli import app
 from potlp_jax.cli.report import page_title
+from potlp_jax.cli.sweep import forget_broken
 from potlp_jax.codec import shipped_settings
 from potlp_jax.engine.engine import Broken, Here
+from potlp_jax.engine.writer import only_writer
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.errors import ConfigurationError, EngineError, StoreError, SweepError
@@ -690,6 +692,22 @@ document.body.append(Object.assign(document.createElement("pre"), {id: "result",
 </script></body>"""
     page.write_text(page.read_text("utf-8").replace("</body>", tour), "utf-8")
     assert dump_page(page, tmp_path / "profile") == [1, 0]
+
+
+def test_a_second_command_on_the_folder_is_refused_while_readers_are_free(finished, tmp_path):
+    folder = tmp_path / "sweep"
+    shutil.copytree(finished, folder)
+    with only_writer(folder, StoreError):
+        longer = _specification(worlds=4)
+        with pytest.raises(StoreError, match="another command works on it"):
+            run_sweep(longer, folder)
+        with pytest.raises(StoreError, match="another command works on it"):
+            forget_broken(folder)
+        told = json.loads(_potlp("sweep", "status", folder, "--json").stdout)
+        assert (told["done"], told["broken"]) == (told["total"], 0)
+        assert sum(told["of_policies"].values()) == told["total"]
+        assert f"{told['done']} of {told['total']} trials done" in _potlp("sweep", "status", folder).stdout
+        assert _potlp("sweep", "show", folder).exit_code == 0
 
 
 def test_export_has_a_line_per_trial(finished, tmp_path):

@@ -5,7 +5,9 @@ import itertools
 import math
 import os
 import random
+import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -15,13 +17,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import NamedSharding, PartitionSpec
 
 from potlp_jax.errors import CheckpointError, TrainingError
 from potlp_jax.learning.augmentation import Augmentation
-from potlp_jax.learning.batches import Batch, Batches
+from potlp_jax.learning.batches import Batch, Batches, Share
 from potlp_jax.learning.checkpoints import checkpoint_steps
 from potlp_jax.learning.dataset import Samples, encode, joined
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
+from potlp_jax.learning.devices import divide_processor, everywhere, is_first, join_processes, mesh, shared_out
 from potlp_jax.learning.estimator import read_estimator
 from potlp_jax.learning.loss import DataScale, evaluation_of, loss_sums, total_loss
 from potlp_jax.learning.network import Answers
@@ -30,8 +34,6 @@ from potlp_jax.learning.serialization import load_estimator, save_estimator
 from potlp_jax.learning.training import (
     TrainingConfig,
     batches_of,
-    devices_for,
-    divide_processor,
     initial_state,
     learning_rate_schedule,
     make_train_step,
@@ -122,8 +124,8 @@ PLAIN = Augmentation(mirror_rows=0.0, brightness=0.0, colour=0.0)
 
 
 def _config(steps: int, **changes) -> TrainingConfig:
-    plain = {"augmentation": PLAIN, "patience": 0}
-    return TrainingConfig(steps=steps, views_per_batch=4, samples_per_view=4, **{**plain, **changes})
+    plain = {"views_per_batch": 4, "samples_per_view": 4, "augmentation": PLAIN, "patience": 0}
+    return TrainingConfig(steps=steps, **{**plain, **changes})
 
 
 @pytest.mark.parametrize("weighting", [0.0, 0.4, 1.0])
@@ -413,47 +415,117 @@ def test_killed_and_resumed_it_reaches_the_same_parameters_bit_for_bit(tmp_path)
             np.testing.assert_array_equal(one[name], other[name])
 
 
-def _shared(folder: str) -> None:
-    """The training of the test below, in a process of its own, with two devices."""
+SHARED = {"views_per_batch": 3, "augmentation": Augmentation(brightness=0.1, colour=0.1)}
+
+
+def _shared(folder: str, address: str) -> None:
+    """The training of the test below, in one of two processes with two devices each."""
     divide_processor(2)
-    samples = synthetic(8, 5, 10)
-    config = _config(6, augmentation=Augmentation(brightness=0.1, colour=0.1))
-    assert devices_for(config.views_per_batch) == 2
-    assert devices_for(3) == 1
+    join_processes(address)
+    samples, validation = synthetic(8, 5, 10), synthetic(5, 5, 11)
+    # Three views for four devices: one of them gets a row that counts nothing.
+    assert (jax.process_count(), jax.local_device_count(), jax.device_count()) == (2, 2, 4)
     learner = _learner(samples, TINY)
-    done = train(learner, samples, samples, config, folder=Path(folder) / "checkpoints")
-    np.savez(f"{folder}/done.npz", *(np.asarray(leaf) for leaf in jax.tree.leaves(done.params)), str(done.best_loss))
-    np.savez(f"{folder}/gradient.npz", *(np.asarray(leaf) for leaf in jax.tree.leaves(_gradient(learner, samples))))
+    losses = []
+    done = train(
+        learner,
+        samples,
+        validation,
+        _config(6, **SHARED),
+        folder=Path(folder) / "checkpoints",
+        budget_seconds=1e6,
+        on_evaluation=lambda progress: losses.append(progress.validation.loss),
+    )
+    if is_first():
+        np.savez(f"{folder}/done.npz", *(np.asarray(leaf) for leaf in jax.tree.leaves(done.params)), losses)
+    gradient = _gradient(learner, samples)
+    if is_first():
+        np.savez(f"{folder}/gradient.npz", *(np.asarray(leaf) for leaf in jax.tree.leaves(gradient)))
+    # Of what differs between processes all of them are told.
+    with pytest.raises(TrainingError, match="process 1 of the fit has other data, settings or versions"):
+        train(learner, samples, validation, _config(6, seed=jax.process_index()))
 
 
 def _gradient(learner: PanoramaLearner, samples: Samples):
     """Of the loss; a training alone would not tell it from its double, which Adam scales away."""
-    batch, scale = _batch(samples, 8, 5), DataScale.of(samples)
+    batch = shared_out(batches_of(learner, samples, _config(1, views_per_batch=7)).training_batch(0))
+    scale = DataScale.of(samples)
 
-    def loss(params):
+    def loss(params, batch):
         return total_loss(shared_sums(learner, scale, 0.4, params, batch), 0.5, 1.0)
 
-    return jax.jit(jax.grad(loss))(learner.init(jax.random.key(3)))
+    whole = NamedSharding(mesh(), PartitionSpec())
+    return jax.jit(jax.grad(loss), out_shardings=whole)(everywhere(learner.init(jax.random.key(3))), batch)
 
 
-def test_two_devices_share_a_batch_and_learn_the_same(tmp_path):
-    code = f"from tests.test_training import _shared; _shared({str(tmp_path)!r})"
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=_environment(tmp_path), check=True, timeout=400)
-    samples = synthetic(8, 5, 10)
-    learner = _learner(samples, TINY)
-    config = _config(6, augmentation=Augmentation(brightness=0.1, colour=0.1))
-    alone = train(learner, samples, samples, config)
+def _joined(folder: Path, processes: int = 2) -> None:
+    """Run ``_shared`` in processes that join each other; none outlives another one's failure."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", f"from tests.test_training import _shared; _shared({str(folder)!r}, {address!r})"],
+            cwd=ROOT,
+            env=_environment(folder),
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for address in (f"127.0.0.1:{port},{index},{processes}" for index in range(processes))
+    ]
+    try:
+        for process in started:
+            _, told = process.communicate(timeout=300)
+            assert process.returncode == 0, told
+    finally:
+        for process in started:
+            process.kill()
+
+
+def test_processes_and_devices_share_a_training_that_another_number_goes_on_with(tmp_path):
+    _joined(tmp_path)
+    samples, validation = synthetic(8, 5, 10), synthetic(5, 5, 11)
+    learner, config, losses = _learner(samples, TINY), _config(6, **SHARED), []
+    alone = train(learner, samples, validation, config, on_evaluation=lambda p: losses.append(p.validation.loss))
     with np.load(tmp_path / "done.npz") as shared:
-        *params, loss = (shared[name] for name in shared.files)
+        *params, told = (shared[name] for name in shared.files)
+    np.testing.assert_allclose(losses, told, rtol=1e-5)
     for one, other in zip(jax.tree.leaves(alone.params), params, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5)
-    assert float(loss) == pytest.approx(alone.best_loss, rel=1e-5)
     with np.load(tmp_path / "gradient.npz") as shared:
         for one, name in zip(jax.tree.leaves(_gradient(learner, samples)), shared.files, strict=True):
             np.testing.assert_allclose(one, shared[name], rtol=1e-3, atol=1e-5)
-    # Their bits differ, and so no training goes on with another number of them.
-    with pytest.raises(CheckpointError, match="devices"):
-        train(learner, samples, samples, config, folder=tmp_path / "checkpoints")
+    # One process with one device goes on with what two with four had left.
+    checkpoints = tmp_path / "checkpoints"
+    assert checkpoint_steps(checkpoints) == [4, 6]
+    shutil.rmtree(checkpoints / "6")
+    begun = []
+    resumed = train(learner, samples, validation, config, folder=checkpoints, on_start=begun.append)
+    assert begun == [4]
+    for one, other in zip(jax.tree.leaves(alone.params), jax.tree.leaves(resumed.params), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("address", ["somewhere", "host:1,0", "host:1,a,2", "host:1,2,2"])
+def test_an_address_of_processes_is_checked(address):
+    with pytest.raises(TrainingError, match=address):
+        join_processes(address)
+
+
+def test_rows_of_processes_together_are_the_batch_of_one():
+    samples = synthetic(7, 6, 5)
+    learner = PanoramaOptions().learner(samples)
+    whole = Batches(samples, learner.inputs, 5, 4, 0)
+    parts = [Batches(samples, learner.inputs, 5, 4, 0, share=Share(index, 2, 6)) for index in range(2)]
+    blocks = [
+        [whole.training_batch(1), *(part.training_batch(1) for part in parts)],
+        *zip(whole.evaluation_batches(), *(part.evaluation_batches() for part in parts), strict=True),
+    ]
+    for one, *pieces in blocks:
+        assert [piece.mask.shape[0] for piece in pieces] == [3, 3]
+        for leaf, *rows in zip(*map(jax.tree.leaves, (one, *pieces)), strict=True):
+            np.testing.assert_array_equal(np.concatenate(rows)[:5], leaf)
+        assert not pieces[1].mask[2:].any()
 
 
 def test_a_processor_in_use_is_not_divided():

@@ -3,6 +3,7 @@
 python -m eval.scale overhead --report docs/results/scale/overhead
 python -m eval.scale store --report docs/results/scale/store
 python -m eval.scale kills --out out/scale --report docs/results/scale/kills
+python -m eval.scale fits --out out/scale-fits --report docs/results/scale/fits
 """
 
 import argparse
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from eval.scale.disturbed import on_a_batch_system, on_a_scheduler
+from eval.scale.fits import draw, same_curves
 from eval.scale.overhead import efficiency, store_of
 from potlp_jax.sweep.rows import provenance
 
@@ -21,6 +23,8 @@ def measured(options: argparse.Namespace) -> dict[str, Any]:
         return {"runs": [efficiency(options.workers, seconds, options.units) for seconds in (1.0, 0.1)]}
     if options.subject == "store":
         return {"runs": [store_of(rows) for rows in (10_000, options.rows)]}
+    if options.subject == "fits":
+        return {"runs": same_curves(options.out, options.epochs)}
     if options.subject == "slurm":
         logs = options.out / "jobs"
         where = f"slurm:partition=cpu,walltime=01:00:00,workers=2,memory=2GB,log_directory={logs}"
@@ -32,7 +36,7 @@ def measured(options: argparse.Namespace) -> dict[str, Any]:
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("subject", choices=("overhead", "store", "kills", "slurm"))
+    parser.add_argument("subject", choices=("overhead", "store", "kills", "slurm", "fits"))
     parser.add_argument("--workers", type=int, default=64, help="simulated workers")
     parser.add_argument("--units", type=int, default=20, help="for each worker")
     parser.add_argument("--rows", type=int, default=1_000_000)
@@ -40,15 +44,18 @@ def main() -> None:
     parser.add_argument("--drivers-killed", type=int, default=20)
     parser.add_argument("--schedulers-killed", type=int, default=5)
     parser.add_argument("--jobs-killed", type=int, default=10)
+    parser.add_argument("--epochs", type=int, default=6, help="of a fit")
     parser.add_argument("--out", type=Path, default=Path("out/scale"))
     parser.add_argument("--report", type=Path, help="NAME of NAME.json")
     options = parser.parse_args()
-    found = measured(options) | {"provenance": provenance()}
+    found: dict[str, Any] = measured(options) | {"provenance": provenance()}
     print(json.dumps(found["runs"], indent=1))
     if options.report is not None:
         file = options.report.with_suffix(".json")
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps(found, indent=1) + "\n")
+        if options.subject == "fits":
+            draw(found["runs"], options.report.with_suffix(".png"))
 
 
 if __name__ == "__main__":

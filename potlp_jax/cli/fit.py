@@ -33,6 +33,8 @@ app = command_app()
 
 [cyan]potlp fit data/training --validation data/validation --out out/fit --set training.learning_rate=1e-3[/cyan]
 
+[cyan]srun --ntasks 8 potlp fit data/training --validation data/validation --out out/fit[/cyan] - shared by 8 processes
+
 [dim]The same command again resumes after an interruption and ends with the same parameters. --out then holds
 estimator.npz, log.csv, curves.png and what TensorBoard shows. Needs the extra: pip install 'potlp-jax\\[train]'.
 docs/estimator.md says more.[/dim]
@@ -60,13 +62,24 @@ def fit(
     ] = None,
     processes: Processes = 1,
     cluster: ClusterName = None,
+    join: Annotated[
+        str | None,
+        typer.Option(
+            "--join",
+            metavar="HOST:PORT,INDEX,COUNT",
+            help="Share the fit with other processes: where the first one listens, this one's number, how many there "
+            "are. Not needed under srun and mpirun.",
+        ),
+    ] = None,
     settings: Settings = None,
 ) -> None:
     """Fit an estimator to a dataset, or make one from nothing with --recipe."""
     require_training_extra()
+    import jax
+
     from potlp_jax.codec import settings_from_words, with_settings
     from potlp_jax.learning.dataset import joined, read_dataset
-    from potlp_jax.learning.training import divide_processor
+    from potlp_jax.learning.devices import divide_processor, is_first, join_processes
     from potlp_jax.recipes import fitting
     from potlp_jax.recipes.recipe import follow, read_recipe
 
@@ -80,25 +93,29 @@ def fit(
         fail("--initial keeps the network of its estimator as it is: leave out --set network")
     given = None if recipe is None else read_recipe(recipe)
     if cluster is not None and datasets:
-        fail("--cluster is for collecting, as a recipe does: a fit runs on the devices of this machine")
+        fail("--cluster is for collecting, as a recipe does: a fit is shared by processes that join (--join)")
     config = with_settings(
         fitting.FitConfig() if given is None else given.fit, settings_from_words(settings or []), "--set"
     )
     options = {"epochs": epochs, "minutes": minutes}
     config = with_settings(config, _given(**options) | {"training": _given(seed=seed)}, "options")
-    folder = make_folder(out)
     if processes > 1:
         divide_processor(processes)
+    join_processes(join)
+    if not datasets and jax.process_count() > 1:
+        fail("several processes share a fit of a DATASET: collect first (`potlp collect --recipe`), then fit")
+    folder = make_folder(out) if is_first() else out
     with progress_bar() as progress:
         if datasets and validation is not None:
             training = joined([read_dataset(dataset) for dataset in datasets])
-            trained = fitting.fit(
-                training, read_dataset(validation), folder, config, _display(progress), initial=initial
-            )
+            shown = _display(progress)
+            trained = fitting.fit(training, read_dataset(validation), folder, config, shown, initial=initial)
         else:
             assert given is not None
             chosen = dataclasses.replace(given, fit=config)
             trained = follow(chosen, folder, processes, cluster, collection_bars(progress), _display(progress))
+    if not is_first():
+        return
     console().print(
         f"{folder / fitting.ESTIMATOR}: step {trained.best_step} of {trained.steps}, validation loss "
         f"{trained.best_loss:.4f}; ended by {trained.reason} after {trained.seconds / 60:.1f} min",
@@ -111,10 +128,13 @@ def _given(**options: Any) -> dict[str, Any]:
 
 
 def _display(progress: "Progress") -> "Display":
-    """A bar of steps, a line about each epoch, and the picture of the curves."""
+    """A bar of steps, a line about each epoch, and the picture of the curves; nothing of a process beside the first."""
+    from potlp_jax.learning.devices import is_first
     from potlp_jax.recipes.journal import Display
     from potlp_jax.view.training_curves import draw_curves
 
+    if not is_first():
+        return Display()
     bars: list[TaskID] = []
 
     def advance(done: int, planned: int) -> None:

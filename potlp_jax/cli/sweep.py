@@ -116,15 +116,35 @@ def show(folder: SweepFolder, json: Json = False) -> None:
         console().print(f"given up: {item.policy} in world {item.world} of {item.environment}, {item.task}: {error}")
 
 
+@app.command("status", cls=Command)
+def status(folder: SweepFolder, json: Json = False) -> None:
+    """Show how far a sweep is, also while it runs."""
+    from potlp_jax.cli.inputs import open_store
+    from potlp_jax.sweep.results import read_status
+
+    with open_store(folder) as store:
+        found = read_status(store)
+    if json:
+        print_json(dataclasses.asdict(found))
+        return
+    given_up = f", {found.broken} given up" if found.broken else ""
+    console().print(f"{folder}: {found.done} of {found.total} trials done{given_up}")
+    for policy, done in found.of_policies.items():
+        console().print(f"{policy}: {done} of {found.total // len(found.of_policies)}")
+
+
 def forget_broken(folder: Path) -> None:
     """Make the trials of a sweep that were given up missing ones."""
+    from potlp_jax.engine.writer import only_writer
+    from potlp_jax.errors import StoreError
     from potlp_jax.sweep.runner import RESULTS
     from potlp_jax.sweep.store import Store
 
     if (folder / RESULTS).is_file():
-        store = Store(folder / RESULTS)
-        store.forget_broken()
-        store.close()
+        with only_writer(folder, StoreError):
+            store = Store(folder / RESULTS)
+            store.forget_broken()
+            store.close()
 
 
 def run_reported(

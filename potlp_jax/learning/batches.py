@@ -52,14 +52,30 @@ class Choice:
     """Which samples a batch holds.
 
     Attributes:
-        views: of the data set, at most as many as the batch has rows; the remaining rows are padding.
+        views: of the data set.
+        real: True for the rows of the batch; those that fill it up show a view of it again.
         index: of the samples; where masked, another one of the same view.
         mask: True where a sample is real.
     """
 
-    views: Int64[np.ndarray, " _"]
+    views: Int64[np.ndarray, " G"]
+    real: Bool[np.ndarray, " G"]
     index: Int64[np.ndarray, "G K"]
     mask: Bool[np.ndarray, "G K"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Share:
+    """The rows of every batch that one process makes; all are made where there is one.
+
+    Attributes:
+        index, count: which of how many equal parts.
+        devices: of all processes; batches are filled up with rows that count nothing, so that all have equally many.
+    """
+
+    index: int = 0
+    count: int = 1
+    devices: int = 1
 
 
 class Batches:
@@ -71,6 +87,7 @@ class Batches:
         views, samples_per_view: shape of a batch.
         seed: of the order.
         usable: True for the samples that take part; all by default.
+        share: which rows of the batches are made.
     """
 
     def __init__(
@@ -81,6 +98,7 @@ class Batches:
         samples_per_view: int,
         seed: int,
         usable: Bool[np.ndarray, "N"] | None = None,
+        share: Share = Share(),
     ) -> None:
         taking_part = np.arange(len(samples.view_of)) if usable is None else np.flatnonzero(usable)
         # Checked here, where every use of a data set begins.
@@ -98,6 +116,9 @@ class Batches:
         # A data set smaller than a batch makes batches of its own size.
         self.views = min(views, len(self._views))
         self.samples_per_view = samples_per_view
+        self._rows = -(-self.views // share.devices) * share.devices
+        part = self._rows // share.count
+        self._own = slice(share.index * part, (share.index + 1) * part)
         self.per_epoch = len(self._views) // self.views
         # Two epochs are remembered: batches are made ahead, so that one may begin before the other has ended.
         self._permutation = functools.lru_cache(2)(
@@ -130,14 +151,21 @@ class Batches:
         return random.choice(members, self.samples_per_view, replace=False)
 
     def _batch(self, groups: list[tuple[int, np.ndarray]]) -> Batch:
-        index = np.zeros((self.views, self.samples_per_view), np.int64)
+        first_view, members_of_first = groups[0]
+        # A row too many repeats a view of the batch, and padding a sample of its own view, so that neither asks about
+        # anything new.
+        filling = [(first_view, members_of_first[:1])] * (self._rows - len(groups))
+        own = [*groups, *filling][self._own]
+        real = (np.arange(self._rows) < len(groups))[self._own]
+        index = np.zeros((len(own), self.samples_per_view), np.int64)
         mask = np.zeros(index.shape, bool)
-        for row, (_, members) in enumerate(groups):
-            # Padding repeats a sample of its own view, so that it asks about nothing new.
+        for row, (_, members) in enumerate(own):
             index[row] = members[0]
             index[row, : len(members)] = members
-            mask[row, : len(members)] = True
-        choice = Choice(views=self._views[[view for view, _ in groups]].astype(np.int64), index=index, mask=mask)
+            mask[row, : len(members)] = real[row]
+        choice = Choice(
+            views=self._views[[view for view, _ in own]].astype(np.int64), real=real, index=index, mask=mask
+        )
         columns = {name: jnp.asarray(getattr(self._samples, name)[index]) for name in _COLUMNS}
         return Batch(inputs=self._make_inputs(self._samples, choice), mask=jnp.asarray(mask), **columns)
 

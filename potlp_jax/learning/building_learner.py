@@ -68,9 +68,8 @@ class BuildingLearner:
         return np.ones(len(samples.success), bool)
 
     def inputs(self, samples: Samples, choice: Choice) -> BuildingInputs:
-        """The decoded maps; the first one again fills the batch up."""
+        """The decoded maps."""
         views = [_decoded(samples, view) for view in choice.views]
-        views += [views[0]] * (len(choice.index) - len(views))
 
         def stacked(name: str) -> Array:
             return jnp.asarray(np.stack([getattr(view, name) for view in views]))
@@ -90,7 +89,7 @@ class BuildingLearner:
             subgoal_of=jnp.asarray(subgoal_of),
             lanes=jnp.asarray(lanes),
             lane_of=jnp.asarray(lane_of),
-            real=jnp.arange(len(views)) < len(choice.views),
+            real=jnp.asarray(choice.real),
         )
 
     def augmented(self, inputs: BuildingInputs, key: PRNGKeyArray, amount: Augmentation) -> BuildingInputs:

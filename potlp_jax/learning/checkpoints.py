@@ -3,6 +3,9 @@
 A **checkpoint** is an Orbax folder named by its step, with everything that the rest of the training depends on. Orbax
 writes to a temporary name and renames, so a process killed at any time leaves whole checkpoints only.
 
+Processes that share a training all call these functions at the same time, with a folder that all of them see: Orbax
+lets the first one write.
+
 This is the only module that imports Orbax: planning with a trained estimator does without.
 """
 
@@ -63,7 +66,7 @@ def save_checkpoint(
     # Arrays by name and not the state itself: reading then needs no class that may have changed.
     ocp.save(str(folder / str(step)), arrays, custom_metadata=description, overwrite=True)
     # After the new one is whole, never before.
-    for old in checkpoint_steps(folder)[:-keep]:
+    for old in checkpoint_steps(folder)[:-keep] if jax.process_index() == 0 else ():
         shutil.rmtree(folder / str(old))
 
 

@@ -10,9 +10,10 @@ in its schema, under the key ``potlp``. ``docs/dataset.md`` describes the column
 import contextlib
 import dataclasses
 import functools
+import itertools
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,20 +22,26 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jaxtyping import Bool, Float32, Int8, Int32, UInt8
+from jaxtyping import Bool, Float32, Int8, Int32, Int64, UInt8
 
 from potlp_jax.errors import DatasetError
 from potlp_jax.files import reading, require_file
 from potlp_jax.images import decode_image
 from potlp_jax.learning.dataset_metadata import DatasetMetadata, DataSource, data_source
 from potlp_jax.learning.map_images import MAP_COLUMNS, EncodedView, EncodedWorld
-from potlp_jax.learning.on_disk import Chained, Entries, ImageFile, OnDisk
+from potlp_jax.learning.on_disk import Chained, ColumnFile, Entries, ImageFile, OnDisk
 
 JPEG_QUALITY: int = 92
 
 _METADATA_KEY = b"potlp"
 
 _TEMPORARY = ".tmp"
+
+# Rows of a file, and bytes, that are read at once.
+_ROWS = 64
+_BUFFER = 1 << 20
+# Samples that are looked at together.
+_SAMPLES = 1 << 18
 
 _REMEDY = "delete all files of the shard and collect or convert it again"
 
@@ -79,7 +86,8 @@ SAMPLES_SCHEMA = pa.schema(
 
 @dataclass
 class Samples:
-    """A dataset on the host; images stay encoded, those that were read from files on disk, and are decoded per batch.
+    """A dataset on the host. Of one that was read from files images, maps, worlds and columns stay on disk; images and
+    maps are encoded until a batch is made.
 
     Attributes:
         images: one per view.
@@ -103,7 +111,7 @@ class Samples:
 
     images: Entries[bytes]
     maps: Entries[EncodedView]
-    worlds: list[EncodedWorld]
+    worlds: Entries[EncodedWorld]
     world_of: Int32[np.ndarray, " views"]
     view_of: Int32[np.ndarray, "N"]
     cells: Int32[np.ndarray, "N 2"]
@@ -139,8 +147,21 @@ class Samples:
         return self._most_in_a_view(self.cells, self.phi_stay)
 
     def _most_in_a_view(self, *columns: Int32[np.ndarray, "N _"] | Int8[np.ndarray, "N _"]) -> int:
-        distinct = np.unique(np.column_stack([self.view_of, *columns]), axis=0)
-        return int(np.unique(distinct[:, 0], return_counts=True)[1].max(initial=1))
+        most = 1
+        for block in self._blocks():
+            table = np.column_stack([self.view_of[block], *(column[block] for column in columns)])
+            distinct = np.unique(table, axis=0)
+            most = max(most, int(np.unique(distinct[:, 0], return_counts=True)[1].max(initial=1)))
+        return most
+
+    def _blocks(self) -> Iterator[slice]:
+        """All samples in pieces, each view in one of them: a table of all would be as large as memory allows."""
+        count, steps = len(self.view_of), np.diff(self.view_of)
+        # Where samples are not in the order of their views, as collections write them, one piece is the only safe one.
+        starts = np.flatnonzero(steps) + 1 if np.all(steps >= 0) else np.zeros(0, np.int64)
+        first = np.searchsorted(starts, np.arange(_SAMPLES, count, _SAMPLES))
+        cuts = starts[first[first < len(starts)]].tolist()
+        yield from itertools.starmap(slice, itertools.pairwise([0, *dict.fromkeys(cuts), count]))
 
 
 def encode(
@@ -269,7 +290,8 @@ def read_dataset(folder: Path | str) -> Samples:
     metadata = read_metadata(folder)
     # Images and maps are most of a dataset: 25 KB a view, 1.3 GB for 51,000 views.
     kept = ImageFile()
-    return _one_after_another([_read_shard(folder, shard, metadata, kept) for shard in sorted(finished_shards(folder))])
+    # One shard at a time: its columns are on disk before the next one is read.
+    return _one_after_another(_read_shard(folder, shard, metadata, kept) for shard in sorted(finished_shards(folder)))
 
 
 def joined(parts: Sequence[Samples]) -> Samples:
@@ -290,45 +312,72 @@ def joined(parts: Sequence[Samples]) -> Samples:
     return dataclasses.replace(_one_after_another(parts), metadata=metadata, joined_from=sources)
 
 
-def _one_after_another(parts: Sequence[Samples]) -> Samples:
-    views = np.cumsum([0, *(len(part.images) for part in parts)])
-    worlds = np.cumsum([0, *(len(part.worlds) for part in parts)])
-    # Once at the end: joining one by one would copy the first ones again and again.
-    columns: dict[str, Any] = {
-        field.name: np.concatenate([getattr(part, field.name) for part in parts])
-        for field in dataclasses.fields(Samples)
-        if isinstance(getattr(parts[0], field.name), np.ndarray)
-    }
-    shifted = {"view_of": views, "world_of": worlds}
-    for name, offsets in shifted.items():
-        arrays = [getattr(part, name) + np.int32(offset) for part, offset in zip(parts, offsets[:-1], strict=True)]
-        columns[name] = np.concatenate(arrays)
-    return Samples(
-        images=Chained(part.images for part in parts),
-        maps=Chained(part.maps for part in parts),
-        worlds=[world for part in parts for world in part.worlds],
-        metadata=parts[0].metadata,
-        **columns,
-    )
+def _one_after_another(parts: Iterable[Samples]) -> Samples:
+    """Several as one; at least one."""
+    columns: dict[str, ColumnFile] = {}
+    images, maps, worlds, metadata = [], [], [], []
+    for part in parts:
+        shifts = {"view_of": sum(map(len, images)), "world_of": sum(map(len, worlds))}
+        for field in dataclasses.fields(Samples):
+            column = getattr(part, field.name)
+            if isinstance(column, np.ndarray):
+                shift = shifts.get(field.name)
+                shifted = column if shift is None else column + np.int32(shift)
+                columns.setdefault(field.name, ColumnFile()).append(shifted)
+        images.append(part.images)
+        maps.append(part.maps)
+        worlds.append(part.worlds)
+        metadata.append(part.metadata)
+    mapped: dict[str, Any] = {name: column.mapped() for name, column in columns.items()}
+    return Samples(images=Chained(images), maps=Chained(maps), worlds=Chained(worlds), metadata=metadata[0], **mapped)
 
 
 def _read_shard(folder: Path | str, shard: int, metadata: DatasetMetadata, kept: ImageFile) -> Samples:
-    """A shard whose images are kept in a file."""
+    """A shard whose images, maps and worlds are kept in a file."""
     paths = worlds_file(folder, shard), views_file(folder, shard), samples_file(folder, shard)
-    worlds = _read_table(paths[0], WORLDS_SCHEMA, None)
-    views = _read_table(paths[1], VIEWS_SCHEMA, ("view", "world", "image", *MAP_COLUMNS))
-    columns = _sample_columns(_read_table(paths[2], SAMPLES_SCHEMA, None), len(metadata.propositions), paths[2])
-    view_of = _index_of(columns.pop("view"), views["view"].to_numpy(), "view", paths[2])
-    world_of = _index_of(views["world"].to_numpy(), worlds["world"].to_numpy(), "world", paths[1])
-    maps = zip(*(views[name].to_pylist() for name in MAP_COLUMNS), strict=True)
+    worlds, of_worlds = _read_worlds(paths[0], kept)
+    views, world_of_views, images, maps = _read_views(paths[1], kept)
+    columns = _sample_columns(_read_table(paths[2], SAMPLES_SCHEMA), len(metadata.propositions), paths[2])
+    view_of = _index_of(columns.pop("view"), views, "view", paths[2])
+    world_of = _index_of(world_of_views, worlds, "world", paths[1])
     return Samples(
-        images=OnDisk(kept, bytes, ((image,) for image in views["image"].to_pylist())),
-        maps=OnDisk(kept, EncodedView, maps),
-        worlds=[EncodedWorld(**row) for row in worlds.drop_columns(["world"]).to_pylist()],
-        world_of=world_of,
-        view_of=view_of,
-        metadata=metadata,
-        **columns,
+        images=images, maps=maps, worlds=of_worlds, world_of=world_of, view_of=view_of, metadata=metadata, **columns
+    )
+
+
+def _read_worlds(path: Path, kept: ImageFile) -> tuple[Int64[np.ndarray, " worlds"], OnDisk[EncodedWorld]]:
+    """Numbers of a shard's worlds, and their maps on disk."""
+    numbers, bounds = [np.zeros(0, np.int64)], [np.zeros((0, 4), np.int64)]
+    for rows in _pieces(path, WORLDS_SCHEMA, WORLDS_SCHEMA.names):
+        numbers.append(rows["world"].to_numpy())
+        sizes = np.stack([rows["rows"].to_numpy(), rows["columns"].to_numpy()], axis=-1)
+        maps = (rows[name].to_pylist() for name in ("cells", "letters"))
+        bounds.append(kept.write(zip(map(np.ndarray.tobytes, sizes), *maps, strict=True)))
+    return np.concatenate(numbers), OnDisk(kept, _world, np.concatenate(bounds))
+
+
+def _world(size: bytes, cells: bytes, letters: bytes) -> EncodedWorld:
+    rows, columns = np.frombuffer(size, np.int32).tolist()
+    return EncodedWorld(rows, columns, cells, letters)
+
+
+def _read_views(
+    path: Path, kept: ImageFile
+) -> tuple[Int64[np.ndarray, " views"], Int64[np.ndarray, " views"], OnDisk[bytes], OnDisk[EncodedView]]:
+    """Numbers of a shard's views and of their worlds; their images and maps on disk."""
+    names = ("view", "world", "image", *MAP_COLUMNS)
+    views, worlds = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    images, maps = [np.zeros((0, 2), np.int64)], [np.zeros((0, 1 + len(MAP_COLUMNS)), np.int64)]
+    for rows in _pieces(path, VIEWS_SCHEMA, names):
+        views.append(rows["view"].to_numpy())
+        worlds.append(rows["world"].to_numpy())
+        images.append(kept.write((image,) for image in rows["image"].to_pylist()))
+        maps.append(kept.write(zip(*(rows[name].to_pylist() for name in MAP_COLUMNS), strict=True)))
+    return (
+        np.concatenate(views),
+        np.concatenate(worlds),
+        OnDisk(kept, bytes, np.concatenate(images)),
+        OnDisk(kept, EncodedView, np.concatenate(maps)),
     )
 
 
@@ -377,19 +426,27 @@ def _metadata_of(path: Path, schema: pa.Schema) -> DatasetMetadata:
         raise DatasetError(f"{path}: {error}") from error
 
 
-def _read_table(path: Path, schema: pa.Schema, columns: tuple[str, ...] | None) -> pa.Table:
+def _pieces(path: Path, schema: pa.Schema, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
+    """The rows of a file, some at a time, each checked; other columns than the schema's are left out."""
     found = _schema_of(path)
     wrong = [field.name for field in schema if field.name not in found.names or found.field(field.name) != field]
     # More columns than the schema's are no harm: data from elsewhere may keep what they need.
     if wrong:
         raise _broken(path, f"has other columns than the schema: {', '.join(wrong)}")
-    with _reading(path):
-        table = pq.read_table(path, columns=list(columns or schema.names), page_checksum_verification=True)
-        # Offsets that point beyond their values would be followed later.
-        table.validate(full=True)
-    if any(table[name].null_count for name in table.column_names):
-        raise _broken(path, "has missing values")
-    return table
+    # Through a buffer, and not a file's column as a whole: a shard may be larger than memory.
+    options: dict[str, Any] = {"buffer_size": _BUFFER, "pre_buffer": False, "page_checksum_verification": True}
+    with _reading(path), pq.ParquetFile(path, **options) as file:
+        for rows in file.iter_batches(_ROWS, columns=list(columns), use_threads=False):
+            # Offsets that point beyond their values would be followed later.
+            rows.validate(full=True)
+            if any(column.null_count for column in rows.columns):
+                raise _broken(path, "has missing values")
+            if len(rows):
+                yield rows
+
+
+def _read_table(path: Path, schema: pa.Schema) -> pa.Table:
+    return pa.Table.from_batches(_pieces(path, schema, schema.names), schema)
 
 
 def _sample_columns(table: pa.Table, propositions: int, path: Path) -> dict[str, Any]:

@@ -134,7 +134,8 @@ def data_source(metadata: DatasetMetadata, worlds: int, views: int, columns: Ite
     # With the samples: collections of two versions of a program may have the same metadata, and so may two logs.
     digest, rows = hashlib.sha256(metadata.to_json().encode()), 0
     for column in columns:
-        digest.update(column.tobytes())
+        # Without a copy: a column may be mapped from disk.
+        digest.update(np.ascontiguousarray(column).data)
         rows = len(column)
     return DataSource(
         environment=metadata.environment,

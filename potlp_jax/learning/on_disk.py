@@ -1,6 +1,10 @@
-"""Sequences of encoded images on disk, so that the memory of a fit does not grow with its data set."""
+"""Images, maps and columns of a data set on disk, so that the memory of a fit does not grow with it.
+
+All files are without a name in the temporary folder (``TMPDIR``), and gone when the process ends, however it ends.
+"""
 
 import bisect
+import contextlib
 import itertools
 import os
 import tempfile
@@ -9,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Generic, Protocol, SupportsIndex, TypeVar, runtime_checkable
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Int64, Shaped
 
 from potlp_jax.errors import DatasetError
 
@@ -26,11 +30,20 @@ class Entries(Protocol[T_co]):
     def __iter__(self) -> Iterator[T_co]: ...
 
 
-class ImageFile:
-    """A file without a name in the temporary folder (``TMPDIR``), which is gone when the process ends, however it ends.
+@contextlib.contextmanager
+def _kept() -> Iterator[None]:
+    """Name what is not kept, and where, as when the disk is full."""
+    try:
+        yield
+    except OSError as error:
+        raise DatasetError(
+            f"the images of a data set cannot be kept in {tempfile.gettempdir()} ({error.strerror}): free space "
+            "there, or set TMPDIR to another folder"
+        ) from error
 
-    Any thread may read it.
-    """
+
+class ImageFile:
+    """Byte strings. Any thread may read them."""
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as this object lives
@@ -45,17 +58,12 @@ class ImageFile:
         Raises:
             DatasetError: there is no space.
         """
-        try:
+        with _kept():
             bounds = [
                 list(itertools.accumulate(map(self._file.write, entry), initial=self._file.tell())) for entry in entries
             ]
             # Entries are read past the buffer.
             self._file.flush()
-        except OSError as error:
-            raise DatasetError(
-                f"the images of a data set cannot be kept in {tempfile.gettempdir()} ({error.strerror}): free space "
-                "there, or set TMPDIR to another folder"
-            ) from error
         return np.array(bounds, np.int64)
 
     def read(self, bounds: Int64[np.ndarray, " entries"]) -> list[bytes]:
@@ -70,17 +78,13 @@ class OnDisk(Generic[T]):
     """Entries that are read when they are asked for.
 
     Args:
-        file: takes them.
+        file: has them.
         make: an entry of its byte strings.
-        entries: the byte strings of each entry, equally many.
-
-    Raises:
-        DatasetError: there is no space for them.
+        bounds: of the entries, as ``ImageFile.write`` gave them.
     """
 
-    def __init__(self, file: ImageFile, make: Callable[..., T], entries: Iterable[Sequence[bytes]]) -> None:
-        self._file, self._make = file, make
-        self._bounds = file.write(entries)
+    def __init__(self, file: ImageFile, make: Callable[..., T], bounds: Int64[np.ndarray, "N ..."]) -> None:
+        self._file, self._make, self._bounds = file, make, bounds
 
     def __len__(self) -> int:
         return len(self._bounds)
@@ -90,6 +94,35 @@ class OnDisk(Generic[T]):
 
     def __iter__(self) -> Iterator[T]:
         return map(self.__getitem__, range(len(self)))
+
+
+class ColumnFile:
+    """One column of the samples, which grows by pieces and is mapped into memory at the end.
+
+    What is mapped counts as memory of the process while it is looked at, and the system takes it back when it needs it.
+    """
+
+    def __init__(self) -> None:
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 - closed when it is mapped
+        self._like, self._rows = np.zeros(0), 0
+
+    def append(self, piece: Shaped[np.ndarray, "n ..."]) -> None:
+        """Write further rows, of the same type and row shape. Raises DatasetError where there is no space."""
+        with _kept():
+            self._file.write(np.ascontiguousarray(piece).data)
+        self._like, self._rows = piece[:0], self._rows + len(piece)
+
+    def mapped(self) -> Shaped[np.ndarray, "N ..."]:
+        """All rows, read only."""
+        with _kept():
+            self._file.flush()
+        shape = (self._rows, *self._like.shape[1:])
+        # Nothing cannot be mapped.
+        if not np.prod(shape):
+            self._file.close()
+            return np.empty(shape, self._like.dtype)
+        with self._file:
+            return np.asarray(np.memmap(self._file, self._like.dtype, "r", shape=shape))
 
 
 class Chained(Generic[T]):

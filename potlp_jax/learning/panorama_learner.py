@@ -46,9 +46,8 @@ class PanoramaLearner:
         return samples.in_view
 
     def inputs(self, samples: Samples, choice: Choice) -> PanoramaInputs:
-        """The decoded panoramas; black ones fill the batch up."""
+        """The decoded panoramas."""
         images = [decode(samples.images[view]) for view in choice.views]
-        images += [np.zeros_like(images[0])] * (len(choice.index) - len(images))
         return PanoramaInputs(
             pixels=jnp.asarray(np.stack(images)),
             bearing=jnp.asarray(samples.bearing[choice.index]),

@@ -4,13 +4,16 @@
 own choice of samples. Augmentation depends on (key, step). So a training that is resumed from a checkpoint does what it
 would have done, bit for bit, on the same machine, devices and versions.
 
-**Devices.** The views of a batch are shared out between all devices at hand. A processor is one device, most of whose
-cores idle in steps as small as these, unless it is divided first (``divide_processor``).
+**Devices.** The views of a batch are shared out between all devices of all processes that share the training
+(``devices``). With another number of them sums are added in another order, so that losses and parameters differ in
+their last bits at first, and nothing else does: a training may be resumed with any number.
 """
 
 import dataclasses
 import functools
+import json
 import time
+import zlib
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
@@ -21,15 +24,16 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import struct
-from jax.sharding import PartitionSpec
+from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
 from potlp_jax.checks import AT_LEAST_ONE, SHARE, require_fields
 from potlp_jax.errors import TrainingError
 from potlp_jax.learning.augmentation import Augmentation
-from potlp_jax.learning.batches import Batch, Batches, prefetched
+from potlp_jax.learning.batches import Batch, Batches, Share, prefetched
 from potlp_jax.learning.checkpoints import checkpoint_steps, load_checkpoint, save_checkpoint
 from potlp_jax.learning.dataset import Samples
+from potlp_jax.learning.devices import VIEWS, agreed, everywhere, mesh, require_agreement, shared_out
 from potlp_jax.learning.estimator import TrainedEstimator, identity_of
 from potlp_jax.learning.learner import Learner
 from potlp_jax.learning.loss import DataScale, Evaluation, Sums, evaluation_of, loss_sums, total_loss
@@ -214,7 +218,8 @@ def make_train_step(
         sums = shared_sums(learner, scale, config.weighting, params, dataclasses.replace(batch, inputs=inputs))
         return total_loss(sums, config.cost_share, config.view_share), sums
 
-    @jax.jit
+    # Whole on every device, so that every process can read it.
+    @functools.partial(jax.jit, out_shardings=NamedSharding(mesh(), PartitionSpec()))
     def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, Float32[Array, ""]]:
         # By the step and not by splitting: a resumed training has the same keys.
         key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step)
@@ -240,8 +245,8 @@ def make_train_step(
 
 
 @functools.lru_cache(8)
-def make_evaluate_step(learner: Learner, scale: DataScale, weighting: float) -> Callable[[Params, Batch], Sums]:
-    """The compiled sums of one batch, not augmented.
+def make_evaluate_step(learner: Learner, scale: DataScale, weighting: float) -> Callable[[Params, Sums, Batch], Sums]:
+    """The compiled sums of batches, not augmented.
 
     Args:
         learner: what is evaluated.
@@ -249,56 +254,37 @@ def make_evaluate_step(learner: Learner, scale: DataScale, weighting: float) -> 
         weighting: as in training.
 
     Returns:
-        A function of parameters and batch.
+        A function of parameters, the sums so far and the next batch.
     """
 
-    @jax.jit
-    def evaluate_step(params: Params, batch: Batch) -> Sums:
-        return shared_sums(learner, scale, weighting, params, batch)
+    @functools.partial(jax.jit, out_shardings=NamedSharding(mesh(), PartitionSpec()))
+    def evaluate_step(params: Params, sums: Sums, batch: Batch) -> Sums:
+        return jax.tree.map(jnp.add, sums, shared_sums(learner, scale, weighting, params, batch))
 
     return evaluate_step
 
 
-def divide_processor(parts: int) -> None:
-    """Have the processor count as so many devices, which share the views of a batch. Accelerators stay as they are.
-
-    Raises:
-        TrainingError: jax has computed something before, and its devices are what they are.
-    """
-    try:
-        jax.config.update("jax_num_cpu_devices", parts)
-    except RuntimeError as error:
-        raise TrainingError(f"the processor cannot be divided into {parts} devices any more: {error}") from error
-
-
-def devices_for(views: int) -> int:
-    """How many devices share a batch of so many views: the most of those at hand that divide it."""
-    return max(count for count in range(1, jax.local_device_count() + 1) if views % count == 0)
-
-
 def shared_sums(learner: Learner, scale: DataScale, weighting: float, params: Params, batch: Batch) -> Sums:
-    """The sums of a batch, of whose views each device takes as many (``devices_for``).
+    """The sums of a batch, of whose views each device takes as many.
 
     Args:
         learner: whose answers are judged.
         scale, weighting: as for ``loss_sums``.
         params: of its network.
-        batch: of any number of views.
+        batch: of a number of views that the number of devices divides (``batches.Share``).
 
     Returns:
         Sums of the whole batch.
     """
-    devices = jax.local_devices()[: devices_for(batch.mask.shape[0])]
-    shared, whole = PartitionSpec("views"), PartitionSpec()
+    shared, whole = PartitionSpec(VIEWS), PartitionSpec()
 
     def sums_of(params: Params, part: Batch) -> Sums:
         answers, view_loss = learner.answers(params, part.inputs, part.phi_stay, part.phi_go)
         sums = loss_sums(answers, view_loss, part, learner.config, scale, weighting)
         return jax.tree.map(lambda value: value[None], sums)
 
-    mesh = jax.sharding.Mesh(np.array(devices), ("views",))
     # Without the check: loops in the networks begin with constants, which it takes for equal on all devices.
-    parts = jax.shard_map(sums_of, mesh=mesh, in_specs=(whole, shared), out_specs=shared, check_vma=False)
+    parts = jax.shard_map(sums_of, mesh=mesh(), in_specs=(whole, shared), out_specs=shared, check_vma=False)
     return jax.tree.map(jnp.sum, parts(params, batch))
 
 
@@ -312,7 +298,7 @@ def check_data(training: Samples, validation: Samples) -> None:
 
 
 def batches_of(learner: Learner, samples: Samples, config: TrainingConfig) -> Batches:
-    """The batches of a data set as a learner is shown them."""
+    """The batches of a data set as a learner is shown them: this process's rows of them."""
     return Batches(
         samples,
         learner.inputs,
@@ -320,6 +306,7 @@ def batches_of(learner: Learner, samples: Samples, config: TrainingConfig) -> Ba
         config.samples_per_view,
         config.seed,
         learner.usable(samples),
+        Share(jax.process_index(), jax.process_count(), jax.device_count()),
     )
 
 
@@ -335,13 +322,13 @@ def seconds_per_step(learner: Learner, training: Samples, config: TrainingConfig
     """
     batches = batches_of(learner, training, config)
     train_step = make_train_step(learner, config, DataScale.of(training))
-    state = initial_state(learner, config)
+    state = everywhere(initial_state(learner, config))
     started = 0.0
     for number, batch in enumerate(prefetched(batches.training_batch, 0, steps + 2)):
         # Two steps first: the one that compiles, and one that finds what was decoded during that.
         if number == 2:
             started = time.perf_counter()
-        state, value = train_step(state, batch)
+        state, value = train_step(state, shared_out(batch))
         value.block_until_ready()
     return (time.perf_counter() - started) / steps
 
@@ -381,13 +368,11 @@ def training_identity(
         initial: what it goes on from.
 
     Returns:
-        JSON-able; differences are named on loading. Versions are part of it, and the number of devices that share a
-        batch: with others it would end with other bits.
+        JSON-able; differences are named on loading. Versions are part of it; the number of devices is not.
     """
     return {
         "network": dataclasses.asdict(learner.config),
         "training": dataclasses.asdict(config),
-        "devices": devices_for(config.views_per_batch),
         **provenance(training, validation, initial),
         "versions": {name: version(name) for name in ("jax", "jaxlib", "flax", "optax", "numpy")},
     }
@@ -414,7 +399,7 @@ def train(
         validation: of other worlds; decides which parameters are the best.
         config: how, and for how many steps.
         initial: its parameters are begun with; new ones by default.
-        folder: where checkpoints go; None for none.
+        folder: where checkpoints go, one that all processes of the training see; None for none.
         budget_seconds: training stops after this time, over all resumptions, also where steps are left.
         on_start: told the number of steps already done.
         on_step: told the number of steps done and the last batch's loss.
@@ -424,28 +409,28 @@ def train(
         The best parameters by validation loss, and why training ended.
 
     Raises:
-        TrainingError: the data do not fit, or the loss is not finite.
+        TrainingError: the data do not fit, the loss is not finite, or processes that share the training were given
+            different things.
         CheckpointError: the newest checkpoint is damaged or of another training.
     """
     # Everything that a checkpoint must hold is in the loop's state: what stands here may be killed at any line.
     check_data(training, validation)
-    loop = _Loop(learner, training, validation, config, folder, initial)
+    loop = _Loop(learner, training, validation, config, folder, initial, budget_seconds)
     on_start(loop.steps_done)
     # Decoding of the next batches goes on while the device is busy with this one.
     remaining = prefetched(loop.batches.training_batch, loop.steps_done, config.steps)
     # A training that was over already, as after a second start, makes no step.
-    for batch in remaining if loop.reason(budget_seconds) is None else ():
+    for batch in remaining if loop.reason is None else ():
         on_step(loop.steps_done + 1, loop.advance(batch))
         # The parameters at the end are worth evaluating whatever ended the training.
-        out_of_time = loop.seconds >= budget_seconds
-        if loop.steps_done % loop.batches.per_epoch == 0 or loop.steps_done == config.steps or out_of_time:
+        if loop.steps_done % loop.batches.per_epoch == 0 or loop.steps_done == config.steps or loop.out_of_time:
             on_evaluation(loop.evaluate())
             loop.save()
         elif loop.steps_done % config.checkpoint_steps == 0:
             loop.save()
-        if loop.reason(budget_seconds) is not None:
+        if loop.reason is not None:
             break
-    return loop.result(budget_seconds)
+    return loop.result()
 
 
 class _Loop:
@@ -459,33 +444,49 @@ class _Loop:
         config: TrainingConfig,
         folder: Path | None,
         initial: TrainedEstimator | None,
+        budget_seconds: float,
     ) -> None:
         self._learner, self._config, self._folder = learner, config, folder
+        self._budget = budget_seconds
         # Figures of the training data also scale the validation loss: they belong to the loss, not to the data.
         scale = DataScale.of(training)
         self.batches = batches_of(learner, training, config)
         self._validation = batches_of(learner, validation, config)
         self._identity = training_identity(learner, training, validation, config, initial)
+        require_agreement(zlib.crc32(json.dumps(self._identity, sort_keys=True).encode()), "data, settings or versions")
         self._train_step = make_train_step(learner, config, scale)
         self._evaluate_step = make_evaluate_step(learner, scale, config.weighting)
         self._schedule = learning_rate_schedule(config)
-        self._state = initial_state(learner, config, None if initial is None else initial.params)
-        before = 0.0
-        saved = checkpoint_steps(folder) if folder is not None else []
-        if folder is not None and saved:
-            self._state, progress = load_checkpoint(folder, saved[-1], self._state, self._identity)
-            # Time counts over all starts, so that a budget is kept.
-            before = progress["seconds"]
+        self._state, before = self._begun(None if initial is None else initial.params)
+        # Time counts over all starts, so that a budget is kept.
         self._started = time.perf_counter() - before
         self.steps_done = int(self._state.step)
+        self.out_of_time = self._is_out_of_time()
+        """Whether the budget was spent when the last step ended."""
+
+    def _begun(self, params: Any) -> tuple[TrainState, float]:
+        """The state to go on from, on all devices, and the seconds that were spent on it."""
+        state, before = initial_state(self._learner, self._config, params), 0.0
+        if self._folder is not None:
+            # The first process's list counts: another one may see a file later.
+            newest = int(agreed(np.int32(max(checkpoint_steps(self._folder), default=-1))))
+            if newest >= 0:
+                state, progress = load_checkpoint(self._folder, newest, state, self._identity)
+                before = progress["seconds"]
+        # Also a state that no process has read: processors of different kinds may draw other last bits.
+        return everywhere(agreed(state)), float(agreed(np.float32(before)))
 
     @property
     def seconds(self) -> float:
         return time.perf_counter() - self._started
 
+    def _is_out_of_time(self) -> bool:
+        # Without a budget processes need not wait for each other to know.
+        return bool(np.isfinite(self._budget)) and bool(agreed(np.bool_(self.seconds >= self._budget)))
+
     def advance(self, batch: Batch) -> float:
         """One step; its loss."""
-        self._state, value = self._train_step(self._state, batch)
+        self._state, value = self._train_step(self._state, shared_out(batch))
         # Waits for the step: without it many steps would be queued, and a NaN be found long after its batch.
         loss = float(value)
         if not np.isfinite(loss):
@@ -495,33 +496,30 @@ class _Loop:
                 "it is kept"
             )
         self.steps_done += 1
+        self.out_of_time = self._is_out_of_time()
         return loss
 
     def evaluate(self) -> Progress:
         """Scores on the validation data; remembers the best parameters and starts new sums."""
-        sums = _no_sums()
+        sums = everywhere(_no_sums())
         # The moving average is what is evaluated and kept: it is less noisy than the parameters of any step.
         for batch in self._validation.evaluation_batches():
-            sums = jax.tree.map(jnp.add, sums, self._evaluate_step(self._state.average, batch))
+            sums = self._evaluate_step(self._state.average, sums, shared_out(batch))
         config, network = self._config, self._learner.config
         validation = evaluation_of(sums, network, config.cost_share, config.view_share)
         trained = evaluation_of(self._state.sums, network, config.cost_share, config.view_share)
         # NaN compares as worse than any best loss, so that training would go on in vain.
         if not np.isfinite(validation.loss):
             raise TrainingError(f"the validation loss after step {self.steps_done} is {validation.loss}")
-        state = dataclasses.replace(
-            self._state, sums=_no_sums(), evaluations_since_best=self._state.evaluations_since_best + 1
-        )
         # Strictly: of equal losses the first counts, so that patience ends a training that stands still.
-        if validation.loss < float(state.best_loss):
-            state = dataclasses.replace(
-                state,
-                best=state.average,
-                best_loss=jnp.float32(validation.loss),
-                best_step=jnp.int32(self.steps_done),
-                evaluations_since_best=jnp.int32(0),
-            )
-        self._state = state
+        better = validation.loss < float(self._state.best_loss)
+        since = 0 if better else int(self._state.evaluations_since_best) + 1
+        changes: dict[str, Any] = {"sums": _no_sums(), "evaluations_since_best": jnp.int32(since)}
+        if better:
+            changes |= {"best_loss": jnp.float32(validation.loss), "best_step": jnp.int32(self.steps_done)}
+        self._state = dataclasses.replace(
+            self._state, best=self._state.average if better else self._state.best, **everywhere(changes)
+        )
         return Progress(
             step=self.steps_done,
             epoch=self.steps_done / self.batches.per_epoch,
@@ -529,7 +527,7 @@ class _Loop:
             learning_rate=float(np.asarray(self._schedule(self.steps_done))),
             training=trained,
             validation=validation,
-            best_step=int(state.best_step),
+            best_step=int(self._state.best_step),
         )
 
     def save(self) -> None:
@@ -537,22 +535,23 @@ class _Loop:
         if self._folder is not None:
             save_checkpoint(self._folder, self.steps_done, self._state, self._identity, {"seconds": self.seconds})
 
-    def reason(self, budget_seconds: float) -> str | None:
+    @property
+    def reason(self) -> str | None:
         """Why training is over, or None."""
         if self.steps_done >= self._config.steps:
             return "planned"
         # After the plan, which is the usual end: its name says that the schedule was completed.
         if self._config.patience and int(self._state.evaluations_since_best) >= self._config.patience:
             return "patience"
-        return "time" if self.seconds >= budget_seconds else None
+        return "time" if self.out_of_time else None
 
-    def result(self, budget_seconds: float) -> Trained:
+    def result(self) -> Trained:
         """The best parameters so far."""
         return Trained(
             params=self._state.best,
             best_step=int(self._state.best_step),
             best_loss=float(self._state.best_loss),
             steps=self.steps_done,
-            reason=self.reason(budget_seconds) or "planned",
+            reason=self.reason or "planned",
             seconds=self.seconds,
         )

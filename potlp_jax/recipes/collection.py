@@ -22,6 +22,7 @@ from jaxtyping import Array, Int32, PRNGKeyArray, UInt8
 from potlp_jax.checks import AT_LEAST_ONE, require_fields
 from potlp_jax.codec import json_copy
 from potlp_jax.engine.engine import Broken, Engine, Here
+from potlp_jax.engine.writer import only_writer
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import DatasetError
@@ -149,33 +150,41 @@ def collect(
         tell: called at the start and after every shard.
 
     Raises:
-        DatasetError: the folder holds a dataset with other metadata, or ``worlds`` does not fill whole shards.
+        DatasetError: the folder holds a dataset with other metadata, another command collects into it, or ``worlds``
+            does not fill whole shards.
     """
-    size = config.worlds_per_shard
-    shards = _whole_shards(worlds, size)
+    shards = _whole_shards(worlds, config.worlds_per_shard)
     # Before anything is made: a collection with other settings must not mix with what is there.
     metadata = dataset_metadata(generator, environment, split, config)
+    estimator = named_estimator(config.estimator) if config.estimator else None
+    folder.mkdir(parents=True, exist_ok=True)
+    with only_writer(folder, DatasetError):
+        _collect_missing(_Job(generator, split, config, metadata, estimator), shards, folder, engine or Here(), tell)
+
+
+def _collect_missing(job: _Job, shards: int, folder: Path, engine: Engine, tell: Callable[[Collected], None]) -> None:
+    """Record and write the shards that are not there."""
+    size = job.config.worlds_per_shard
     finished = finished_shards(folder)
     # What is there was recorded with settings of its own; a dataset has one set of them.
-    differences = read_metadata(folder).differences(metadata) if finished else []
+    differences = read_metadata(folder).differences(job.metadata) if finished else []
     if differences:
         raise DatasetError(
             f"{folder} holds a dataset that was collected otherwise ({'; '.join(differences)}): continue with the same "
             "settings, or choose an empty folder"
         )
-    # Nobody else writes to the folder now (docs/dataset.md), so temporary files are of processes that were killed.
+    # Nobody else writes to the folder now, so temporary files are of processes that were killed.
     remove_unfinished_files(folder)
     # What is finished stays as it is; a larger number of worlds adds shards.
     missing = [shard for shard in range(shards) if shard not in finished]
-    estimator = named_estimator(config.estimator) if config.estimator else None
-    job = _Job(generator, split, config, metadata, estimator)
+    worlds = shards * size
     views, done = 0, worlds - len(missing) * size
     tell(Collected(done, worlds, views))
-    for shard, found in (engine or Here()).run(_recorded, job, missing):
+    for shard, found in engine.run(_recorded, job, missing):
         if isinstance(found, Broken):
             raise DatasetError(f"shard {shard} of {folder} cannot be collected: {found.error}")
         (recorder,) = found
-        write_shard(folder, shard, recorder.worlds, recorder.views, recorder.samples, metadata)
+        write_shard(folder, shard, recorder.worlds, recorder.views, recorder.samples, job.metadata)
         views, done = views + len(recorder.views["view"]), done + size
         tell(Collected(done, worlds, views))
 

@@ -6,6 +6,9 @@ also by SIGKILL, resumes and ends with the same parameters, bit for bit, as with
 
 With a time to keep, the speed is measured first, and as many steps are planned as fit, at most ``epochs``; the learning
 rate's schedule ends with the plan. The plan is written once, so that a resumed training follows it.
+
+Several processes may share a fit (``learning.devices``): all of them call ``fit`` with one
+folder, to which the first one writes.
 """
 
 import dataclasses
@@ -16,12 +19,15 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from potlp_jax.checks import AT_LEAST_ONE, require_fields
 from potlp_jax.codec import differences
 from potlp_jax.errors import TrainingError
 from potlp_jax.files import MOST_TEXT, read_json, reading
 from potlp_jax.learning.building_learner import BuildingOptions
 from potlp_jax.learning.dataset import Samples
+from potlp_jax.learning.devices import agreed, is_first, mesh
 from potlp_jax.learning.estimator import TrainedEstimator, read_estimator
 from potlp_jax.learning.learner import Learner
 from potlp_jax.learning.learners import learner_of
@@ -86,7 +92,7 @@ def fit(
         validation: of other worlds; decides which parameters are the best.
         out: the fit's folder.
         config: what is fitted, and how.
-        display: shows how it goes.
+        display: shows how it goes; of the first process alone.
         initial: an estimator to go on from, whose network is kept as it is; a new one by default.
 
     Returns:
@@ -98,15 +104,14 @@ def fit(
     """
     begin = None if initial is None else read_estimator(initial)
     learner = config.network.learner(training) if begin is None else _learner_of(begin, training)
-    out.mkdir(parents=True, exist_ok=True)
     # Measuring counts: the time asked for is that of the whole command.
     began = time.perf_counter()
     plan = _plan(learner, training, out, config)
-    _say_what_is_fitted(training, plan, config, display)
-    journal = Journal(out, plan.steps, display)
+    journal = _begin_journal(training, plan, out, config, display) if is_first() else None
     budget = float("inf")
     if config.minutes is not None:
         budget = config.minutes * 60 * _OVERRUN - (time.perf_counter() - began)
+    observers: dict[str, Any] = {} if journal is None else journal.observers()
     # The journal is closed whatever happens, so that TensorBoard's file is whole.
     try:
         trained = train(
@@ -117,17 +122,26 @@ def fit(
             initial=begin,
             folder=out / "checkpoints",
             budget_seconds=budget,
-            on_start=journal.start,
-            on_step=journal.step,
-            on_evaluation=journal.evaluation,
+            **observers,
         )
     finally:
-        journal.close()
-    # Whoever has the file alone can still say how it was made.
-    made_from = provenance(training, validation, begin)
-    metadata = made_from | _metadata(training, plan, trained, journal)
-    save_estimator(out / ESTIMATOR, trained.params, learner.config, training.metadata.domain, metadata)
+        if journal is not None:
+            journal.close()
+    if journal is not None:
+        # Whoever has the file alone can still say how it was made.
+        metadata = provenance(training, validation, begin) | _metadata(training, plan, trained, journal)
+        save_estimator(out / ESTIMATOR, trained.params, learner.config, training.metadata.domain, metadata)
     return trained
+
+
+def _begin_journal(training: Samples, plan: TrainingConfig, out: Path, config: FitConfig, display: Display) -> Journal:
+    devices = mesh().size
+    shared = f"; shared by {devices} devices" if devices > 1 else ""
+    display.say(
+        f"a {config.network.kind} network; {len(training.images)} views, {len(training.success)} samples; {plan.steps} "
+        f"steps in at most {config.epochs} epochs{shared}"
+    )
+    return Journal(out, plan.steps, display)
 
 
 def _learner_of(begin: TrainedEstimator, training: Samples) -> Learner:
@@ -151,13 +165,13 @@ def _plan(learner: Learner, training: Samples, out: Path, config: FitConfig) -> 
 
 
 def planned_steps(folder: Path, epoch: int, config: FitConfig, measure: Callable[[], float]) -> int:
-    """Steps to plan; where there is a plan already, what it says.
+    """Steps to plan; where there is a plan already, what it says. The first process's plan is that of all.
 
     Args:
         folder: where ``plan.json`` is.
         epoch: steps in an epoch.
         config: how many epochs and how much time.
-        measure: gives the seconds that a step takes; called where a plan must be made for a time.
+        measure: gives the seconds that a step takes; called, by all processes, where a plan must be made for a time.
 
     Returns:
         The number of steps. A resumed training must not measure again: another number would be another schedule.
@@ -168,33 +182,33 @@ def planned_steps(folder: Path, epoch: int, config: FitConfig, measure: Callable
     # What the number of steps follows from. Other options are compared with the checkpoint.
     asked = {"epochs": config.epochs, "minutes": config.minutes, "seed": config.training.seed}
     path = folder / "plan.json"
-    if path.exists():
-        plan = read_json(path, TrainingError, "the plan of a training", MOST_TEXT)
-        with reading(path, TrainingError, "the plan of a training"):
-            found, steps = differences(plan["asked"], asked), int(plan["steps"])
-        if found:
-            raise TrainingError(f"{path} was made for another training ({'; '.join(found)}): choose another folder")
-        if steps < 1:
-            raise TrainingError(f"{path} plans {steps} steps: delete it to plan again")
-        return steps
-    plan = {"asked": asked, "steps": config.epochs * epoch}
+    written = int(agreed(np.int32(_written_steps(path, asked) if is_first() and path.exists() else 0)))
+    if written:
+        return written
+    plan: dict[str, Any] = {"asked": asked, "steps": config.epochs * epoch}
     if config.minutes is not None:
-        plan["seconds_per_step"] = measure()
+        plan["seconds_per_step"] = float(agreed(np.float32(measure())))
         # At least one step, however short the time: the estimator is then poor, but there is one.
         fitting = int(config.minutes * 60 * (1 - _RESERVE) / plan["seconds_per_step"])
         plan["steps"] = max(1, min(plan["steps"], fitting))
-    # Renamed when it is whole: half a plan would stop every resumption.
-    temporary = path.with_suffix(".json.tmp")
-    temporary.write_text(json.dumps(plan))
-    temporary.replace(path)
+    if is_first():
+        folder.mkdir(parents=True, exist_ok=True)
+        # Renamed when it is whole: half a plan would stop every resumption.
+        temporary = path.with_suffix(".json.tmp")
+        temporary.write_text(json.dumps(plan))
+        temporary.replace(path)
     return int(plan["steps"])
 
 
-def _say_what_is_fitted(training: Samples, plan: TrainingConfig, config: FitConfig, display: Display) -> None:
-    display.say(
-        f"a {config.network.kind} network; {len(training.images)} views, {len(training.success)} samples; {plan.steps} "
-        f"steps in at most {config.epochs} epochs"
-    )
+def _written_steps(path: Path, asked: dict[str, Any]) -> int:
+    plan = read_json(path, TrainingError, "the plan of a training", MOST_TEXT)
+    with reading(path, TrainingError, "the plan of a training"):
+        found, steps = differences(plan["asked"], asked), int(plan["steps"])
+    if found:
+        raise TrainingError(f"{path} was made for another training ({'; '.join(found)}): choose another folder")
+    if steps < 1:
+        raise TrainingError(f"{path} plans {steps} steps: delete it to plan again")
+    return steps
 
 
 def _metadata(training: Samples, plan: TrainingConfig, trained: Trained, journal: Journal) -> dict[str, Any]:

@@ -43,6 +43,10 @@ class Journal:
         self._rows: list[Row] = []
         self._writer: SummaryWriter | None = None
 
+    def observers(self) -> dict[str, Callable[..., None]]:
+        """What ``learning.training.train`` tells how it goes."""
+        return {"on_start": self.start, "on_step": self.step, "on_evaluation": self.evaluation}
+
     def start(self, step: int) -> None:
         """Training starts with ``step`` steps done."""
         if step:

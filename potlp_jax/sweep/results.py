@@ -51,6 +51,34 @@ class Results:
         return {"specification": self.specification, "cells": [cell.to_dict() for cell in self.cells]}
 
 
+@dataclasses.dataclass(frozen=True)
+class SweepStatus:
+    """How far a sweep is.
+
+    Attributes:
+        done, total: trials that have rows, and all.
+        broken: trials that were given up.
+        of_policies: trials that have rows, by policy.
+    """
+
+    done: int
+    total: int
+    broken: int
+    of_policies: Mapping[str, int]
+
+
+def read_status(store: Store) -> SweepStatus:
+    """How far a sweep is; reads no row."""
+    specification, done = store.facts()["specification"], store.counts()
+    policies = specification["policies"]
+    return SweepStatus(
+        done=sum(done.values()),
+        total=len(specification["cells"]) * len(policies) * specification["worlds"],
+        broken=len(store.broken()),
+        of_policies={policy: done.get(policy, 0) for policy in policies},
+    )
+
+
 def read_results(store: Store) -> Results:
     """The results of a sweep, finished or not."""
     specification = store.facts()["specification"]

@@ -12,8 +12,9 @@ from pathlib import Path
 
 from potlp_jax.engine.engine import Broken, Engine
 from potlp_jax.engine.opening import open_engine
+from potlp_jax.engine.writer import only_writer
 from potlp_jax.environments.splits import MAX_INDEX
-from potlp_jax.errors import SweepError, WorldError
+from potlp_jax.errors import StoreError, SweepError, WorldError
 from potlp_jax.learning.estimator import identity_of
 from potlp_jax.sweep.ending import KEPT, ending_when_asked
 from potlp_jax.sweep.specification import Cell, Specification
@@ -211,14 +212,15 @@ def run_sweep(
         begun: is called once with the engine, if there is anything to do.
 
     Raises:
-        StoreError: the folder holds another sweep, or cannot be written; of a sweep that is finished nothing is.
+        StoreError: the folder holds another sweep, cannot be written, or another command works on it; of a sweep that
+            is finished nothing is written.
         EngineError, SweepError: nobody is left who could do the work; what is finished is kept.
         SystemExit: the process was asked to end (SIGTERM); it and its workers do within two seconds.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if _is_finished(specification, folder):
         return
-    with ending_when_asked():
+    with ending_when_asked(), only_writer(folder, StoreError):
         sweep = Sweep(specification, folder)
         try:
             with open_engine(processes, cluster) as engine:

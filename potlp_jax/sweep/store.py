@@ -337,7 +337,11 @@ class Store:
 
     def count(self) -> int:
         """Finished trials."""
-        return self._execute("SELECT count(*) FROM trials")[0][0]
+        return sum(self.counts().values())
+
+    def counts(self) -> dict[str, int]:
+        """Finished trials by policy; none of a policy that has none."""
+        return dict(self._execute("SELECT policy, count(*) FROM trials GROUP BY policy"))
 
 
 def _key(item: Item) -> tuple[str, str, str, int]:
