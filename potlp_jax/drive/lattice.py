@@ -110,6 +110,11 @@ class Lattice:
         """Row and column of the lattice at a point in the map's metres."""
         return self._anchor.metres_to_cell(x, y)
 
+    def position_of(self, x: float, y: float) -> tuple[float, float]:
+        """Rows and columns, with their parts, from the anchor; the centre of cell (0, 0) is at (0.5, 0.5)."""
+        across, up = self._anchor.to_grid(np.array([[x, y]], dtype=np.float64))[0]
+        return -float(up), float(across)
+
     def lay(self, scan: Scan) -> Int8[np.ndarray, "H W"]:
         """A map on the window, which grows where it must: values of ``BeliefMap.cells``."""
         free = (scan.occupancy >= 0) & (scan.occupancy <= self._config.free)

@@ -6,6 +6,7 @@ for "now".
 
 import base64
 import binascii
+import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -33,9 +34,7 @@ def stamp_of(message: Message) -> int:
     """Nanoseconds of a header's stamp, of ROS 1 or ROS 2. Raises RobotError."""
     try:
         stamp = message["header"]["stamp"]
-        seconds, parts = (
-            (stamp["sec"], stamp["nanosec"]) if "sec" in stamp else (stamp["secs"], stamp["nsecs"])
-        )
+        seconds, parts = (stamp["sec"], stamp["nanosec"]) if "sec" in stamp else (stamp["secs"], stamp["nsecs"])
         return int(seconds) * 1_000_000_000 + int(parts)
     except _FAULTS as error:
         raise RobotError(f"a message without a stamp: {short(repr(error))}") from error
@@ -199,6 +198,6 @@ def make_path(points: Sequence[tuple[float, float]], frame_id: str) -> dict[str,
 
 def with_headings(points: Sequence[tuple[float, float]]) -> list[tuple[float, float, float]]:
     """Points and the directions to the ones after; the last keeps that of the one before."""
-    yaws = [math.atan2(y1 - y0, x1 - x0) for (x0, y0), (x1, y1) in zip(points[:-1], points[1:], strict=True)]
+    yaws = [math.atan2(y1 - y0, x1 - x0) for (x0, y0), (x1, y1) in itertools.pairwise(points)]
     yaws.append(yaws[-1] if yaws else 0.0)
     return [(x, y, yaw) for (x, y), yaw in zip(points, yaws, strict=True)]

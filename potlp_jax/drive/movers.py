@@ -71,8 +71,7 @@ class Navigator:
         self._end: Ended | None = None
 
     def begin(self, points: Points, frame_id: str) -> None:
-        """Send a goal, in place of the one before."""
-        self.stop()
+        """Send a goal. Nav2 gives up the one before for it, without a halt between them."""
         with self._lock:
             number = self._current = next(self._numbers)
             self._end = None
@@ -109,5 +108,3 @@ def mover_of(config: DriveConfig, link: Link) -> Mover:
     """Who moves the robot by these settings."""
     commanding = config.mode in (Mode.NAVIGATE, Mode.FOLLOW)
     return Navigator(link, config.mode, config.topics.action) if commanding else Adviser()
-
-

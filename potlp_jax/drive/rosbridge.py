@@ -14,7 +14,7 @@ from potlp_jax.errors import RobotError
 PORT: int = 9090
 """Of rosbridge, unless another is given."""
 
-CONNECT_SECONDS: float = 10.0
+CONNECT_SECONDS: int = 10
 
 
 class RosbridgeLink:
