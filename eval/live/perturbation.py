@@ -55,7 +55,7 @@ class Network:
         restart = self._perturbation.restart
         # A day later than it is: the clock of a robot counts from some other moment.
         shown = now + 86_400 if restart is None or now < restart else now - restart
-        nanoseconds = int(round(shown * SECOND))
+        nanoseconds = round(shown * SECOND)
         return {"sec": nanoseconds // SECOND, "nanosec": nanoseconds % SECOND}
 
     def send(self, now: float, topic: str, message: dict[str, Any]) -> None:

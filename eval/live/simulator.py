@@ -25,6 +25,9 @@ STEP = 0.1
 MAP_SECONDS = 0.5
 """Between maps."""
 
+WHOLE_SECONDS = 5.0
+"""Between whole maps where updates are sent: a map that was lost is not lost for ever, as a latched one is not."""
+
 
 @dataclass(frozen=True)
 class Floor:
@@ -102,7 +105,7 @@ class SimulatedLink:
         self._failures = behaviour.failures
         self._sent: tuple[int, ...] = ()
         self._subscribers: dict[str, Callable[[Message], None]] = {}
-        self.time, self._next_map = 0.0, 0.0
+        self.time, self._next_map, self._next_whole = 0.0, 0.0, 0.0
         self.published: list[tuple[str, str, Any]] = []
         self.goals: list[str] = []
         self.cancelled: list[str] = []
@@ -217,12 +220,12 @@ class SimulatedLink:
         size = self._floor.resolution / self._behaviour.pixels
         x, y = left * self._floor.resolution, (len(self._floor.rows) - 1 - bottom) * self._floor.resolution
         box = (int(top), int(left), int(bottom), int(right))
-        if self._behaviour.updates and box == self._sent:
+        if self._behaviour.updates and box == self._sent and self.time < self._next_whole:
             height, width = pixels.shape
             update = {"header": header, "x": 0, "y": 0, "width": width, "height": height, "data": _flat(pixels)}
             self._network.send(self.time, "/map_updates", update)
             return
-        self._sent = box
+        self._sent, self._next_whole = box, self.time + WHOLE_SECONDS
         # A little turned about its own corner: pixels then say what lies up to some centimetres beside them.
         yaw = self._behaviour.turns * min(1.0, self.time / 20)
         info = {"height": pixels.shape[0], "width": pixels.shape[1], "resolution": size, "origin": make_pose(x, y, yaw)}

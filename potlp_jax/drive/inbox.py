@@ -150,6 +150,9 @@ class Inbox:
             scan = Scan(scan.frame, np.where(newer, before.occupancy, scan.occupancy))
             self._pixel_stamps = np.where(newer, stamps, self._pixel_stamps)
         frame_id = str(message["header"].get("frame_id", "")).lstrip("/")
+        # The same once more is no news: whoever waits for the map goes on waiting.
+        if before is not None and before.frame == scan.frame and np.array_equal(before.occupancy, scan.occupancy):
+            return None
         return replace(self._heard, scan=scan, frame_id=frame_id, maps=self._heard.maps + 1)
 
     def _update(self, message: Message) -> Heard | None:
@@ -169,6 +172,8 @@ class Inbox:
         occupancy, self._pixel_stamps = scan.occupancy.copy(), stamps.copy()
         occupancy[area] = np.where(newer, values, occupancy[area])
         self._pixel_stamps[area] = np.where(newer, stamp, stamps[area])
+        if np.array_equal(occupancy, scan.occupancy):
+            return None
         return replace(self._heard, scan=Scan(scan.frame, occupancy), maps=self._heard.maps + 1)
 
     def _pose(self, message: Message) -> Heard | None:

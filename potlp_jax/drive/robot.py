@@ -31,6 +31,9 @@ POLL: float = 0.1
 HYSTERESIS: float = 0.1
 """Cells beyond a cell's edge from which on the robot is in the next: a pose trembles."""
 
+SETTLED: float = 1.0
+"""Seconds after the end of a navigation for which its last poses may still be on their way."""
+
 ASTRAY: int = 2
 """Cells from the path from which on a robot that somebody else drives goes elsewhere, and is advised anew."""
 
@@ -86,6 +89,7 @@ class RemoteRobot:
         self._sure.append(self._cell)
         self._inbox.take_poses()
         self._reported = self._lattice.origin
+        self._end_noticed = math.inf
 
     @property
     def origin(self) -> Cell:
@@ -137,6 +141,7 @@ class RemoteRobot:
     def _travel(self, planned: list[Cell], stop: Stop) -> Leg:
         """Along a path on the lattice; the cells of the leg are on it, too."""
         before, begun = Knowledge.of(self._belief()), self._clock()
+        self._end_noticed = math.inf
         self._mover.begin([self._metres(cell) for cell in planned[1:]], self.frame_id)
         while True:
             self._inbox.wait(POLL)
@@ -162,10 +167,17 @@ class RemoteRobot:
         if ended is not None and not ended.succeeded:
             return ended.words
         # Nothing would change, and the same goal would be sent again.
-        if ended is not None and not moved:
+        if not moved and ended is not None and self._has_settled(heard):
             return f"{ended.words}, and the robot has not moved"
         limit = self._config.silence + self._config.seconds_per_cell * cells
         return f"{cells - 1} cells took more than {limit:.0f} s: the robot is late" if now - begun > limit else ""
+
+    def _has_settled(self, heard: Heard) -> bool:
+        """Whether the navigation ended so long ago that the newest pose is the last one."""
+        if self._mover.ended() is None:
+            return False
+        self._end_noticed = min(self._end_noticed, self._clock())
+        return heard.heard >= self._end_noticed + SETTLED
 
     def _is_heard_again(self, heard: Heard) -> bool:
         """Whether poses come, now or within the time that one is patient."""
@@ -183,7 +195,7 @@ class RemoteRobot:
 
     def _is_over(self, heard: Heard, planned: list[Cell], leg: tuple[Cell, ...], before: Knowledge, stop: Stop) -> bool:
         """Whether a leg that goes well ends here."""
-        if leg and (self._cell == planned[-1] or self._mover.ended() is not None):
+        if leg and (self._cell == planned[-1] or self._has_settled(heard)):
             return True
         # Nobody's path is followed exactly; far from it another one may be better.
         if leg and not self._mover.commands and min(_distance(self._cell, cell) for cell in planned) > ASTRAY:
@@ -270,9 +282,7 @@ class RemoteRobot:
             (math.hypot(down, right), row + down, column + right)
             for down in range(-math.floor(reach), math.floor(reach) + 1)
             for right in range(-math.floor(reach), math.floor(reach) + 1)
-            if 0 <= row + down < free.shape[0]
-            and 0 <= column + right < free.shape[1]
-            and math.hypot(down, right) <= reach
+            if 0 <= row + down < height and 0 <= column + right < width and math.hypot(down, right) <= reach
         ]
         found = min((entry for entry in near if free[entry[1:]]), default=None)
         top, left = self._lattice.origin
