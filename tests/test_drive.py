@@ -271,7 +271,10 @@ def test_what_cannot_be_read_is_counted_and_changes_nothing():
 # Drives, in the simulation's time.
 
 
-def driven(mode, behaviour=Behaviour(), *, before=lambda _link: None, tasks=1, **settings):
+ORDINARY = Behaviour()
+
+
+def driven(mode, behaviour=ORDINARY, *, before=lambda _link: None, tasks=1, **settings):
     """Trials of a drive, and the link."""
     config = dataclasses.replace(CONFIG, mode=mode, **settings)
     link = SimulatedLink(FLOOR, behaviour, Network(Perturbation(), np.random.default_rng(0)))

@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 
 from jaxtyping import PRNGKeyArray
 
@@ -42,7 +42,7 @@ def drive_robot(
     listener: Callable[[Decision, BeliefMap], None] = lambda _decision, _belief: None,
     inbox: Inbox | None = None,
     clock: Callable[[], float] = time.monotonic,
-) -> Iterator[Trial]:
+) -> Generator[Trial, None, None]:
     """Drive, or advise, a robot behind a link.
 
     Args:

@@ -1,11 +1,12 @@
 """What is asked of a connection to a robot: the rest of this package knows no network."""
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from potlp_jax.drive.messages import Message
 
 
+@runtime_checkable
 class Link(Protocol):
     """A connection. Methods may be called from any thread, and callbacks come from any."""
 

@@ -4,7 +4,7 @@ import itertools
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from potlp_jax.drive.config import DriveConfig, Mode
 from potlp_jax.drive.link import Link
@@ -22,6 +22,7 @@ class Ended:
     words: str
 
 
+@runtime_checkable
 class Mover(Protocol):
     """Moves the robot along paths."""
 

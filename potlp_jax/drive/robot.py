@@ -75,7 +75,6 @@ class RemoteRobot:
         self._interrupted, self._say, self._clock = interrupted, say, clock
         heard = self._await_first()
         assert heard.scan is not None
-        assert heard.pose is not None
         self._lattice = Lattice(
             heard.scan.frame, LatticeConfig(config.resolution, config.radius, config.free, config.occupied)
         )
@@ -84,8 +83,7 @@ class RemoteRobot:
         self._entered: list[Cell] = []
         self._sure: list[Cell] = []
         self._laid = -1
-        self._lay(heard)
-        self._cell = self._first_cell(heard.pose)
+        self._cell = self._first_cell()
         self._sure.append(self._cell)
         self._inbox.take_poses()
         self._reported = self._lattice.origin
@@ -240,14 +238,23 @@ class RemoteRobot:
                 break
         return Leg(tuple(self._entered))
 
-    def _first_cell(self, pose: Pose) -> Cell:
-        cell = self._snapped(self._lattice.cell_of(*pose[:2]))
-        if cell is None:
-            raise RobotError(
-                f"the robot is at [{pose[0]:.2f}, {pose[1]:.2f}], where its map has no free cell within "
-                f"{FARTHEST_SNAP:g} cells: is it localised, and is the radius of {self._config.radius:g} m right?"
-            )
-        return cell
+    def _first_cell(self) -> Cell:
+        """Where the robot is at first. A pose that is not on the map may be an error of localisation: it waits."""
+        begun = self._clock()
+        while True:
+            heard = self._inbox.heard
+            assert heard.pose is not None
+            self._lay(heard)
+            cell = self._snapped(self._lattice.cell_of(*heard.pose[:2]))
+            if cell is not None:
+                return cell
+            if self._interrupted() or self._clock() - begun > self._config.patience:
+                raise RobotError(
+                    f"the robot is at [{heard.pose[0]:.2f}, {heard.pose[1]:.2f}], where its map has no free cell "
+                    f"within {FARTHEST_SNAP:g} cells: is it localised, and is the radius of {self._config.radius:g} m "
+                    "right?"
+                )
+            self._inbox.wait(POLL)
 
     def _follow(self, poses: Sequence[Pose]) -> None:
         """Enter the cells that the poses lie in; between cells that are no neighbours, along the shortest path."""
