@@ -325,7 +325,7 @@ def test_a_silent_robot_is_stopped_and_goes_on_when_it_is_heard_again():
 
 
 def test_a_robot_that_is_silent_for_good_ends_the_drive():
-    (trial,), link = driven(Mode.NAVIGATE, Behaviour(silent=(2.0, math.inf)), patience=5.0)
+    (trial,), link = driven(Mode.NAVIGATE, Behaviour(silent=(2.0, math.inf)), silence=0.5, patience=5.0)
     assert trial.outcome == "unfinished"
     assert link.cancelled
 

@@ -184,7 +184,7 @@ class RemoteRobot:
         if silent:
             self._say("stopped: nothing is heard of the robot's pose")
         while self._clock() - self._inbox.heard.heard > self._config.silence:
-            if self._interrupted() or self._clock() - begun > self._config.patience:
+            if self._clock() - begun > self._config.patience:
                 return False
             self._inbox.wait(POLL)
         if silent:
@@ -210,7 +210,7 @@ class RemoteRobot:
     def _await_first(self) -> Heard:
         begun = self._clock()
         while (heard := self._inbox.heard).scan is None or heard.pose is None:
-            if self._interrupted() or self._clock() - begun > self._config.patience:
+            if self._clock() - begun > self._config.patience:
                 missing = "no map" if heard.scan is None else "no pose in the frame of the map"
                 topics = self._config.topics
                 raise RobotError(
@@ -248,7 +248,7 @@ class RemoteRobot:
             cell = self._snapped(self._lattice.cell_of(*heard.pose[:2]))
             if cell is not None:
                 return cell
-            if self._interrupted() or self._clock() - begun > self._config.patience:
+            if self._clock() - begun > self._config.patience:
                 raise RobotError(
                     f"the robot is at [{heard.pose[0]:.2f}, {heard.pose[1]:.2f}], where its map has no free cell "
                     f"within {FARTHEST_SNAP:g} cells: is it localised, and is the radius of {self._config.radius:g} m "
