@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from potlp_jax.trials.batch import run_batch as run_batch
     from potlp_jax.trials.config import TrialConfig as TrialConfig
     from potlp_jax.trials.config import trial_config_for as trial_config_for
-    from potlp_jax.trials.loop import run_robot as run_robot
+    from potlp_jax.trials.live import run_robot as run_robot
     from potlp_jax.trials.loop import run_trial as run_trial
     from potlp_jax.trials.record import Outcome as Outcome
     from potlp_jax.trials.record import RunRecord as RunRecord
@@ -167,7 +167,8 @@ _MODULES: dict[str, tuple[str, ...]] = {
     "task.task": ("Task", "TaskArrays", "TaskSizes", "stack_tasks"),
     "trials.batch": ("Finished", "Start", "run_batch"),
     "trials.config": ("TrialConfig", "trial_config_for"),
-    "trials.loop": ("run_robot", "run_trial"),
+    "trials.live": ("run_robot",),
+    "trials.loop": ("run_trial",),
     "trials.record": ("Outcome", "RunRecord", "Trial", "load_trial"),
     "trials.robot": ("Leg", "Robot"),
     "trials.rules": ("Stop",),

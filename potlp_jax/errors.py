@@ -144,5 +144,9 @@ class LogError(PotlpError):
     """A log cannot be used: names the file or topic, what is wrong, and what to do."""
 
 
+class RobotError(PotlpError):
+    """A robot broke its side of the contract, or cannot be reached; the message says what it did, and what is right."""
+
+
 class PictureError(PotlpError):
     """A picture cannot be written as asked; the message names the file and what to do."""

@@ -26,7 +26,8 @@ from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.specification import specification_from_dict
 from potlp_jax.trials.batch import Start, run_batch
 from potlp_jax.trials.config import TrialConfig, trial_config_for
-from potlp_jax.trials.loop import run_robot, run_trial
+from potlp_jax.trials.live import run_robot
+from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.robot import SimulatedRobot
 from potlp_jax.trials.run import default_policy
 from potlp_jax.world.camera import CameraConfig

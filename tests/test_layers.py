@@ -30,6 +30,7 @@ ORDER = (
     "sweep",
     "recipes",
     "logs",
+    "drive",
     "bench",
     "view",
     "cli",
@@ -72,6 +73,7 @@ def test_only_one_module_imports_each_heavy_neighbour():
         "typer": {"cli"},
         "matplotlib": {"view"},
         "rosbags": {"logs"},
+        "roslibpy": {"drive"},
         "distributed": {"engine"},
     }.items():
         users = {

@@ -17,7 +17,8 @@ from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task
 from potlp_jax.trials.batch import Start, run_batch
 from potlp_jax.trials.config import TrialConfig
-from potlp_jax.trials.loop import run_robot, run_trial
+from potlp_jax.trials.live import run_robot
+from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import Outcome, load_trial
 from potlp_jax.trials.replay import replay_decision
 from potlp_jax.trials.robot import Leg, SimulatedRobot

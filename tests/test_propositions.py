@@ -27,7 +27,8 @@ from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import Task, stack_tasks
 from potlp_jax.trials.batch import Start, run_batch
 from potlp_jax.trials.config import TrialConfig
-from potlp_jax.trials.loop import run_robot, run_trial
+from potlp_jax.trials.live import run_robot
+from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.robot import SimulatedRobot
 from potlp_jax.trials.rules import first_tally
 from potlp_jax.trials.run import run

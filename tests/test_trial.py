@@ -203,7 +203,7 @@ def test_damaged_records_are_refused(tmp_path):
     path.write_text(json.dumps({"format": "potlp-trial-1"}))
     with pytest.raises(RecordError, match=r"found 'potlp-trial-1'\); run `potlp run` again"):
         load_trial(path)
-    path.write_text(json.dumps({"format": "potlp-trial-2"}))
+    path.write_text(json.dumps({"format": "potlp-trial-3"}))
     with pytest.raises(RecordError, match="its checksum differs"):
         load_trial(path)
     world = ROOMS.generate(world_key(Split.VALIDATION, 0, "rooms"))

@@ -72,13 +72,15 @@ def _trial(path: Path) -> tuple[int, list[tuple[str, str]]]:
     from potlp_jax.cli.inputs import record_file
     from potlp_jax.environments.registry import make
     from potlp_jax.environments.splits import Split
-    from potlp_jax.trials.record import LOG_PREFIX, load_trial
+    from potlp_jax.trials.record import LOG_PREFIX, ROBOT_PREFIX, load_trial
     from potlp_jax.verify.audit import problems_of
 
     file = record_file(path)
     trial = load_trial(file)
     if trial.environment.startswith(LOG_PREFIX):
         fail(f"{file}: the trial is the replay of a robot's log: nobody but the log knows the world")
+    if trial.environment.startswith(ROBOT_PREFIX):
+        fail(f"{file}: a robot drove the trial: nobody but the robot knows the world")
     # As `potlp run` and `run` write it; the name of an environment may have slashes of its own.
     environment, _, split = trial.environment.rpartition("/")
     if not environment or split not in list(Split) or trial.world_number is None:

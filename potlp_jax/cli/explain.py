@@ -118,7 +118,7 @@ def _draw(trial: "Trial", decision: "Decision", out: Path, *, depth: int, estima
     if decision.observations:
         seen = {look: np.asarray(panorama_at(trial, trial.decisions[look])) for look in decision.observations}
         beside["panoramas"] = draw_panoramas(trial, decision, seen)
-    overlays = overlays_of(estimator_at(trial, decision.index, given), trial.belief_at(decision.step))
+    overlays = overlays_of(estimator_at(trial, decision.index, given), trial.belief_of(decision))
     if overlays:
         beside["map"] = draw_overlays(trial, decision, overlays)
     files = {out.with_name(f"{out.stem}-{name}.png"): figure for name, figure in beside.items()}

@@ -25,6 +25,7 @@ COMMANDS: Mapping[str, str] = MappingProxyType(
         "estimator": "potlp_jax.cli.estimator",
         "map": "potlp_jax.cli.maps",
         "log": "potlp_jax.cli.log",
+        "drive": "potlp_jax.cli.drive",
         "export": "potlp_jax.cli.export",
         "bench": "potlp_jax.cli.bench",
     }

@@ -119,14 +119,14 @@ def drive_path(
         # Cells entered, not time spent in them.
         if path and cell == path[-1]:
             continue
-        between = [cell] if not path else _shortest(main, path[-1], cell)
+        between = [cell] if not path else shortest(main, path[-1], cell)
         path += between
         entered += [number] * len(between)
     return path, np.array(entered)
 
 
-def _shortest(free: Bool[np.ndarray, "H W"], start: Cell, goal: Cell) -> list[Cell]:
-    """Cells of a shortest path, the start left out. Both ends are in one component, so that there is one."""
+def shortest(free: Bool[np.ndarray, "H W"], start: Cell, goal: Cell) -> list[Cell]:
+    """Cells of a shortest path, the start left out. Raises KeyError where the ends are not in one component."""
     # A* with the straight distance, which never exceeds the length of a path.
     best, came_from = {start: 0.0}, {}
     queue = [(0.0, start)]

@@ -19,7 +19,8 @@ from potlp_jax.planning.policies import Policy, PolicyFunction
 from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
-from potlp_jax.trials.loop import make_trial, run_robot
+from potlp_jax.trials.loop import drive as drive_robot
+from potlp_jax.trials.loop import make_trial
 from potlp_jax.trials.record import LOG_PREFIX, NEVER_SEEN, Decision, Trial
 from potlp_jax.trials.replay import Views, recall_views
 from potlp_jax.trials.robot import Leg
@@ -140,7 +141,7 @@ def replay(
     if isinstance(asked, TrainedEstimator):
         drive = from_first_picture(drive, config.camera)
         reader = PanoramaReader(drive, config.camera)
-    run = run_robot(
+    run = drive_robot(
         LoggedRobot(drive, reader),
         task,
         policy,

@@ -60,7 +60,7 @@ def policy_drives(
         travelled = np.cumsum([0.0, *step_lengths(trial.path)]).tolist()
         yield [
             Pose(
-                belief=trial.belief_at(decision.step),
+                belief=trial.belief_of(decision),
                 cell=decision.cell,
                 step=decision.step,
                 travelled=travelled[decision.step],

@@ -1,12 +1,13 @@
 """Algorithm 1 of Bradley et al. 2021: observe, decide, advance - until the task is satisfied.
 
-``run_trial`` simulates, ``run_robot`` drives any ``Robot``; both are the same loop. When a leg stops and when a trial
-ends is said in ``rules``.
+``run_trial`` simulates, ``trials.live.run_robot`` drives a robot of somebody else's; both are the same loop, ``drive``.
+When a leg stops and when a trial ends is said in ``rules``; what happens after a leg that failed, in ``setbacks``.
 """
 
 import dataclasses
 import importlib.metadata
 import logging
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -26,10 +27,11 @@ from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials import rules
 from potlp_jax.trials.config import TrialConfig, config_in
 from potlp_jax.trials.move_record import decision_of
-from potlp_jax.trials.record import Decision, Outcome, RunRecord, Trial
-from potlp_jax.trials.robot import Leg, Robot, SimulatedRobot
+from potlp_jax.trials.record import Decision, Outcome, RunRecord, Trial, with_closed
+from potlp_jax.trials.robot import GrowingRobot, Leg, Robot, SimulatedRobot
+from potlp_jax.trials.setbacks import SetbackConfig, Setbacks
 from potlp_jax.world.grid import BeliefMap, World
-from potlp_jax.world.moves import Cell, as_cell, path_length
+from potlp_jax.world.moves import Cell, path_length
 
 logger = logging.getLogger(__name__)
 
@@ -86,14 +88,18 @@ def run_trial(
     # One key for everything, and a use of its own for each: disturbing the camera does not change the search.
     robot = SimulatedRobot(world, config, rules.sensing_key(key))
     asked = rules.estimator_of(policy, task.propositions, Domain.of_world(world, config.camera), estimator)
-    run = run_robot(robot, task, policy, key, config, arrays=arrays, estimator=asked, world=world)
+    run = drive(robot, task, policy, key, config, arrays=arrays, estimator=asked, world=world)
     return make_trial(
         run, task, policy, config, asked, world, robot.first_seen, environment=environment, world_number=world_number
     )
 
 
+Listener = Callable[[Decision, BeliefMap], None]
+"""Is told each decision before it is carried out, and the map that it was planned on."""
+
+
 @in_32_bits
-def run_robot(
+def drive(
     robot: Robot,
     task: Task,
     policy: Policy | PolicyFunction | str,
@@ -103,6 +109,8 @@ def run_robot(
     arrays: TaskArrays | None = None,
     estimator: TrainedEstimator | Estimator | None = None,
     world: World | None = None,
+    setbacks: SetbackConfig | None = None,
+    listener: Listener | None = None,
 ) -> RunRecord:
     """Drive a robot, a simulated or a real one, until the task is satisfied or cannot go on.
 
@@ -116,6 +124,8 @@ def run_robot(
         estimator: what the policy asks, as in ``run_trial``. What worlds without a true map look like is not known: no
             shipped estimator serves them, and one is asked on request only.
         world: the true map, where it is known; only the policy ``oracle`` asks it.
+        setbacks: what to do after a leg that failed.
+        listener: is told each decision before it is carried out.
 
     Returns:
         How it ended, the path that was taken and every decision. What the robot did after the task was decided is left
@@ -128,7 +138,7 @@ def run_robot(
     """
     policy = named_policy(policy)
     # Nothing is asked of the robot's map but its names and shape: the loop observes for itself.
-    belief = robot.observe()[0]
+    belief, cell = robot.observe()
     require_same_propositions(
         task.propositions, belief.propositions, asker=f"the task {task.text!r}", knower="the robot's map"
     )
@@ -136,18 +146,23 @@ def run_robot(
     resolution = float(belief.resolution)
     here = Domain.of_robot(resolution) if world is None else Domain.of_world(world, config.camera)
     asked = rules.estimator_of(policy, task.propositions, here, estimator)
-    # An estimator that remembers where it was needs to know how large the map is.
-    height, width = belief.cells.shape
+
+    def first_estimator(shape: tuple[int, int]) -> Estimator | None:
+        # An estimator that remembers where it was needs to know how large the map is.
+        return rules.first_estimator(policy, asked, shape, config.panoramas, world)
+
     loop = _Loop(
         robot,
         task,
         task.arrays if arrays is None else arrays,
         policy,
-        rules.first_estimator(policy, asked, (height, width), config.panoramas, world),
+        first_estimator,
         key,
         config,
+        Setbacks(SetbackConfig() if setbacks is None else setbacks),
+        listener,
     )
-    return loop.run()
+    return loop.run(belief, cell)
 
 
 class _Loop:
@@ -159,26 +174,36 @@ class _Loop:
         task: Task,
         arrays: TaskArrays,
         policy: Policy | PolicyFunction,
-        estimator: Estimator | None,
+        first_estimator: Callable[[tuple[int, int]], Estimator | None],
         key: PRNGKeyArray,
         config: TrialConfig,
+        setbacks: Setbacks,
+        listener: Listener | None,
     ) -> None:
         self._robot, self._dfa, self._arrays = robot, task.dfa, arrays
-        self._policy, self._estimator, self._config = policy, estimator, config
+        self._policy, self._first_estimator, self._config = policy, first_estimator, config
+        self._setbacks, self._listener = setbacks, listener
         self._key = rules.planning_key(key)
-        belief, cell = robot.observe()
-        self._tally = _first_tally(belief, jnp.asarray(cell, jnp.int32), arrays)
-        self._path: list[Cell] = [cell]
-        self._word: list[int] = [int(belief.letters[cell])]
-        self._states: list[int] = [int(self._tally.state)]
+        self._path: list[Cell] = []
+        self._word: list[int] = []
+        self._states: list[int] = []
         self._decisions: list[Decision] = []
+        self._origin, self._shift, self._has_moved_map = (0, 0), (0, 0), False
 
-    def run(self) -> RunRecord:
-        """Loop until the task is satisfied or cannot go on."""
+    def run(self, belief: BeliefMap, cell: Cell) -> RunRecord:
+        """Loop until the task is satisfied or cannot go on.
+
+        Args:
+            belief: what the robot knows at first.
+            cell: where it is.
+
+        Returns:
+            What it did.
+        """
+        self._begin(belief, cell)
         # Algorithm 1 ends at acceptance; budget, repetition and a robot that ends are ours (docs/model.md section 7).
         gave_up, leg = False, Leg(cells=())
         while True:
-            belief, cell = self._robot.observe()
             at = jnp.asarray(cell, jnp.int32)
             self._tally = _arrive(self._tally, belief, at, self._arrays, jnp.asarray(gave_up), config=self._config)
             if not bool(self._tally.running):
@@ -186,11 +211,23 @@ class _Loop:
             # Asked only now: the last cells of a log may well decide the task.
             if leg.ended:
                 return self._result(Outcome.UNFINISHED, belief)
+            if self._setbacks.is_stuck:
+                return self._result(Outcome.STUCK, belief)
             move = self._decide(belief, cell)
-            leg = self._advance(belief, move)
-            # Without a move a simulated robot stays, and the task is infeasible. A robot in a log goes on, and there
-            # may be a move again later.
-            gave_up = int(move.kind) == MoveKind.NONE and not leg.cells and not leg.ended
+            leg = self._robot.advance(move.path, _stop_of(move, self._tally, belief, config=self._config))
+            known_before = belief
+            belief, cell = self._robot.observe()
+            cells = self._follow_map(known_before, belief, leg.cells)
+            self._after(leg, cells, move, belief)
+            gave_up = self._gave_up(leg, move, known_before, belief)
+
+    def _begin(self, belief: BeliefMap, cell: Cell) -> None:
+        self._tally = _first_tally(belief, jnp.asarray(cell, jnp.int32), self._arrays)
+        self._estimator = self._first_estimator(_shape(belief))
+        self._origin = _origin(self._robot)
+        self._path.append(cell)
+        self._word.append(int(belief.letters[cell]))
+        self._states.append(int(self._tally.state))
 
     def _decide(self, belief: BeliefMap, cell: Cell) -> Move:
         index = len(self._decisions)
@@ -199,8 +236,11 @@ class _Loop:
         # Before the decision, so that its estimates know what can be seen from here.
         if isinstance(self._estimator, ObservingEstimator):
             self._estimator = observe_panorama(self._estimator, self._robot.panorama(), belief, at)
+        # The robot's own cell is free, whatever was set aside.
+        closed = tuple(entry for entry in self._setbacks.closed_at(index, belief) if entry != cell)
+        planned_on = with_closed(belief, closed)
         move = _decide(
-            belief,
+            planned_on,
             at,
             self._tally.state,
             self._arrays,
@@ -211,25 +251,85 @@ class _Loop:
             config=self._config.decision,
         )
         step, state = len(self._path) - 1, self._states[-1]
-        self._decisions.append(decision_of(move, self._estimator, key, index=index, step=step, cell=cell, state=state))
+        decision = decision_of(move, self._estimator, key, index=index, step=step, cell=cell, state=state)
+        self._decisions.append(dataclasses.replace(decision, set_aside=closed))
         logger.debug("decision %d in cell %s, automaton state %d", index, cell, state)
+        if self._listener is not None:
+            self._listener(self._decisions[-1], planned_on)
         return move
 
-    def _advance(self, belief: BeliefMap, move: Move) -> Leg:
-        """Carry out a move; the tally counts where the robot really went."""
-        leg = self._robot.advance(move.path, _stop_of(move, self._tally, belief, config=self._config))
+    def _after(self, leg: Leg, cells: tuple[Cell, ...], move: Move, belief: BeliefMap) -> None:
+        """Count a leg, where the robot really went and whether it failed; ``cells`` are those of the map now."""
         self._tally = _count_decision(self._tally, move)
-        planned = np.asarray(move.path.cells)[1 : len(leg.cells) + 1]
-        if leg.cells != tuple(as_cell(cell) for cell in planned):
+        # From the record, which is on the map as it is now.
+        decision = self._decisions[-1]
+        if cells != decision.path[1 : len(cells) + 1]:
             # A robot that went elsewhere is not committed to what was chosen.
             self._tally = dataclasses.replace(self._tally, intention=Intention.none())
-        self._enter(leg.cells)
-        return leg
+        elif self._has_moved_map:
+            self._tally = dataclasses.replace(self._tally, intention=self._moved(move.intention))
+        self._enter(cells, belief)
+        if leg.failure:
+            self._fail(leg, decision, belief)
+        elif cells:
+            self._setbacks.went_well()
 
-    def _enter(self, cells: tuple[Cell, ...]) -> None:
+    def _fail(self, leg: Leg, decision: Decision, belief: BeliefMap) -> None:
+        """Record a failed leg, and set its target aside where it was not the first."""
+        self._decisions[-1] = dataclasses.replace(decision, failure=leg.failure)
+        target = decision.path[-1]
+        aside = self._setbacks.failed(target, belief, decision.index, moved=bool(leg.cells))
+        logger.warning(
+            "decision %d: %s; the target %s is %s",
+            decision.index,
+            leg.failure,
+            target,
+            "set aside for a while" if aside else "tried again",
+        )
+        # To decide again in the same place is what a retry is, and no sign of a cycle. No map knows as few cells.
+        self._tally = dataclasses.replace(self._tally, known=jnp.int32(-1))
+        if aside:
+            self._tally = dataclasses.replace(self._tally, intention=Intention.none())
+
+    def _gave_up(self, leg: Leg, move: Move, before: BeliefMap, belief: BeliefMap) -> bool:
+        """Whether the policy knows no move, and nothing will change that."""
+        # Without a move a simulated robot stays, and the task is infeasible. A robot in a log goes on, and there may be
+        # a move again later.
+        if int(move.kind) != MoveKind.NONE or leg.cells or leg.ended or leg.failure:
+            return False
+        if self._setbacks.release():
+            self._tally = dataclasses.replace(self._tally, known=jnp.int32(-1))
+            return False
+        # A simulated robot hands out the same map again; that of a real one may have changed while it stood.
+        return before is belief or _same_map(before, belief)
+
+    def _follow_map(self, before: BeliefMap, belief: BeliefMap, cells: tuple[Cell, ...]) -> tuple[Cell, ...]:
+        """Carry all cells that are remembered to the map as it is now; returns those of the leg there."""
+        origin = _origin(self._robot)
+        rows, columns = self._origin[0] - origin[0], self._origin[1] - origin[1]
+        self._has_moved_map = bool(rows or columns) or _shape(before) != _shape(belief)
+        if not self._has_moved_map:
+            return cells
+        self._origin, self._shift = origin, (rows, columns)
+        self._path = list(shifted_cells(self._path, rows, columns))
+        self._decisions = [shifted_decision(decision, rows, columns) for decision in self._decisions]
+        self._setbacks.shift(rows, columns)
+        # Visits begin anew, as whenever the map has changed.
+        visits = jnp.zeros((*_shape(belief), self._tally.visits.shape[2]), jnp.int8)
+        self._tally = dataclasses.replace(self._tally, visits=visits, known=jnp.int32(-1))
+        if isinstance(self._estimator, ObservingEstimator):
+            logger.warning("the map has outgrown its array: the estimator forgets what it saw on the former one")
+            self._estimator = self._first_estimator(_shape(belief))
+        return shifted_cells(cells, rows, columns)
+
+    def _moved(self, intention: Intention) -> Intention:
+        """An intention on the map as it is now."""
+        return dataclasses.replace(intention, cell=intention.cell + jnp.asarray(self._shift, jnp.int32))
+
+    def _enter(self, cells: tuple[Cell, ...], belief: BeliefMap) -> None:
         """Read the letters of the cells entered, up to where they decide the task."""
         # All at once after the leg: what was entered has been observed, and letters do not change.
-        letters = np.asarray(self._robot.observe()[0].letters)
+        letters = np.asarray(belief.letters)
         straight, diagonal = int(self._tally.straight), int(self._tally.diagonal)
         for cell in cells:
             state = self._states[-1]
@@ -259,6 +359,42 @@ class _Loop:
             decisions=tuple(self._decisions),
             status=int(self._tally.status),
         )
+
+
+def shifted_cells(cells: Sequence[Cell], rows: int, columns: int) -> tuple[Cell, ...]:
+    """The same cells on a map with so many rows and columns more above and to the left."""
+    return tuple((row + rows, column + columns) for row, column in cells)
+
+
+def shifted_decision(decision: Decision, rows: int, columns: int) -> Decision:
+    """The same decision on a map with so many rows and columns more above and to the left."""
+
+    def shift(cell: Cell | None) -> Cell | None:
+        return None if cell is None else (cell[0] + rows, cell[1] + columns)
+
+    return dataclasses.replace(
+        decision,
+        cell=(decision.cell[0] + rows, decision.cell[1] + columns),
+        target=shift(decision.target),
+        subgoals=shifted_cells(decision.subgoals, rows, columns),
+        actions=tuple(dataclasses.replace(action, cell=shift(action.cell)) for action in decision.actions),
+        path=shifted_cells(decision.path, rows, columns),
+        set_aside=shifted_cells(decision.set_aside, rows, columns),
+    )
+
+
+def _shape(belief: BeliefMap) -> tuple[int, int]:
+    height, width = belief.cells.shape
+    return height, width
+
+
+def _origin(robot: Robot) -> Cell:
+    """Where the robot's map begins."""
+    return robot.origin if isinstance(robot, GrowingRobot) else (0, 0)
+
+
+def _same_map(before: BeliefMap, belief: BeliefMap) -> bool:
+    return np.array_equal(before.cells, belief.cells) and np.array_equal(before.letters, belief.letters)
 
 
 def make_trial(

@@ -7,11 +7,12 @@ step at which the cell was first seen, so that the belief at any step - and with
 import dataclasses
 import json
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int32
 
@@ -31,11 +32,13 @@ from potlp_jax.world.grid import (
 )
 from potlp_jax.world.moves import Cell
 
-FORMAT = "potlp-trial-2"
+FORMAT = "potlp-trial-3"
 NEVER_SEEN: int = -1
 """Entry of ``first_seen`` for a cell that was never observed."""
 LOG_PREFIX: str = "log:"
 """How the ``environment`` of a trial begins that was made from a robot's log."""
+ROBOT_PREFIX: str = "robot:"
+"""How the ``environment`` of a trial begins that a robot drove (``trials.live``)."""
 
 
 class Outcome(StrEnum):
@@ -93,6 +96,10 @@ class Decision:
             where none is used.
         preferred: index of the action that the search found best. The robot commits to its former target unless that
             one is cheaper by enough, so that ``choice`` may differ. None unless the policy searches.
+        set_aside: cells that counted as obstacles in this decision, because the robot had failed to get there or past
+            them (``trials.setbacks``).
+        failure: why the robot could not carry the decision out, in its words; empty where it could.
+        extent: rows and columns by which dead ends were counted; None: those of the world.
     """
 
     index: int
@@ -112,6 +119,9 @@ class Decision:
     path: tuple[tuple[int, int], ...]
     observations: tuple[int, ...] = ()
     preferred: int | None = None
+    set_aside: tuple[tuple[int, int], ...] = ()
+    failure: str = ""
+    extent: tuple[int, int] | None = None
 
     @property
     def overruled(self) -> ActionRecord | None:
@@ -144,13 +154,36 @@ class RunRecord:
     status: int
 
 
+@dataclasses.dataclass(frozen=True)
+class Correction:
+    """What a cell was taken for in some decisions, where ``first_seen`` and the world say otherwise.
+
+    Attributes:
+        cell: row and column.
+        first, until: the first of these decisions, and the first one after them.
+        value: of ``BeliefMap.cells``.
+        letter: of the cell; 0 where it was not observed.
+    """
+
+    cell: tuple[int, int]
+    first: int
+    until: int
+    value: int
+    letter: int
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Trial(RunRecord):
     """A finished trial: a run, with the true map and all that it was made with.
 
+    Of a robot that drove where nobody knows the true map, the world is what the robot knew at the end; what it never
+    observed is an obstacle there.
+
     Attributes:
         first_seen: index into ``path`` at which each cell was first observed, or ``NEVER_SEEN``.
         world: the true map.
+        corrections: what a robot had seen wrongly and took back later; none in simulation, where seeing is perfect.
+        notes: what was noticed about the robot, in words.
         task_text, task_hoa, propositions: the task, also as an automaton, so that it is read without Spot.
         policy: a name, or ``module:attribute`` of a function.
         environment, world_number: where the world comes from; None where it has no number.
@@ -168,10 +201,28 @@ class Trial(RunRecord):
     world_number: int | None
     config: Mapping[str, Any]
     versions: Mapping[str, str]
+    corrections: tuple[Correction, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def belief_at(self, step: int) -> BeliefMap:
         """The belief after observing from ``path[step]``."""
         return belief_seen_by(self.world, self.first_seen, step)
+
+    def belief_of(self, decision: Decision) -> BeliefMap:
+        """What the robot knew at a decision; ``planned_on`` is what it planned with."""
+        belief = self.belief_at(decision.step)
+        corrected = [entry for entry in self.corrections if entry.first <= decision.index < entry.until]
+        if not corrected and decision.extent is None:
+            return belief
+        cells, letters = np.array(belief.cells), np.array(belief.letters)
+        for entry in corrected:
+            cells[entry.cell], letters[entry.cell] = entry.value, entry.letter
+        rows, columns = np.asarray(belief.extent).tolist() if decision.extent is None else decision.extent
+        return belief_from_numpy(cells, letters, float(belief.resolution), (rows, columns), belief.propositions)
+
+    def planned_on(self, decision: Decision) -> BeliefMap:
+        """What a decision was planned with: what the robot knew, and what was set aside closed."""
+        return with_closed(self.belief_of(decision), decision.set_aside)
 
     def summary(self) -> dict[str, Any]:
         """The figures of the trial without its arrays."""
@@ -193,13 +244,14 @@ class Trial(RunRecord):
         data = {
             field.name: getattr(self, field.name)
             for field in dataclasses.fields(self)
-            if field.name not in ("decisions", "first_seen", "world")
+            if field.name not in ("decisions", "first_seen", "corrections", "world")
         }
         data["outcome"] = str(self.outcome)
         # Arrays are packed; everything else is readable JSON.
         data["decisions"] = [_decision_to_dict(decision) for decision in self.decisions]
         data["status"] = list(status_names(self.status))
         data["first_seen"] = pack_array(self.first_seen)
+        data["corrections"] = pack_array(_correction_rows(self.corrections))
         data["world"] = world_to_dict(self.world)
         return finite_or_text({"format": FORMAT, **data})
 
@@ -220,6 +272,28 @@ def belief_seen_by(world: World, first_seen: Int32[np.ndarray, "H W"], step: int
     # The extent is known from the start, whatever the padding: budget and dead ends are counted by it.
     height, width = (int(size) for size in world.extent)
     return belief_from_numpy(cells, letters, float(world.resolution), (height, width), world.propositions)
+
+
+def with_closed(belief: BeliefMap, cells: Sequence[Cell]) -> BeliefMap:
+    """The belief with some cells taken for obstacles."""
+    # As it was, where there are none: nothing is copied from the device for most decisions. By NumPy otherwise, for the
+    # number of cells would be compiled.
+    if not cells:
+        return belief
+    at = tuple(np.array(cells, np.int32).T)
+    values, letters = np.array(belief.cells), np.array(belief.letters)
+    values[at], letters[at] = BeliefMap.OCCUPIED, 0
+    return dataclasses.replace(belief, cells=jnp.asarray(values), letters=jnp.asarray(letters))
+
+
+def _correction_rows(corrections: Sequence[Correction]) -> Int32[np.ndarray, "N 6"]:
+    # One array: a noisy map has thousands of them.
+    rows = [(*entry.cell, entry.first, entry.until, entry.value, entry.letter) for entry in corrections]
+    return np.array(rows, np.int32).reshape(-1, 6)
+
+
+def _corrections(rows: Int32[np.ndarray, "N 6"]) -> tuple[Correction, ...]:
+    return tuple(Correction((row, column), *rest) for row, column, *rest in rows.tolist())
 
 
 def record_checksum(data: Mapping[str, Any]) -> int:
@@ -270,6 +344,8 @@ def _trial_from_dict(data: Mapping[str, Any]) -> Trial:
         _decision_from_dict(decision, f"decision {index}") for index, decision in enumerate(data["decisions"])
     )
     values["first_seen"] = unpack_array(data["first_seen"])
+    values["corrections"] = _corrections(unpack_array(data["corrections"]))
+    values["notes"] = tuple(data["notes"])
     # Lists become tuples throughout: records are compared, and used as keys.
     values["world"] = world_from_dict(data["world"])
     require_same_propositions(values["propositions"], values["world"].propositions, remedy="run the trial again")
@@ -296,6 +372,13 @@ def _check(trial: Trial) -> None:
         raise ValueError("first_seen is not of the map's shape")
     if not all(0 <= decision.step < len(trial.path) for decision in trial.decisions):
         raise ValueError("a decision is not on the path")
+    closed = [cell for decision in trial.decisions for cell in decision.set_aside]
+    if not all(0 <= row < height and 0 <= column < width for row, column in (*closed, *_cells_of(trial.corrections))):
+        raise ValueError("a cell that was corrected, or set aside, is not on the map")
+
+
+def _cells_of(corrections: Sequence[Correction]) -> list[Cell]:
+    return [entry.cell for entry in corrections]
 
 
 def _decision_from_dict(data: Mapping[str, Any], where: str) -> Decision:
@@ -308,6 +391,8 @@ def _decision_from_dict(data: Mapping[str, Any], where: str) -> Decision:
     values["subgoals"] = _cells(data["subgoals"])
     values["path"] = _cells(data["path"])
     values["observations"] = tuple(data["observations"])
+    values["set_aside"] = _cells(data["set_aside"])
+    values["extent"] = None if data["extent"] is None else tuple(data["extent"])
     values["actions"] = tuple(_action_from_dict(action) for action in data["actions"])
     # An index that points nowhere would fail later, in a picture or a page, far from the file.
     listed = {action.index for action in values["actions"]}

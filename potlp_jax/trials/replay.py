@@ -26,7 +26,7 @@ from potlp_jax.planning.search.uct import UctTree
 from potlp_jax.planning.situation import DecisionConfig, assess, planning_problem
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials.config import TrialConfig
-from potlp_jax.trials.record import LOG_PREFIX, Decision, Trial
+from potlp_jax.trials.record import LOG_PREFIX, ROBOT_PREFIX, Decision, Trial
 from potlp_jax.trials.robot import photograph
 from potlp_jax.trials.rules import asked_of, first_estimator
 from potlp_jax.world.camera import Disturbance
@@ -77,7 +77,7 @@ def replay_decision(
     task = Task.from_hoa(trial.task_hoa, propositions=trial.propositions)
     config = config_from_dict(TrialConfig, trial.config, "trial record")
     problem = _replayed_problem(
-        trial.belief_at(decision.step),
+        trial.planned_on(decision),
         jnp.asarray(decision.cell, jnp.int32),
         jnp.int32(decision.state),
         task.arrays,
@@ -135,7 +135,7 @@ def _after_looking(
     """The estimator after the panorama of a decision; one that does not remember has seen nothing."""
     if not isinstance(asked, ObservingEstimator):
         return asked
-    cell, belief = jnp.asarray(decision.cell, jnp.int32), trial.belief_at(decision.step)
+    cell, belief = jnp.asarray(decision.cell, jnp.int32), trial.belief_of(decision)
     return observe_panorama(asked, jnp.asarray(panorama_of(decision)), belief, cell)
 
 
@@ -161,8 +161,10 @@ def panorama_at(trial: Trial, decision: Decision, config: TrialConfig | None = N
         The panorama, in the frame of the map.
 
     Raises:
-        RecordError: the trial is from a log, or its camera was disturbed.
+        RecordError: the trial is from a log or a robot, or its camera was disturbed.
     """
+    if trial.environment.startswith(ROBOT_PREFIX):
+        raise RecordError("a robot drove the trial: what its camera saw is not in the record")
     if trial.environment.startswith(LOG_PREFIX):
         raise RecordError(
             f"the trial is the replay of a robot's log, {trial.environment.removeprefix(LOG_PREFIX)}: its panoramas "
@@ -185,11 +187,13 @@ def views_of(trial: Trial, estimator: TrainedEstimator | Estimator | None = None
             estimator shows that is neither is left out, with a warning in the log.
 
     Returns:
-        The views; empty where the policy takes no panoramas.
+        The views; empty where the policy takes no panoramas, and where a robot drove, whose pictures nobody kept.
 
     Raises:
         RecordError: the panoramas cannot be made again (``panorama_at``).
     """
+    if trial.environment.startswith(ROBOT_PREFIX):
+        return Views()
     config = config_from_dict(TrialConfig, trial.config, "trial record")
     made_with = trial.versions.get("estimator")
     # Policies of the user's own may ask one too, which the record tells and the policy's name does not.
@@ -230,7 +234,7 @@ def recall_views(
     if isinstance(estimator, ShowsOverlays):
         for decision in trial.decisions:
             estimator = _after_looking(estimator, trial, decision, lambda at: look(at.index))
-            overlays[decision.index] = overlays_of(estimator, trial.belief_at(decision.step))
+            overlays[decision.index] = overlays_of(estimator, trial.belief_of(decision))
     return Views({number: look(number) for number in sorted({n for numbers in used for n in numbers})}, overlays)
 
 

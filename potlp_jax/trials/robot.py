@@ -1,7 +1,8 @@
 """What the loop of a trial asks of a robot, and the robot that is simulated.
 
 The loop knows a ``Robot`` only: a real one is another class with these three methods (``potlp_jax.logs.replaying`` has
-one that follows a log).
+one that follows a log, ``potlp_jax.drive`` one that is reached over the network). ``trials.watching`` checks what a
+robot of somebody else's says.
 """
 
 import dataclasses
@@ -31,18 +32,22 @@ class Leg:
     Attributes:
         cells: entered, in order, the start left out.
         ended: the robot will not move again: the log is at its end, the battery is empty, someone took over.
+        failure: why the robot could not go on along the path, in words; empty where it could. The target is tried again
+            and then set aside for a while (``trials.setbacks``).
     """
 
     cells: tuple[Cell, ...]
     ended: bool = False
+    failure: str = ""
 
 
 @runtime_checkable
 class Robot(Protocol):
     """What the loop asks of a robot: a simulated one, or a real one.
 
-    The map that a robot reports has one shape throughout a trial. Every cell that it enters must be free there, and
-    its letter known.
+    The map that a robot reports has one shape throughout a trial, unless it is a ``GrowingRobot``. Every cell that it
+    enters must be free in the map that it reports next, and its letter known. Cells may be taken back: the latest map
+    is what the robot knows.
     """
 
     def observe(self) -> tuple[BeliefMap, Cell]:
@@ -59,8 +64,19 @@ class Robot(Protocol):
     def advance(self, path: KnownPath, stop: Stop) -> Leg:
         """Follow ``path`` through known space, observing at every cell, until it ends or ``stop.is_due``.
 
-        At least one move is made where the path has one: otherwise nothing would change before the next decision.
+        At least one move is made where the path has one: otherwise nothing would change before the next decision. A
+        robot that cannot says why (``Leg.failure``). The cells of the leg are those of the map that the path is on.
         """
+        ...
+
+
+@runtime_checkable
+class GrowingRobot(Robot, Protocol):
+    """A robot whose map changes its shape, or where it begins, between two calls of ``observe``."""
+
+    @property
+    def origin(self) -> Cell:
+        """Row and column of the map's first cell in a lattice that never moves; both may be negative."""
         ...
 
 

@@ -155,7 +155,14 @@ def describe_move(trial: Trial, decision: Decision) -> str:
         move = action_name(chosen, task_of(trial)).replace(":", f"{target}:", 1)
     # Hysteresis: the robot keeps its target unless another is clearly better (docs/model.md, section 8).
     better = decision.overruled
-    return move if better is None else f"{move}; kept although {action_name(better, task_of(trial))} is better"
+    kept = "" if better is None else f"; kept although {action_name(better, task_of(trial))} is better"
+    return move + kept + _setbacks(decision)
+
+
+def _setbacks(decision: Decision) -> str:
+    """What a robot had failed to get to before, and whether it failed now; empty in simulation."""
+    aside = f"; {len(decision.set_aside)} cells were set aside after failed legs" if decision.set_aside else ""
+    return aside + (f"; the robot failed: {decision.failure}" if decision.failure else "")
 
 
 def decision_to_dict(decision: Decision) -> dict[str, Any]:

@@ -117,7 +117,7 @@ def _mark(axes: Axes, decision: Decision) -> None:
 def _picture(trial: Trial, decision: Decision, overlay: Overlay) -> UInt8[np.ndarray, "h w 3"]:
     """The map as it was known, below or around the overlay; squares of whole pixels for each cell."""
     rows, columns = map_extent(trial.world)
-    seen = ~np.asarray(trial.belief_at(decision.step).unknown)
+    seen = ~np.asarray(trial.belief_of(decision).unknown)
     known = cell_image(trial.world, seen, trial.propositions, hatch=False)
     scale = known.shape[0] // rows
     colours, mask = _laid(overlay, seen)

@@ -93,6 +93,7 @@ def replay_data(trial: Trial, views: Views) -> dict[str, Any]:
         "occupied": _base64(np.asarray(trial.world.occupied, np.uint8)),
         # Little-endian, as JavaScript's typed arrays are on every machine that runs a browser.
         "first_seen": _base64(np.asarray(trial.first_seen, "<i4")),
+        "corrections": _corrections(trial),
         "letters": [[int(row), int(column), int(letters[row, column])] for row, column in labelled],
         "propositions": list(trial.propositions),
         "area_colours": [area_colour(bit) for bit in range(len(trial.propositions))],
@@ -105,6 +106,16 @@ def replay_data(trial: Trial, views: Views) -> dict[str, Any]:
         "panoramas": {number: _jpeg(image) for number, image in views.panoramas.items()},
         **_overlays(views, (rows, columns)),
     }
+
+
+def _corrections(trial: Trial) -> list[list[int]]:
+    """Index of a cell, the steps from and until which it was shown otherwise, and what it was taken for."""
+    steps = [*(decision.step for decision in trial.decisions), len(trial.path)]
+    width = trial.world.shape[1]
+    return [
+        [entry.cell[0] * width + entry.cell[1], steps[entry.first], steps[entry.until], entry.value, entry.letter]
+        for entry in trial.corrections
+    ]
 
 
 def _overlays(views: Views, extent: tuple[int, int]) -> dict[str, Any]:

@@ -103,6 +103,12 @@ function mountReplay(root, data) {
     return pictures.get(source);
   }
 
+  // What a robot took a cell for and took back later; none in simulation.
+  function correctionsNow() {
+    const now = data.corrections.filter(([, from, until]) => from <= step && step < until);
+    return new Map(now.map(([index, , , value, letter]) => [index, { value, letter }]));
+  }
+
   function isKnown(row, column) {
     const first = seen[row * data.width + column];
     return first >= 0 && first <= step;
@@ -233,16 +239,25 @@ function mountReplay(root, data) {
 
   function drawCells(context) {
     const paint = { free: colour("--free"), wall: colour("--wall"), unseen: colour("--unseen"), unseenWall: colour("--unseen-wall") };
+    const corrected = correctionsNow();
     for (let row = 0; row < rows; row++) {
       for (let column = 0; column < columns; column++) {
         const index = row * data.width + column;
-        const known = isKnown(row, column);
-        context.fillStyle = occupied[index] ? (known ? paint.wall : paint.unseenWall) : known ? paint.free : paint.unseen;
+        const entry = corrected.get(index);
+        const known = entry ? entry.value >= 0 : isKnown(row, column);
+        const wall = entry && known ? entry.value === 1 : occupied[index];
+        context.fillStyle = wall ? (known ? paint.wall : paint.unseenWall) : known ? paint.free : paint.unseen;
         context.fillRect(column * scale, row * scale, scale, scale);
       }
     }
-    for (const [row, column, letter] of data.letters) {
-      const known = isKnown(row, column);
+    const asSeen = data.letters.filter(([row, column]) => !corrected.has(row * data.width + column));
+    const seenOtherwise = [...corrected].map(([index, { letter }]) => [
+      Math.floor(index / data.width),
+      index % data.width,
+      letter,
+    ]);
+    for (const [row, column, letter] of [...asSeen, ...seenOtherwise]) {
+      const known = corrected.has(row * data.width + column) || isKnown(row, column);
       const bits = data.propositions.map((_, bit) => bit).filter((bit) => (letter >> bit) & 1);
       bits.forEach((bit, place) => {
         context.globalAlpha = known ? 1 : 0.35;

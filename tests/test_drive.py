@@ -1,0 +1,385 @@
+"""A robot behind rosbridge: maps on one lattice, messages in any order, advice, navigation, silence, another task."""
+
+import base64
+import dataclasses
+import json
+import math
+
+import cv2
+import jax
+import numpy as np
+import pytest
+
+from eval.live.__main__ import run_stream
+from eval.live.perturbation import Network, Perturbation
+from eval.live.server import RosbridgeServer
+from eval.live.simulator import FLOOR, Behaviour, SimulatedLink, SteppedInbox
+from potlp_jax.drive.config import DriveConfig, Mode, Topics
+from potlp_jax.drive.driving import drive_robot
+from potlp_jax.drive.inbox import Inbox
+from potlp_jax.drive.lattice import Lattice, LatticeConfig, Scan, bucket
+from potlp_jax.drive.messages import make_path, make_pose, picture_of, pose_of, regions_of, scan_of, stamp_of
+from potlp_jax.drive.rosbridge import RosbridgeLink, parse_url
+from potlp_jax.environments.ros.map_files import GridFrame
+from potlp_jax.environments.ros.places import Disc, Polygon
+from potlp_jax.errors import RobotError
+from potlp_jax.task.task import Task
+from potlp_jax.world.grid import BeliefMap
+
+TASK = Task.from_formula("!fire U exit", FLOOR.propositions)
+CONFIG = DriveConfig(resolution=FLOOR.resolution, radius=0.05)
+
+
+# Maps on one lattice.
+
+
+def rough_lay(scan, anchor, config, window):
+    """Each cell by a search through all pixels: the slow twin of ``Lattice.lay`` where pixels are not larger."""
+    reach = config.radius / scan.frame.resolution
+    height, width = scan.occupancy.shape
+
+    def value(row, column):
+        if not (0 <= row < height and 0 <= column < width):
+            return -1
+        return int(scan.occupancy[row, column])
+
+    def around(row, column):
+        span = range(-math.floor(reach), math.floor(reach) + 1)
+        return [value(row + r, column + c) for r in span for c in span if math.hypot(r, c) <= reach]
+
+    found = np.full((window.height, window.width), BeliefMap.UNKNOWN)
+    pixels = {}
+    for row in range(height):
+        for column in range(width):
+            cell = anchor.metres_to_cell(*scan.frame.cell_to_metres(row, column))
+            pixels.setdefault((cell[0] - window.top, cell[1] - window.left), []).append((row, column))
+    for cell, inside in pixels.items():
+        near = [entry for pixel in inside for entry in around(*pixel)]
+        if all(0 <= entry <= config.free for entry in near):
+            found[cell] = BeliefMap.FREE
+        elif any(entry >= config.occupied for entry in near):
+            found[cell] = BeliefMap.OCCUPIED
+    return found
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_map_is_laid_as_a_search_through_its_pixels_says(seed):
+    random = np.random.default_rng(seed)
+    config = LatticeConfig(0.2, float(random.choice([0.0, 0.05, 0.11])), 25, 65)
+    first = GridFrame(9, 9, 0.05, 1.0, -2.0, float(random.uniform(-3, 3)))
+    lattice = Lattice(first, config)
+    yaw = first.yaw + float(random.choice([0.0, 0.02, -0.3]))
+    # Of half a cell at most, so that every cell within has a pixel's centre.
+    frame = GridFrame(24, 20, float(random.choice([0.05, 0.1])), *random.uniform(-3, 3, 2).tolist(), yaw)
+    values = random.choice(np.array([-1, 0, 0, 0, 0, 0, 0, 0, 0, 10, 50, 100], np.int8), (24, 20))
+    scan = Scan(frame, values)
+    found = lattice.lay(scan)
+    anchor = GridFrame(0, 0, 0.2, first.x, first.y, first.yaw)
+    assert np.array_equal(found, rough_lay(scan, anchor, config, lattice.window))
+
+
+def test_large_pixels_leave_no_holes():
+    lattice = Lattice(GridFrame(4, 4, 0.2, 0.0, 0.0), LatticeConfig(0.2, 0.0, 25, 65))
+    found = lattice.lay(Scan(GridFrame(3, 3, 1.0, 0.0, 0.0), np.zeros((3, 3), np.int8)))
+    assert int((found == BeliefMap.FREE).sum()) == 15 * 15
+
+
+def test_what_is_known_keeps_its_place_when_the_map_grows_and_the_shape_is_one_of_few():
+    config = LatticeConfig(0.2, 0.0, 25, 65)
+    lattice = Lattice(GridFrame(10, 10, 0.2, 0.0, 0.0), config)
+    shapes, seen = set(), []
+    for size in range(10, 60, 2):
+        # Grows to all sides; one pixel in the middle of the first map is an obstacle throughout.
+        shift = (size - 10) // 2
+        occupancy = np.zeros((size, size), np.int8)
+        occupancy[size - 1 - (shift + 4), shift + 4] = 100
+        origin = -0.2 * shift
+        found = lattice.lay(Scan(GridFrame(size, size, 0.2, origin, origin), occupancy))
+        shapes.add(found.shape)
+        rows, columns = np.nonzero(found == BeliefMap.OCCUPIED)
+        seen.append((int(rows[0]) + lattice.origin[0], int(columns[0]) + lattice.origin[1]))
+        assert int((found == BeliefMap.FREE).sum()) == size * size - 1
+    assert set(seen) == {(-5, 4)}
+    assert lattice.cell_of(0.9, 0.9) == (-5, 4)
+    assert shapes <= {(32, 32), (48, 48), (64, 64), (96, 96)}
+    assert len(shapes) <= 4
+
+
+def test_buckets_grow_by_half_at_most():
+    sizes = sorted({bucket(size) for size in range(1, 1000)})
+    assert sizes == [32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024]
+    assert all(bucket(size) >= size for size in range(1, 1000))
+    with pytest.raises(RobotError, match="cells larger"):
+        bucket(5000)
+
+
+def test_cells_finer_than_pixels_are_refused():
+    with pytest.raises(RobotError, match="finer"):
+        Lattice(GridFrame(4, 4, 0.5, 0.0, 0.0), LatticeConfig(0.2, 0.0, 25, 65))
+
+
+# Messages.
+
+
+def header(seconds, ros1=False):
+    whole, parts = int(seconds), round((seconds - int(seconds)) * 1e9)
+    stamp = {"secs": whole, "nsecs": parts} if ros1 else {"sec": whole, "nanosec": parts}
+    return {"stamp": stamp, "frame_id": "map"}
+
+
+def grid(seconds, values, x=0.0, y=0.0):
+    values = np.asarray(values)
+    info = {"height": values.shape[0], "width": values.shape[1], "resolution": 0.4, "origin": make_pose(x, y, 0.0)}
+    return {"header": header(seconds), "info": info, "data": values[::-1].ravel().tolist()}
+
+
+def test_stamps_of_both_ros():
+    assert stamp_of({"header": header(3.5)}) == stamp_of({"header": header(3.5, ros1=True)}) == 3_500_000_000
+
+
+def test_the_first_row_of_a_map_is_the_lowest():
+    scan = scan_of(grid(0, [[100, 0], [0, -1]]))
+    assert scan.occupancy.tolist() == [[100, 0], [0, -1]]
+    packed = {**grid(0, [[0, 0]]), "data": base64.b64encode(np.array([-1, 100], np.int8).tobytes()).decode()}
+    assert scan_of(packed).occupancy.tolist() == [[-1, 100]]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [{"data": [0]}, {"data": None}, {"data": [0, 0, 0, 101]}, {"info": {}}, {"data": [0.5] * 4}, {"data": "%"}],
+)
+def test_a_damaged_map_is_refused(damage):
+    with pytest.raises(RobotError):
+        scan_of({**grid(0, [[0, 0], [0, 0]]), **damage})
+
+
+def test_poses_alone_stamped_and_with_covariance():
+    pose = make_pose(1.0, 2.0, 0.5)
+    for message in (pose, {"pose": pose}, {"pose": {"pose": pose, "covariance": []}}):
+        assert pose_of(message) == pytest.approx((1.0, 2.0, 0.5))
+    with pytest.raises(RobotError, match="not finite"):
+        pose_of(make_pose(math.nan, 0.0, 0.0))
+
+
+def test_a_path_looks_to_its_next_point():
+    poses = make_path([(0.0, 0.0), (0.0, 1.0), (-1.0, 1.0)], "map")["poses"]
+    assert [pose_of(pose)[2] for pose in poses] == pytest.approx([math.pi / 2, math.pi, math.pi])
+
+
+def test_pictures_raw_and_compressed():
+    image = np.zeros((4, 8, 3), np.uint8)
+    image[:, :4] = (255, 0, 0)
+    data = base64.b64encode(cv2.imencode(".png", image[..., ::-1])[1].tobytes()).decode()
+    assert np.array_equal(picture_of({"data": data, "format": "png"}), image)
+    padded = np.pad(image[..., ::-1].reshape(4, 24), ((0, 0), (0, 3)))
+    raw = {"encoding": "bgr8", "height": 4, "width": 8, "step": 27}
+    assert np.array_equal(picture_of({**raw, "data": base64.b64encode(padded.tobytes()).decode()}), image)
+    with pytest.raises(RobotError, match="encoding"):
+        picture_of({**raw, "encoding": "yuv", "data": ""})
+
+
+def test_places_are_regions_of_known_propositions():
+    text = {"exit": [{"point": [1, 2], "radius": 0.5}, {"polygon": [[0, 0], [1, 0], [1, 1]]}]}
+    found = regions_of({"data": json.dumps(text)}, ("fire", "exit"))
+    assert found == (("exit", Disc((1.0, 2.0), 0.5)), ("exit", Polygon(((0.0, 0.0), (1.0, 0.0), (1.0, 1.0)))))
+    with pytest.raises(RobotError, match="'smoke'"):
+        regions_of({"data": '{"smoke": []}'}, ("fire",))
+
+
+@pytest.mark.parametrize("url", ["http://robot", "robot:x", "", "ws://"])
+def test_what_is_no_address_is_refused(url):
+    with pytest.raises(RobotError, match="no address"):
+        parse_url(url)
+    assert parse_url("robot") == ("robot", 9090, False)
+    assert parse_url("wss://robot:1") == ("robot", 1, True)
+
+
+# What was heard.
+
+
+def transform(seconds, parent, child, x):
+    moved = {"translation": {"x": x, "y": 0.0, "z": 0.0}, "rotation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+    return {**{"header": {**header(seconds), "frame_id": parent}}, "child_frame_id": child, "transform": moved}
+
+
+def messages():
+    """Maps, updates and transforms of a drive, with stamps that tell their order."""
+    random, found = np.random.default_rng(5), []
+    for number in range(6):
+        values = random.choice([-1, 0, 100], (5, 6))
+        found.append(("/map", grid(10 + 2 * number, values)))
+        update = {"header": header(11 + 2 * number), "x": 1, "y": 2, "width": 3, "height": 2, "data": [number] * 6}
+        found.append(("/map_updates", update))
+        found.append(("/tf", {"transforms": [transform(10 + number, "odom", "base_link", number)]}))
+        found.append(("/tf", {"transforms": [transform(10 + number, "map", "odom", 10 * number)]}))
+    return found
+
+
+def state_of(inbox):
+    heard = inbox.heard
+    return heard.scan.occupancy.tolist(), heard.pose
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_order_and_repetition_do_not_matter(seed):
+    # An update that is alone says nothing, so a map comes first; within five seconds any order will do.
+    wanted = Inbox(CONFIG, FLOOR.propositions)
+    for topic, message in messages():
+        wanted.handle(topic, message)
+    assert wanted.heard.pose == (55.0, 0.0, 0.0)
+    random = np.random.default_rng(seed)
+    sent = messages()
+    order = np.argsort(np.arange(len(sent)) + random.uniform(0, 8, len(sent)))
+    inbox = Inbox(CONFIG, FLOOR.propositions)
+    inbox.handle(*sent[0])
+    for index in order:
+        for _ in range(int(random.integers(1, 3))):
+            inbox.handle(*sent[index])
+    assert state_of(inbox) == state_of(wanted)
+    assert not inbox.refused
+
+
+def test_a_clock_that_begins_anew_is_followed():
+    inbox = Inbox(CONFIG, FLOOR.propositions)
+    inbox.handle("/map", grid(1000, [[0, 0]]))
+    inbox.handle("/map", grid(998, [[100, 100]]))
+    assert inbox.heard.scan.occupancy.tolist() == [[0, 0]]
+    inbox.handle("/map", grid(3, [[100, 100]]))
+    assert inbox.heard.scan.occupancy.tolist() == [[100, 100]]
+
+
+def test_a_wheel_that_turns_is_no_pose():
+    inbox = Inbox(CONFIG, FLOOR.propositions)
+    inbox.handle("/map", grid(1, [[0]]))
+    inbox.handle("/tf_static", {"transforms": [transform(0, "map", "odom", 0.0)]})
+    inbox.handle("/tf", {"transforms": [transform(1, "odom", "base_link", 1.0)]})
+    poses = len(inbox.heard.poses)
+    inbox.handle("/tf", {"transforms": [transform(2, "base_link", "wheel", 1.0)]})
+    assert len(inbox.heard.poses) == poses == 1
+
+
+def test_what_cannot_be_read_is_counted_and_changes_nothing():
+    inbox = Inbox(CONFIG, FLOOR.propositions)
+    before = inbox.heard
+    for topic in inbox.handlers:
+        for message in ({}, {"header": None}, {"data": 3}, {"transforms": 1}):
+            inbox.handle(topic, message)
+    assert inbox.heard is before
+    assert sum(inbox.refused.values()) == 4 * len(inbox.handlers)
+
+
+# Drives, in the simulation's time.
+
+
+ORDINARY = Behaviour()
+
+
+def driven(mode, behaviour=ORDINARY, *, before=lambda _link: None, tasks=1, **settings):
+    """Trials of a drive, and the link."""
+    config = dataclasses.replace(CONFIG, mode=mode, **settings)
+    link = SimulatedLink(FLOOR, behaviour, Network(Perturbation(), np.random.default_rng(0)))
+    before(link)
+    inbox = SteppedInbox(link, config, TASK.propositions)
+    drive = drive_robot(link, TASK, "baseline", jax.random.key(0), config, inbox=inbox, clock=link.clock)
+    trials = [trial for trial, _ in zip(drive, range(tasks), strict=False)]
+    drive.close()
+    return trials, link
+
+
+def published(link, topic):
+    return [message for name, _, message in link.published if name == topic]
+
+
+def test_advice_is_published_and_nothing_is_commanded():
+    (trial,), link = driven(Mode.ADVISE)
+    assert trial.outcome == "satisfied"
+    assert not link.goals
+    decisions = [json.loads(message["data"]) for message in published(link, "/potlp/decision")]
+    assert [decision["index"] for decision in decisions] == list(range(len(trial.decisions)))
+    assert decisions[0]["task"] == TASK.text
+    # In metres of the map: the first path begins where the robot is.
+    x, y, _ = pose_of(published(link, "/potlp/path")[0]["poses"][0])
+    assert (x, y) == pytest.approx(FLOOR.frame.cell_to_metres(*FLOOR.start))
+    markers = published(link, "/potlp/markers")[-1]["markers"]
+    assert {"path", "exit", "target"} <= {marker["ns"] for marker in markers[1:]}
+    exits = next(marker for marker in markers if marker.get("ns") == "exit")["points"]
+    assert [(point["x"], point["y"]) for point in exits] == [pytest.approx(FLOOR.frame.cell_to_metres(5, 13))]
+
+
+@pytest.mark.parametrize("mode", [Mode.NAVIGATE, Mode.FOLLOW])
+def test_navigation_is_commanded_and_failures_are_set_aside(mode):
+    (trial,), link = driven(mode, Behaviour(failures=3))
+    assert trial.outcome == "satisfied"
+    assert link.goals
+    assert sum(bool(decision.failure) for decision in trial.decisions) == 3
+    assert any(decision.set_aside for decision in trial.decisions)
+
+
+def test_a_silent_robot_is_stopped_and_goes_on_when_it_is_heard_again():
+    (trial,), link = driven(Mode.NAVIGATE, Behaviour(silent=(2.0, 7.0)))
+    assert trial.outcome == "satisfied"
+    assert link.cancelled
+    assert any("no pose" in decision.failure for decision in trial.decisions)
+    states = [json.loads(message["data"])["state"] for message in published(link, "/potlp/state")]
+    assert "stopped" in states
+
+
+def test_a_robot_that_is_silent_for_good_ends_the_drive():
+    (trial,), link = driven(Mode.NAVIGATE, Behaviour(silent=(2.0, math.inf)), silence=0.5, patience=5.0)
+    assert trial.outcome == "unfinished"
+    assert link.cancelled
+
+
+def test_a_dry_run_decides_once_and_publishes_nothing():
+    (trial,), link = driven(Mode.DRY)
+    assert len(trial.decisions) == 1
+    assert not link.published
+    assert not link.goals
+
+
+def test_another_formula_takes_over_and_one_that_is_none_does_not():
+    def ask(link):
+        link.ask_for("F ((")
+
+    (trial,), link = driven(Mode.ADVISE, before=ask)
+    assert trial.outcome == "satisfied"
+    assert "refused" in published(link, "/potlp/state")[0]["data"]
+    (first, second), _ = driven(Mode.ADVISE, before=lambda link: link.ask_for("F exit"), tasks=2)
+    assert first.outcome == "unfinished"
+    assert (second.outcome, second.task_text) == ("satisfied", "F exit")
+
+
+def test_without_a_map_the_error_says_what_to_look_at():
+    with pytest.raises(RobotError, match="no map within 3 s: is /other published"):
+        driven(Mode.ADVISE, patience=3.0, topics=Topics(map="/other"))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_perturbed_streams_end_well(seed):
+    row = run_stream(seed, {})
+    assert row["end"] not in ("crash", "hung"), row
+    assert not row["wrong"]
+
+
+# Over a socket.
+
+
+@pytest.fixture
+def server():
+    found = RosbridgeServer(Behaviour(), speed=5.0)
+    yield found
+    found.close()
+
+
+@pytest.mark.parametrize("mode", [Mode.ADVISE, Mode.NAVIGATE])
+def test_a_drive_over_a_real_socket(server, mode):
+    pytest.importorskip("roslibpy")
+    link = RosbridgeLink(f"127.0.0.1:{server.port}")
+    config = dataclasses.replace(CONFIG, mode=mode, silence=20.0, patience=60.0)
+    try:
+        trial = next(drive_robot(link, TASK, "baseline", jax.random.key(0), config, name="simulator"))
+    finally:
+        link.close()
+    assert trial.outcome == "satisfied"
+    assert server.advertised["/potlp/path"] == "nav_msgs/Path"
+    assert bool(server.link.goals) == (mode is Mode.NAVIGATE)

@@ -1,0 +1,325 @@
+"""Robots of one's own: the contract is checked, legs may fail, maps may grow and be corrected; the record is exact."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import potlp_jax
+from potlp_jax.errors import RobotError
+from potlp_jax.trials.record import BeliefMap, load_trial
+from potlp_jax.trials.replay import views_of
+from potlp_jax.trials.robot import GrowingRobot, Leg
+from potlp_jax.trials.setbacks import SetbackConfig
+from potlp_jax.view.decisions import describe_decision
+from potlp_jax.view.replay_page import replay_data
+from potlp_jax.world.grid import belief_from_numpy
+
+PROPOSITIONS = ("fire", "exit")
+TASK = potlp_jax.Task.from_formula("!fire U exit", PROPOSITIONS)
+KEY = jax.random.key(0)
+FLOOR = np.array(
+    [
+        list(row)
+        for row in (
+            "###############",
+            "#......#......#",
+            "#......#..f...#",
+            "#.............#",
+            "#......#......#",
+            "#......#.....e#",
+            "###############",
+        )
+    ]
+)
+
+
+class Rover:
+    """Sees three rows and columns around it and drives three cells at most."""
+
+    def __init__(self, start=(1, 1)):
+        self.cells = np.full(FLOOR.shape, BeliefMap.UNKNOWN)
+        self.cell = start
+        self.sense()
+
+    def sense(self):
+        row, column = self.cell
+        near = np.s_[max(row - 3, 0) : row + 4, max(column - 3, 0) : column + 4]
+        self.cells[near] = np.where(FLOOR[near] == "#", BeliefMap.OCCUPIED, BeliefMap.FREE)
+
+    def arrays(self):
+        letters = np.where(FLOOR == "f", 0b01, 0) | np.where(FLOOR == "e", 0b10, 0)
+        return self.cells.copy(), np.where(self.cells == BeliefMap.UNKNOWN, 0, letters)
+
+    def observe(self):
+        return belief_from_numpy(*self.arrays(), propositions=PROPOSITIONS), self.cell
+
+    def panorama(self):
+        raise AssertionError("the baseline takes no panorama")
+
+    def may_enter(self, cell):
+        return True
+
+    def advance(self, path, stop):
+        cells = []
+        for cell in [tuple(map(int, entry)) for entry in np.asarray(path.cells)[1 : int(path.length) + 1][:3]]:
+            if not self.may_enter(cell):
+                return Leg(cells=tuple(cells), failure="the door is shut")
+            self.cell = cell
+            self.sense()
+            cells.append(cell)
+        return Leg(cells=tuple(cells))
+
+
+class GrowingRover(Rover):
+    """Its map is the box of what it knows and a ring of unobserved cells: it grows in all directions."""
+
+    def box(self):
+        known = np.argwhere(self.cells != BeliefMap.UNKNOWN)
+        # In steps of several cells, so that few shapes are compiled; the box may begin before the floor does.
+        top = int(known[:, 0].min()) // 2 * 2 - 1
+        return top, -1, 8 - top, 8 + 8 * (int(known[:, 1].max()) // 8)
+
+    @property
+    def origin(self):
+        return self.box()[:2]
+
+    def observe(self):
+        top, left, height, width = self.box()
+        cells, letters = self.arrays()
+        pad = ((1, height), (1, width))
+        cells, letters = np.pad(cells, pad, constant_values=BeliefMap.UNKNOWN), np.pad(letters, pad)
+        window = np.s_[top + 1 : top + 1 + height, left + 1 : left + 1 + width]
+        belief = belief_from_numpy(cells[window], letters[window], propositions=PROPOSITIONS)
+        return belief, (self.cell[0] - top, self.cell[1] - left)
+
+    def advance(self, path, stop):
+        top, left, *_ = self.box()
+        moved = dataclasses.replace(path, cells=path.cells + jnp.array([[top, left]], jnp.int32))
+        leg = super().advance(moved, stop)
+        return dataclasses.replace(leg, cells=tuple((row - top, column - left) for row, column in leg.cells))
+
+
+class MistakenRover(Rover):
+    """Takes cells for what they are not, forgets others, and sees a fire that is none; never where it stands."""
+
+    def __init__(self, seed):
+        self.random = np.random.default_rng(seed)
+        super().__init__()
+
+    def observe(self):
+        cells, letters = self.arrays()
+        wrong = self.random.random(cells.shape) < 0.06
+        wrong[max(self.cell[0] - 1, 0) : self.cell[0] + 2, max(self.cell[1] - 1, 0) : self.cell[1] + 2] = False
+        wrong &= FLOOR != "e"
+        cells[wrong] = self.random.integers(-1, 2, cells.shape)[wrong]
+        letters[wrong] = np.where(cells[wrong] == BeliefMap.FREE, 1, 0)
+        letters[cells == BeliefMap.UNKNOWN] = 0
+        # Where it drove on the last leg it knows better.
+        for cell in self.leg:
+            cells[cell], letters[cell] = BeliefMap.FREE, 0b10 if FLOOR[cell] == "e" else 0
+        return belief_from_numpy(cells, letters, propositions=PROPOSITIONS), self.cell
+
+    leg = ()
+
+    def advance(self, path, stop):
+        leg = super().advance(path, stop)
+        self.leg = leg.cells
+        return leg
+
+
+def driven(robot, **options):
+    """A trial, and the maps that its decisions were planned on."""
+    maps = []
+    trial = potlp_jax.run_robot(robot, TASK, "baseline", KEY, listener=lambda _, belief: maps.append(belief), **options)
+    return trial, maps
+
+
+def assert_same_map(found, wanted):
+    # A record's world has a ring around it where the robot's map had no border of obstacles.
+    ring = (found.cells.shape[0] - wanted.cells.shape[0]) // 2
+    cells, letters = np.asarray(wanted.cells), np.asarray(wanted.letters)
+    assert np.array_equal(found.cells, np.pad(cells, ring, constant_values=BeliefMap.UNKNOWN))
+    assert np.array_equal(found.letters, np.pad(letters, ring))
+    assert np.array_equal(found.extent, wanted.extent)
+
+
+def test_the_record_is_whole_without_a_true_map(tmp_path):
+    trial, maps = driven(Rover(), name="rover")
+    assert trial.outcome == "satisfied"
+    assert trial.environment == "robot:rover"
+    trial.save(tmp_path / "trial.json")
+    again = load_trial(tmp_path / "trial.json")
+    assert again.decisions == trial.decisions
+    for decision, belief in zip(again.decisions, maps, strict=True):
+        assert_same_map(again.planned_on(decision), belief)
+    # What was never observed is an obstacle, and never seen.
+    unseen = again.first_seen < 0
+    assert unseen.any()
+    assert np.asarray(again.world.occupied)[unseen].all()
+    assert replay_data(again, views_of(again))["corrections"] == []
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_was_seen_wrongly_is_in_the_record_as_it_was_seen(seed, tmp_path):
+    trial, maps = driven(MistakenRover(seed))
+    assert trial.corrections
+    trial.save(tmp_path / "trial.json")
+    trial = load_trial(tmp_path / "trial.json")
+    for decision, belief in zip(trial.decisions, maps, strict=True):
+        assert_same_map(trial.planned_on(decision), belief)
+    # The page shows each of them while it lasted.
+    width = trial.world.shape[1]
+    for (index, first, until, value, letter), entry in zip(
+        replay_data(trial, views_of(trial))["corrections"], trial.corrections, strict=True
+    ):
+        assert divmod(index, width) == entry.cell
+        assert first <= until
+        assert (value, letter) == (entry.value, entry.letter)
+
+
+def test_a_map_that_grows_changes_no_decision():
+    wanted, _ = driven(Rover((5, 1)))
+    robot = GrowingRover((5, 1))
+    assert isinstance(robot, GrowingRobot)
+    assert not isinstance(Rover(), GrowingRobot)
+    first = robot.origin
+    trial, maps = driven(robot)
+    # It really grew, to the right and upward, where cells are counted from.
+    assert len({belief.cells.shape for belief in maps}) > 1
+    assert first != robot.origin
+    top, left = robot.origin
+    ring = 1 if trial.world.shape != maps[-1].cells.shape else 0
+    there = tuple((row + top - ring, column + left - ring) for row, column in trial.path)
+    assert there == wanted.path
+    assert [decision.kind for decision in trial.decisions] == [decision.kind for decision in wanted.decisions]
+    for decision, belief in zip(trial.decisions, maps, strict=True):
+        found = trial.planned_on(decision)
+        assert int((~found.unknown).sum()) == int((~belief.unknown).sum())
+        assert np.array_equal(found.extent, belief.extent)
+
+
+class Shut(Rover):
+    """Cannot get past the door in the middle until it has tried so many times."""
+
+    def __init__(self, attempts):
+        super().__init__()
+        self.left = attempts
+
+    def may_enter(self, cell):
+        if cell[1] < 7:
+            return True
+        self.left -= 1
+        return self.left < 0
+
+
+def test_a_target_is_tried_again_and_then_set_aside_and_the_record_says_so():
+    trial, _ = driven(Shut(3))
+    assert trial.outcome == "satisfied"
+    failed = [decision for decision in trial.decisions if decision.failure]
+    assert [decision.failure for decision in failed] == ["the door is shut"] * 3
+    # Tried again at once: nothing is set aside before the second failure, something after it.
+    first = failed[0].index
+    assert failed[1].index == first + 1
+    assert not trial.decisions[first + 1].set_aside
+    assert any(decision.set_aside for decision in trial.decisions)
+    assert "the robot failed: the door is shut" in describe_decision(trial, failed[0])
+
+
+def test_a_door_that_stays_shut_ends_the_trial_as_stuck():
+    config = SetbackConfig(attempts=2, decisions=3, give_up=5)
+    trial, _ = driven(Shut(10**6), setbacks=config)
+    assert trial.outcome == "stuck"
+    # Not at the third decision in one place, as a cycle would be.
+    assert sum(bool(decision.failure) for decision in trial.decisions) >= 5
+
+
+class Breaks(Rover):
+    """Breaks the contract in one way, on its second leg."""
+
+    legs = 0
+
+    def __init__(self, fault):
+        super().__init__()
+        self.fault = fault
+
+    def advance(self, path, stop):
+        leg = super().advance(path, stop)
+        self.legs += 1
+        if self.legs == 2 and self.fault == "jumps":
+            return Leg(cells=leg.cells[1:])
+        if self.legs == 2 and self.fault == "elsewhere":
+            self.cell = leg.cells[0]
+        if self.legs == 2 and self.fault == "no leg":
+            return leg.cells
+        return leg
+
+    def observe(self):
+        if self.legs < 2:
+            return super().observe()
+        cells, letters = self.arrays()
+        names = PROPOSITIONS
+        if self.fault == "blocked":
+            cells[self.cell] = BeliefMap.OCCUPIED
+        if self.fault == "outside":
+            return super().observe()[0], (99, 0)
+        if self.fault == "grows":
+            cells, letters = np.pad(cells, 1), np.pad(letters, 1)
+        if self.fault == "names":
+            names = ("exit", "fire")
+        if self.fault == "nothing":
+            return None
+        resolution = 0.5 if self.fault == "resolution" else 1.0
+        return belief_from_numpy(cells, letters, resolution, propositions=names), self.cell
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ("jumps", "no neighbour"),
+        ("elsewhere", "says that it is in cell"),
+        ("no leg", "returns a Leg"),
+        ("blocked", "not free in the map"),
+        ("outside", "says that it is in cell \\(99, 0\\)"),
+        ("grows", "GrowingRobot"),
+        ("names", "propositions"),
+        ("resolution", "onto one grid"),
+        ("nothing", "observe\\(\\) returns"),
+    ],
+)
+def test_a_broken_contract_is_named(fault, said):
+    with pytest.raises(RobotError, match=said):
+        driven(Breaks(fault))
+
+
+def test_a_late_leg_is_noted():
+    trial, _ = driven(Rover(), seconds_per_cell=0.0)
+    assert len(trial.notes) == len(trial.decisions)
+    assert "late" in trial.notes[0]
+    assert not driven(Rover())[0].notes
+
+
+def test_another_map_is_no_reason_to_give_up():
+    """A robot that knows no move stands, and its map arrives a moment later."""
+
+    class Slow(Rover):
+        waited = 0
+
+        def sense(self):
+            super().sense()
+            if self.waited < 1:
+                self.cells[self.cells == BeliefMap.UNKNOWN] = BeliefMap.OCCUPIED
+
+        def advance(self, path, stop):
+            if not int(path.length):
+                self.waited += 1
+                self.cells[:] = BeliefMap.UNKNOWN
+                self.sense()
+                return Leg(cells=())
+            return super().advance(path, stop)
+
+    trial, _ = driven(Slow())
+    assert trial.decisions[0].kind == "none"
+    assert trial.outcome == "satisfied"
