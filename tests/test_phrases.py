@@ -34,7 +34,9 @@ from tests.test_pointing import formulas
     ],
 )
 def test_each_operator_has_a_phrase(text, phrase):
-    assert formula_phrase(parse_formula(text).structure) == phrase
+    structure = parse_formula(text).structure
+    assert structure is not None
+    assert formula_phrase(structure) == phrase
 
 
 @settings(deadline=None)
@@ -55,4 +57,6 @@ def test_what_is_of_another_logic_or_large_has_no_structure(text):
 
 
 def test_long_formulas_have_phrases():
-    assert formula_phrase(parse_formula("X" * 199 + "a").structure) == "in 199 steps be at a"
+    structure = parse_formula("X" * 199 + "a").structure
+    assert structure is not None
+    assert formula_phrase(structure) == "in 199 steps be at a"
