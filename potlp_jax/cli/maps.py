@@ -463,7 +463,7 @@ def _joined(
         name, text = _named("--room", option, 'NAME="X,Y X,Y X,Y ..."')
         regions.setdefault(name, []).append(_read_polygon(option, text))
     if not regions:
-        fail("there is nothing to label: give a --place, a --room or a --named")
+        fail("there is nothing to label: give a --place or a --room, or --named")
     names = check_propositions(list(regions))
     formulas = dict(old.tasks) | dict(_named("--task", option, "NAME=FORMULA") for option in tasks)
     # Compiled only to be checked; labels keep the text.

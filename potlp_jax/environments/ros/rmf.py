@@ -14,7 +14,7 @@ free lies on a floor and in no wall; a level without floors is what its walls en
 `OPEN_DOORS` are open, and cut the walls that they stand in; others are closed. Names of vertices are places.
 
 References:
-    open-rmf/rmf_traffic_editor (rmf_building_map_tools/building_map/level.py).
+    Open-RMF, "Traffic editor", and the building map tools of rmf_traffic_editor.
 """
 
 import math
