@@ -13,6 +13,7 @@ import contextlib
 import io
 import json
 import stat
+import xml.etree.ElementTree as ElementTree
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -189,6 +190,16 @@ def read_yaml(path: Path | str, error: type[PotlpError], loader: type[Any] | Non
         except yaml.YAMLError as cause:
             why = one_line(cause, 400).replace('in "<unicode string>", line', "at line")
             raise error.of_file(path, f"is not valid YAML: {why}") from cause
+
+
+def read_xml(path: Path | str, error: type[PotlpError]) -> ElementTree.Element:
+    """The root element of an XML file, read without entities of its own; see `read_bytes` and `reading`."""
+    contents = read_bytes(path, error, MOST_TEXT)
+    # A few lines of entities within entities can stand for gigabytes, and none of the formats has any.
+    if b"<!ENTITY" in contents:
+        raise error.of_file(path, "declares entities, which are not read")
+    with reading(path, error, "valid XML"):
+        return ElementTree.fromstring(contents)
 
 
 def parse_yaml(text: str, loader: type[Any] | None = None) -> Any:

@@ -76,7 +76,39 @@ def test_version():
 
 def test_task_as_json_is_its_description():
     data = _json(_potlp("task", "!hazard U goal", "--propositions", "goal,hazard", "--json"))
-    assert data == json.loads(json.dumps(Task.shipped("toy-2").describe()))
+    assert data.items() >= json.loads(json.dumps(Task.shipped("toy-2").describe())).items()
+    assert data["words"] == "avoid hazard until goal is found"
+    assert data["can_be_lost"]
+    assert data["examples"] == {
+        "satisfying": {"letters": [["goal"]], "repeated": 0},
+        "violating": {"letters": [["hazard"]], "repeated": 0},
+    }
+    assert data["doubts"] == []
+
+
+def test_task_is_checked_against_an_environment():
+    data = _json(_potlp("task", "F (goal & hazard)", "--environment", "toy", "--json"))
+    assert data["propositions"] == ["goal", "hazard"]
+    assert [doubt["kind"] for doubt in data["doubts"]] == ["together"]
+    assert data["examples"]["satisfying"] is None
+    assert _json(_potlp("task", "2", "--environment", "toy", "--json"))["formula"] == "!hazard U goal"
+    both = _potlp("task", "2", "--environment", "toy", "--propositions", "goal,hazard")
+    assert both.exit_code == 2
+    assert "leave out --propositions" in both.stderr
+
+
+def test_task_names_a_word_that_was_taken_apart():
+    result = _potlp("task", "Fire")
+    assert "Find ire." in result.stdout
+    assert "'Fire' is read as F ire" in result.stderr
+
+
+def test_a_doubt_is_one_line_of_run_and_of_compare():
+    asked = ("toy", "--task", "F (goal & hazard) & X (goal & hazard)", "--policy", "baseline")
+    line = "no place in world 0 of toy/validation has goal and hazard together"
+    assert _potlp("run", *asked).stderr.count(line) == 1
+    result = _potlp("compare", *asked[:3], "--policies", "baseline", "--trials", "1")
+    assert result.stderr.count("no place in worlds 0 to 2 of toy/validation has goal and hazard together") == 1
 
 
 def test_task_as_text_and_picture(tmp_path):

@@ -95,7 +95,7 @@ def test_unknown_proposition_names_the_known_ones():
     message = error_of("F fire & Falarm", ("fire", "exit"))
     assert "unknown proposition 'alarm'" in message
     assert "fire, exit" in message
-    assert caret_column(message) == 11
+    assert caret_column(message) == 10, "below the word as it was written"
 
 
 def test_unknown_quoted_proposition_has_a_caret():
@@ -106,6 +106,22 @@ def test_a_name_taken_apart_is_explained():
     assert 'quote it, "GOAL"' in error_of("F GOAL")
     assert 'quote it, "FIRE"' in error_of("F FIRE", ("fire",))
     assert "quote it" not in error_of("F Ga")
+
+
+@pytest.mark.parametrize(
+    ("text", "known"), [("!Fire U exit", None), ("!Fire U exit", ("fire", "exit")), ("!Fire", ("x",))]
+)
+def test_an_error_about_a_name_taken_apart_points_at_the_name(text, known):
+    message = error_of(text, known)
+    assert "'Fire' is read as F ire" in message
+    assert 'quote it, "Fire"' in message
+    assert caret_column(message) == 2
+
+
+def test_an_unknown_name_is_answered_by_the_nearest_one():
+    assert "did you mean alarm?" in error_of("F alram", ("fire", "alarm"))
+    assert "did you mean Exit?" in error_of("F exit", ("Exit", "fire"))
+    assert "did you mean" not in error_of("F dragon", ("fire", "alarm"))
 
 
 def test_too_many_propositions():
@@ -145,6 +161,21 @@ def test_not_co_safe_names_the_sub_formula(text, offender):
     message = error_of(text)
     assert "not co-safe" in message
     assert f"'{offender}'" in message
+
+
+@pytest.mark.parametrize(
+    ("text", "column"),
+    [
+        ("F a & G b", 7),
+        ("!(G a) & (F b -> c)", 11),
+        ("a W b", 3),
+        ("!(a & (b U c))", 10),
+        ("Fire & G a", 8),
+        ("F GOAL", 3),
+    ],
+)
+def test_what_is_not_co_safe_is_pointed_at(text, column):
+    assert caret_column(error_of(text)) == column
 
 
 @pytest.mark.parametrize("text", ["!(G a)", "!(a W b)", "!(a R b)", "a -> F b", "!(a M b) | 1", "a M b", "{a;b[*];c}!"])

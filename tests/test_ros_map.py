@@ -229,7 +229,7 @@ def test_cells_keep_their_metres_through_crop_and_resampling(tmp_path):
 def test_without_places_the_message_holds_an_example_that_works(tmp_path):
     file = write_map(tmp_path, p5(np.where(TWO_ROOMS, 254, 0)), resolution=1, origin="[-3, 5, 0]")
     config = RosMapConfig(file, resolution=1.0, radius=0.0)
-    with pytest.raises(MapError, match=r"map\.places\.yaml does not exist, and a map has no propositions") as caught:
+    with pytest.raises(MapError, match=r"map\.places\.yaml does not exist, and the map itself does not name") as caught:
         RosMap(config)
     (tmp_path / "map.places.yaml").write_text(str(caught.value).split("for instance\n")[1])
     assert RosMap(config).propositions == ("document", "package")

@@ -4,7 +4,7 @@ import dataclasses
 import math
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -35,7 +35,17 @@ app = command_app(
     "map", "From a ROS map to a world: inspect, clean, label and look at it. docs/maps.md goes through it."
 )
 # Resolution and radius have the defaults of `map:FILE.yaml` worlds, so that what is inspected is what a trial gets.
-MapFile = Annotated[Path, typer.Argument(metavar="FILE.yaml", help="A map of ROS map_server or nav2_map_server.")]
+MapFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FILE",
+        help="A map of ROS map_server or nav2_map_server (.yaml), a building of Open-RMF (building.yaml), a Gazebo "
+        "world (.world, .sdf) or a floor plan (.xml).",
+    ),
+]
+Level = Annotated[
+    str | None, typer.Option("--level", metavar="NAME", help="Of a building with several.", show_default=False)
+]
 Resolution = Annotated[float, typer.Option("--resolution", help="Size of a cell of the working grid, in metres.")]
 Radius = Annotated[float, typer.Option("--radius", help="The robot's radius in metres, by which obstacles grow.")]
 Start = Annotated[
@@ -60,16 +70,21 @@ Start = Annotated[
 """,
 )
 def inspect_map(
-    file: MapFile, resolution: Resolution = 0.2, radius: Radius = 0.1, start: Start = None, json: Json = False
+    file: MapFile,
+    resolution: Resolution = 0.2,
+    radius: Radius = 0.1,
+    start: Start = None,
+    level: Level = None,
+    json: Json = False,
 ) -> None:
     """Show what a map holds, its narrowest passages, what is wrong with it, and what cleaning would do."""
+    from potlp_jax.environments.ros.buildings import load_building
     from potlp_jax.environments.ros.cleaning import clean_map
-    from potlp_jax.environments.ros.map_files import load_map
     from potlp_jax.environments.ros.survey import survey_map
 
     # What is odd about the file is listed with the map's other defects rather than as notes on stderr.
     with _caught_warnings() as remarks:
-        image_map = load_map(file)
+        image_map = load_building(file, level)
     # `--start` names the option in messages about a start that lies in a wall.
     clean = clean_map(image_map, resolution, radius, _read_start(start), "--start")
     survey = survey_map(image_map, clean)
@@ -108,14 +123,15 @@ def write_clean_map(
     resolution: Resolution = 0.2,
     radius: Radius = 0.1,
     start: Start = None,
+    level: Level = None,
     json: Json = False,
 ) -> None:
     """Write the grid on which the robot moves, where everything else is an obstacle, as a ROS map."""
+    from potlp_jax.environments.ros.buildings import load_building
     from potlp_jax.environments.ros.cleaning import clean_map
-    from potlp_jax.environments.ros.map_files import load_map
     from potlp_jax.environments.ros.map_writer import save_map
 
-    image_map = load_map(file)
+    image_map = load_building(file, level)
     # A cleaned map has lost what was cleaned away, so that it must not replace its source by accident.
     own = {path.resolve() for path in (image_map.settings.file, image_map.settings.image)}
     if own & {out.resolve(), out.with_suffix(".pgm").resolve()}:
@@ -124,7 +140,7 @@ def write_clean_map(
     out.parent.mkdir(parents=True, exist_ok=True)
     image = save_map(out, clean.free, clean.frame)
     # The map is written with obstacles grown already: growing them again would close passages.
-    world = _environment(out, None, resolution, 0.0)
+    world = _environment(out, None, resolution, 0.0, None)
     if json:
         print_json({**_clean_facts(clean, radius), "files": [str(out), str(image)], "world": world})
         return
@@ -173,13 +189,18 @@ def label_map(
         typer.Option("--out", "-o", metavar="LABELS.yaml", help="Default: FILE.places.yaml beside the map."),
     ] = None,
     add: Annotated[bool, typer.Option("--add", help="Add to the labels that the file holds already.")] = False,
+    named: Annotated[
+        list[str] | None,
+        typer.Option("--named", metavar="NAME", help="A place that the file names, such as a vertex of Open-RMF."),
+    ] = None,
     resolution: Resolution = 0.2,
     radius: Radius = 0.1,
+    level: Level = None,
     json: Json = False,
 ) -> None:
     """Say in metres where propositions are true, and check that a robot gets there."""
+    from potlp_jax.environments.ros.buildings import load_building
     from potlp_jax.environments.ros.cleaning import clean_map
-    from potlp_jax.environments.ros.map_files import load_map
     from potlp_jax.environments.ros.places import Places, check_points, load_places, place_letters, save_places
 
     target = file.with_suffix(".places.yaml") if out is None else out
@@ -187,8 +208,10 @@ def label_map(
     if target.exists() and not add:
         fail(f"{target} exists: --add adds to it, --out writes another file")
     old = load_places(target) if add else Places(())
-    labels = _joined(old, places=place or [], rooms=room or [], tasks=task or [], start=start)
-    clean = clean_map(load_map(file), resolution, radius, labels.start, labels.source)
+    image_map = load_building(file, level)
+    own = _named_places(file, image_map, named or [])
+    labels = _joined(old, own, places=place or [], rooms=room or [], tasks=task or [], start=start)
+    clean = clean_map(image_map, resolution, radius, labels.start, labels.source)
     # Before anything is written: labels that no robot reaches would make every task impossible.
     check_points(labels, clean.free, clean.frame)
     letters = place_letters(labels, clean.free, clean.frame)
@@ -207,7 +230,7 @@ def label_map(
     output.print(f"wrote {target}")
     # A command that works as it stands: a task of the labels, or to reach every place.
     example = labels.tasks[0][0] if labels.tasks else " & ".join(f"F {name}" for name in labels.names)
-    world = _environment(file, None if out is None else target, resolution, radius)
+    world = _environment(file, None if out is None else target, resolution, radius, level)
     output.print(f"next: potlp run {world} --task '{example}'", style="dim")
 
 
@@ -232,12 +255,13 @@ def preview_map(
     ] = None,
     resolution: Resolution = 0.2,
     radius: Radius = 0.1,
+    level: Level = None,
 ) -> None:
     """Draw a map in metres: what the robot can reach, what is cut off, propositions and start."""
     import jax
 
+    from potlp_jax.environments.ros.buildings import load_building
     from potlp_jax.environments.ros.cleaning import clean_map
-    from potlp_jax.environments.ros.map_files import load_map
     from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig
     from potlp_jax.view.map_preview import draw_map, draw_places
     from potlp_jax.view.style import save_figure
@@ -246,24 +270,25 @@ def preview_map(
     beside = file.with_suffix(".places.yaml")
     found = labels or (beside if beside.is_file() else None)
     if found is None:
-        image_map = load_map(file)
+        image_map = load_building(file, level)
         clean = clean_map(image_map, resolution, radius)
         figure = draw_map(image_map, clean, _title(file, clean))
     else:
         # A start that the labels leave open is drawn by the key; any shows where trials may begin.
-        family = RosMap(RosMapConfig(file, str(found), resolution, radius))
+        family = RosMap(RosMapConfig(file, str(found), resolution, radius, level))
         figure = draw_places(family, family.generate(jax.random.key(0)), _title(file, family.clean))
     save_figure(figure, out)
     console().print(f"wrote {out}")
 
 
-def _environment(file: Path, places: Path | None, resolution: float, radius: float) -> str:
+def _environment(file: Path, places: Path | None, resolution: float, radius: float, level: str | None) -> str:
     """How the command line names the worlds on a map, without options that have their default."""
     from potlp_jax.environments.ros.ros_map import RosMapConfig
 
     chosen = {"resolution": resolution, "radius": radius}
     options = [f"{name}={value:g}" for name, value in chosen.items() if value != getattr(RosMapConfig, name)]
-    return ",".join([f"map:{file}", *([] if places is None else [f"places={places}"]), *options])
+    of_level = [] if level is None else [f"level={level}"]
+    return ",".join([f"map:{file}", *([] if places is None else [f"places={places}"]), *options, *of_level])
 
 
 @contextmanager
@@ -285,6 +310,9 @@ def _map_facts(image_map: "OccupancyMap") -> dict[str, Any]:
     settings, frame = image_map.settings, image_map.frame
     return {
         "file": str(settings.file),
+        "kind": image_map.kind,
+        "closed_gaps": image_map.closed_gaps,
+        "places": [] if image_map.places is None else list(image_map.places.names),
         "image": str(settings.image),
         "pixels": [frame.height, frame.width],
         "resolution": frame.resolution,
@@ -315,13 +343,25 @@ def _clean_facts(clean: "CleanMap", radius: float) -> dict[str, Any]:
 
 
 def _map_lines(image_map: "OccupancyMap", survey: "MapSurvey") -> Iterator[tuple[str, str]]:
+    from potlp_jax.environments.ros.map_files import ROS_MAP
+
     settings, frame = image_map.settings, image_map.frame
     metres = f"{frame.width * frame.resolution:.2f} x {frame.height * frame.resolution:.2f} m"
-    yield "image", f"{settings.image.name}, {frame.width} x {frame.height} pixels of {frame.resolution:g} m: {metres}"
-    yield "origin", f"[{frame.x:g}, {frame.y:g}], turned by {frame.yaw:g} rad ({math.degrees(frame.yaw):.1f} degrees)"
-    inverted = ", negated" if settings.negate else ""
-    thresholds = f"occupied above {float(settings.occupied_thresh):g}, free below {float(settings.free_thresh):g}"
-    yield "mode", f"{settings.mode}{inverted}, {thresholds}"
+    drawn = f"{frame.width} x {frame.height} pixels of {frame.resolution:g} m: {metres}"
+    origin = f"[{frame.x:g}, {frame.y:g}], turned by {frame.yaw:g} rad ({math.degrees(frame.yaw):.1f} degrees)"
+    if image_map.kind == ROS_MAP:
+        yield "image", f"{settings.image.name}, {drawn}"
+        yield "origin", origin
+        inverted = ", negated" if settings.negate else ""
+        thresholds = f"occupied above {float(settings.occupied_thresh):g}, free below {float(settings.free_thresh):g}"
+        yield "mode", f"{settings.mode}{inverted}, {thresholds}"
+    else:
+        yield "plan", f"{image_map.kind}, drawn as {drawn}"
+        yield "origin", origin
+    if image_map.closed is not None:
+        yield "outer walls", f"{image_map.closed_gaps} gaps closed (potlp map preview shows them)"
+    if image_map.places is not None:
+        yield "places", ", ".join(image_map.places.names)
     shares = ((survey.free, "free"), (survey.occupied, "occupied"), (survey.unknown, "unknown"))
     yield "pixels", ", ".join(f"{100 * share:.1f} % {name}" for share, name in shares)
     # Specks count as parts, so that they are named: otherwise a noisy map seems to fall into hundreds of rooms.
@@ -390,8 +430,22 @@ def _cut_off_lines(clean: "CleanMap") -> Iterator[str]:
         yield f"{len(rest)} smaller parts, {area:.1f} m2 in all, cannot be reached either: --json has them"
 
 
+def _named_places(file: Path, image_map: "OccupancyMap", names: Sequence[str]) -> "dict[str, tuple[Region, ...]]":
+    known = {} if image_map.places is None else dict(image_map.places.propositions)
+    for name in names:
+        if name not in known:
+            fail(f"--named {name}: {file} names {', '.join(known) or 'no places'}")
+    return {name: known[name] for name in names}
+
+
 def _joined(
-    old: "Places", *, places: Sequence[str], rooms: Sequence[str], tasks: Sequence[str], start: str | None
+    old: "Places",
+    own: "Mapping[str, tuple[Region, ...]]",
+    *,
+    places: Sequence[str],
+    rooms: Sequence[str],
+    tasks: Sequence[str],
+    start: str | None,
 ) -> "Places":
     """The old labels with what the options add. Raises TaskError for a bad name or formula."""
     from potlp_jax.environments.ros.places import Places
@@ -400,6 +454,8 @@ def _joined(
 
     # A name that is given again gets another place: the proposition holds in each of them.
     regions: dict[str, list[Region]] = {name: list(found) for name, found in old.propositions}
+    for name, found in own.items():
+        regions.setdefault(name, []).extend(found)
     for option in places:
         name, text = _named("--place", option, "NAME=X,Y[,RADIUS]")
         regions.setdefault(name, []).append(_read_disc(option, text))
@@ -407,7 +463,7 @@ def _joined(
         name, text = _named("--room", option, 'NAME="X,Y X,Y X,Y ..."')
         regions.setdefault(name, []).append(_read_polygon(option, text))
     if not regions:
-        fail("there is nothing to label: give a --place or a --room")
+        fail("there is nothing to label: give a --place or a --room, or --named")
     names = check_propositions(list(regions))
     formulas = dict(old.tasks) | dict(_named("--task", option, "NAME=FORMULA") for option in tasks)
     # Compiled only to be checked; labels keep the text.

@@ -72,6 +72,7 @@ def run_one(
     json: Json = False,
 ) -> None:
     """Run one trial: one world, one task, one policy."""
+    from potlp_jax.cli.doubts import of_worlds, warn_of_doubts
     from potlp_jax.cli.inputs import (
         default_policy,
         make_world,
@@ -92,6 +93,7 @@ def run_one(
     trained = read_estimator(estimator)
     asked = generator.task(task)
     made = make_world(generator, chosen_split, world)
+    warn_of_doubts(asked, of_worlds(f"world {world} of {generator.name}/{chosen_split}", [made]))
     config = trial_config(setting_changes(simulations=simulations, search=search, camera=camera), generator)
     chosen_policy = default_policy(made, config, trained) if named is None else named
     folder = None if out is None else make_folder(out)

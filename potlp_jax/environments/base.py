@@ -91,12 +91,20 @@ class Generator(abc.ABC):
         Raises:
             TaskError: there is no such task, or the formula is none.
         """
-        # A number that is none of the tasks would be read as a formula, in which 1 and 0 are constants.
+        return read_task(self.formula(text), self.propositions)
+
+    def formula(self, text: str | int) -> str:
+        """The formula of one of the family's tasks, by its number or name; any other text as it is.
+
+        Raises:
+            TaskError: a number that is none of the tasks.
+        """
+        # It would be read as a formula, in which 1 and 0 are constants.
         formula = self.tasks.get(str(text), str(text))
         if formula.strip().isdecimal():
             known = ", ".join(f"{number} ({entry})" for number, entry in self.tasks.items()) or "none"
             raise TaskError(f"{self.name} has no task {text}; it has: {known}. Or give a formula.")
-        return read_task(formula, self.propositions)
+        return formula
 
 
 def host_generators(key: PRNGKeyArray, count: int) -> tuple[np.random.Generator, ...]:

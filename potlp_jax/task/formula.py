@@ -11,6 +11,14 @@ from typing import Any
 
 from potlp_jax.errors import TaskError
 from potlp_jax.files import one_line
+from potlp_jax.task.pointing import (
+    OPERATOR_PREFIX,
+    WORD_OR_STRING,
+    TakenApart,
+    nearest_name,
+    offending_column,
+    words_taken_apart,
+)
 from potlp_jax.task.propositions import LONGEST_NAME, check_propositions
 from potlp_jax.task.spot_process import ask_spot
 
@@ -20,8 +28,9 @@ MAX_LENGTH: int = 4000
 LONGEST_EXCERPT: int = 160
 """Characters of a formula that a message shows, around what is wrong."""
 
-_WORD_OR_STRING = re.compile(r'"(?:[^"\\]|\\.)*"|[A-Za-z_][A-Za-z0-9_.]*|.')
-_OPERATOR_PREFIX = re.compile(r"^[FGX]+")
+Structure = tuple
+"""Nested tuples, such as ``("U", ("true",), ("name", "a"))``: the form of ``task.language.Formula``."""
+
 _CARET_INDENT = 4
 """Columns that Spot's error report puts before the formula (``>>> ``)."""
 
@@ -54,11 +63,14 @@ class Formula:
         text: what the user wrote.
         propositions: Sigma; bit ``i`` of a letter is ``propositions[i]``.
         parsed: the formula as Spot writes it.
+        structure: its negation normal form, in the form of ``task.language``; None where it is large or has operators
+            of PSL.
     """
 
     text: str
     propositions: tuple[str, ...]
     parsed: str
+    structure: Structure | None
 
 
 def parse_formula(text: str, propositions: Sequence[str] | None = None) -> Formula:
@@ -92,12 +104,14 @@ def parse_formula(text: str, propositions: Sequence[str] | None = None) -> Formu
     # The check is of syntax: a formula that is co-safe for subtler reasons is refused, which is why the message says
     # what may be used.
     if answer["offender"] is not None:
-        raise TaskError(
-            f"the formula is not co-safe: its negation normal form holds '{one_line(answer['offender'])}', which no "
-            "finite word can make true; use X, F, U, M, &, | and negated propositions only"
-            f"{_operator_hint(line)}\n  {one_line(line)}"
-        )
-    return Formula(text=text, propositions=sigma, parsed=answer["formula"])
+        raise _not_co_safe(answer["offender"], line, sigma if known is not None else ())
+    structure = None if answer["structure"] is None else _frozen(answer["structure"])
+    return Formula(text=text, propositions=sigma, parsed=answer["formula"], structure=structure)
+
+
+def _frozen(part: Any) -> Any:
+    """Nested lists, as JSON has them, as nested tuples."""
+    return tuple(map(_frozen, part)) if isinstance(part, list) else part
 
 
 def _parse(line: str, known: tuple[str, ...]) -> dict[str, Any]:
@@ -124,8 +138,8 @@ def _quote_known_names(line: str, known: tuple[str, ...]) -> tuple[str, list[int
     """
     pieces: list[str] = []
     added: list[int] = []
-    for piece in _WORD_OR_STRING.findall(line):
-        operand = _OPERATOR_PREFIX.sub("", piece)
+    for piece in WORD_OR_STRING.findall(line):
+        operand = OPERATOR_PREFIX.sub("", piece)
         # Only F, G and X are left of the word (``operand`` is empty): these are operators, whatever is known.
         if piece in known and operand not in ("", piece, *known):
             start = sum(map(len, pieces))
@@ -136,17 +150,39 @@ def _quote_known_names(line: str, known: tuple[str, ...]) -> tuple[str, list[int
 
 
 def unknown_proposition(name: str, known: tuple[str, ...], line: str) -> TaskError:
-    """Points at the name and lists the known propositions."""
-    shown = one_line(name, LONGEST_NAME)
-    message = f"unknown proposition '{shown}'; known: {', '.join(known) or 'none'}{_operator_hint(line)}"
+    """Points at what was written, and lists the known propositions, with the nearest one first."""
     # The name as a whole word, perhaps in quotes, perhaps with operators written in front of it.
     pattern = rf'(?<![A-Za-z0-9_.])[FGX]*("?)(?P<name>{re.escape(name)})\1(?![A-Za-z0-9_.])'
     match = re.search(pattern, line)
-    return error_at(message, line, 1 + (match.start("name") if match else 0))
+    column = 1 + (match.start("name") if match else 0)
+    word = _word_around(column, line, known)
+    near = nearest_name((name,) if word is None else (word.word, name), known)
+    proposal = "" if near is None else f"; did you mean {near}?"
+    shown = one_line(name, LONGEST_NAME)
+    message = f"unknown proposition '{shown}'{_reading(word)}{proposal}; known: {', '.join(known) or 'none'}"
+    return error_at(message + ("" if word is None else word.hint), line, column if word is None else word.column)
 
 
-def _operator_hint(line: str) -> str:
-    """What may have gone wrong if a name in capitals was taken apart."""
-    # A word in capitals that begins with F, G or X and has a letter that is none of them, such as FIRE.
-    match = re.search(r'(?<![\w".])[FGX][A-Z_]*[A-EH-WY-Z][A-Z0-9_]+(?![\w"])', line)
-    return "" if match is None else f'; F, G and X at the start of a name are operators: quote it, "{match.group()}"'
+def _not_co_safe(offender: str, line: str, known: tuple[str, ...]) -> TaskError:
+    """Points at the operator because of which the formula is refused, or at the name that was read as operators."""
+    column = offending_column(line, known)
+    words = words_taken_apart(line, known)
+    # Where the operator cannot be told, a word that was taken apart is the likeliest to have brought it.
+    word = next(iter(words), None) if column is None else _word_around(column, line, known)
+    message = (
+        f"the formula is not co-safe: its negation normal form holds '{one_line(offender)}', which no finite word can "
+        f"make true{_reading(word)}; use X, F, U, M, &, | and negated propositions only"
+    )
+    if word is not None:
+        return error_at(message + word.hint, line, word.column)
+    return TaskError(f"{message}\n  {one_line(line)}") if column is None else error_at(message, line, column)
+
+
+def _word_around(column: int, line: str, known: tuple[str, ...]) -> TakenApart | None:
+    """The word that was taken apart and holds a column."""
+    words = words_taken_apart(line, known)
+    return next((word for word in words if word.column <= column < word.column + len(word.word)), None)
+
+
+def _reading(word: TakenApart | None) -> str:
+    return "" if word is None else f" ('{word.word}' is read as {word.read_as})"

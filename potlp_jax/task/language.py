@@ -22,8 +22,9 @@ from itertools import product
 import numpy as np
 
 from potlp_jax.task.automaton import Dfa
+from potlp_jax.task.formula import Structure
 
-Formula = tuple
+Formula = Structure
 """Nested tuples: ("true",), ("false",), ("name", p), ("not", f), ("X", f), ("and", f, g), ("or", f, g), ("U", f, g)."""
 
 Rest = frozenset[frozenset[Formula]]

@@ -4,15 +4,19 @@ It imports nothing but Spot, so that it starts in a tenth of a second; ``task.sp
 some formulas Spot takes hours or all memory, or crashes: its limits end this process and no other.
 
 A question is ``{"ask": "parse" | "translate", "formula": text}``. Answers are ``{"errors": report}`` where Spot cannot
-read the text; of ``parse`` ``{"formula", "names", "offender"}`` (``offender`` is None for a co-safe formula); of
-``translate`` ``{"states", "propositions", "transitions", "hoa"}``, with ``hoa`` None where it is longer than the limit.
+read the text; of ``parse`` ``{"formula", "names", "offender", "structure"}`` (``offender`` is None for a co-safe
+formula; ``structure`` is its negation normal form as nested lists in the form of ``task.language``, None where it is
+large or has operators of PSL); of ``translate`` ``{"states", "propositions", "transitions", "hoa"}``, with ``hoa`` None
+where it is longer than the limit.
 """
 
+import functools
 import importlib
 import json
 import resource
 import signal
 import sys
+from collections.abc import Iterator
 from typing import Any
 
 SECONDS: float = 2.0
@@ -20,6 +24,9 @@ SECONDS: float = 2.0
 
 MEMORY: int = 1 << 31
 """Bytes of address space."""
+
+MOST_PARTS: int = 200
+"""Parts of a structure, at most: the tasks that ship have 14, and whoever reads one does so recursively."""
 
 LONGEST_HOA: int = 250_000
 """Characters of an automaton: 8 conjoined ``F p``, 256 states with 6,561 transitions, have half as many."""
@@ -76,7 +83,32 @@ def _parsed(spot: Any, formula: Any) -> dict[str, Any]:
         "formula": str(formula),
         "names": sorted(proposition.ap_name() for proposition in spot.atomic_prop_collect(formula) or ()),
         "offender": None if normal_form.is_syntactic_guarantee() else str(_offending_part(normal_form)),
+        "structure": _structure(normal_form),
     }
+
+
+def _structure(normal_form: Any) -> list[Any] | None:
+    try:
+        return _nested(normal_form, iter(range(MOST_PARTS)))
+    # A formula of more parts than the counter has, and an operator of another logic.
+    except (StopIteration, KeyError):
+        return None
+
+
+def _nested(formula: Any, counter: Iterator[int]) -> list[Any]:
+    """The formula as lists such as ``["U", ["true"], ["name", "a"]]``; And and Or join two parts each."""
+    next(counter)
+    kind = formula.kindstr()
+    if kind == "ap":
+        return ["name", formula.ap_name()]
+    parts = [_nested(part, counter) for part in formula]
+    if kind == "F":
+        return ["U", ["true"], *parts]
+    if kind == "M":
+        # Read once more, so that the second copy counts too.
+        return ["U", parts[1], ["and", parts[0], _nested(formula[1], counter)]]
+    name = {"tt": "true", "ff": "false", "Not": "not", "X": "X", "U": "U", "And": "and", "Or": "or"}[kind]
+    return functools.reduce(lambda left, right: [name, left, right], parts) if name in ("and", "or") else [name, *parts]
 
 
 def _offending_part(formula: Any) -> Any:

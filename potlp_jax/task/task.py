@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Int8, Int32
 from potlp_jax.errors import SpotMissingError, TaskError, TaskWarning, UnsatisfiableError
 from potlp_jax.precision import in_32_bits
 from potlp_jax.task.automaton import Dfa, canonical_dfa, check_size, translate
-from potlp_jax.task.formula import parse_formula, unknown_proposition
+from potlp_jax.task.formula import Structure, parse_formula, unknown_proposition
 from potlp_jax.task.guards import Phi, minimal_cover
 from potlp_jax.task.hoa import HoaAutomaton, read_hoa, write_hoa
 from potlp_jax.task.language import UnreadableError, names_of, read_formula
@@ -113,6 +113,8 @@ class Task:
         dfa: the minimal automaton.
         outcomes: edges, conditions and outcome classes.
         max_positive_literals: cubes that need more propositions at one cell were dropped (None: none were).
+        structure: the formula in negation normal form (``task.language``), where the task was made from one that can
+            be written so; what an automaton's name says is nothing that was checked.
     """
 
     text: str
@@ -120,6 +122,7 @@ class Task:
     dfa: Dfa
     outcomes: Outcomes
     max_positive_literals: int | None = None
+    structure: Structure | None = None
 
     @classmethod
     def from_formula(
@@ -149,11 +152,11 @@ class Task:
         try:
             formula = parse_formula(text, propositions)
         except SpotMissingError as missing:
-            sigma, automaton = _without_spot(text, propositions, missing)
+            sigma, automaton, structure = _without_spot(text, propositions, missing)
         else:
             # Through HOA text, so that formulas and files take one path and a shipped file is what Spot would deliver.
-            sigma, automaton = formula.propositions, read_hoa(translate(formula))
-        return cls._compile(text, sigma, automaton, max_positive_literals)
+            sigma, automaton, structure = formula.propositions, read_hoa(translate(formula)), formula.structure
+        return cls._compile(text, sigma, automaton, max_positive_literals, structure)
 
     @classmethod
     def from_hoa(
@@ -194,7 +197,12 @@ class Task:
 
     @classmethod
     def _compile(
-        cls, text: str, propositions: tuple[str, ...], automaton: HoaAutomaton, max_positive_literals: int | None
+        cls,
+        text: str,
+        propositions: tuple[str, ...],
+        automaton: HoaAutomaton,
+        max_positive_literals: int | None,
+        structure: Structure | None = None,
     ) -> "Task":
         """The task of a parsed automaton, over Sigma."""
         check_size(len(automaton.accepting), len(propositions))
@@ -214,6 +222,7 @@ class Task:
             dfa=dfa,
             outcomes=find_outcomes(dfa, max_positive_literals),
             max_positive_literals=max_positive_literals,
+            structure=structure,
         )
 
     @property
@@ -357,8 +366,8 @@ def stack_tasks(tasks: Sequence[Task], sizes: TaskSizes | None = None) -> TaskAr
 
 def _without_spot(
     text: str, propositions: Sequence[str] | None, missing: SpotMissingError
-) -> tuple[tuple[str, ...], HoaAutomaton]:
-    """Sigma and the shipped automaton that has the language of a formula.
+) -> tuple[tuple[str, ...], HoaAutomaton, Structure]:
+    """Sigma, the shipped automaton that has the language of a formula, and the formula's structure.
 
     Raises:
         SpotMissingError: none has.
@@ -376,7 +385,7 @@ def _without_spot(
     automaton = find_shipped(formula)
     if automaton is None:
         raise missing
-    return sigma, automaton
+    return sigma, automaton, formula
 
 
 def _cube_text(cube: Phi, propositions: Sequence[str]) -> str:

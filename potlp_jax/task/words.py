@@ -71,7 +71,7 @@ def _goal(task: Task, source: int, go: Bool[np.ndarray, " L"], *, exact: bool = 
         if positive:
             wanted.append(_cube_words(task, positive, negative))
         else:
-            left.append(_join([task.propositions[bit] for bit in negative], "and"))
+            left.append(join_names([task.propositions[bit] for bit in negative], "and"))
     phrases = [f"{verb} {_alternatives(cubes)}" for verb, cubes in (("find", wanted), ("leave", left)) if cubes]
     return " or ".join(phrases)
 
@@ -84,9 +84,9 @@ def _manner(task: Task, source: int) -> str:
         if positive:
             avoided.append(_cube_words(task, positive, negative))
         elif negative:
-            kept.append(_join([task.propositions[bit] for bit in negative], "or"))
+            kept.append(join_names([task.propositions[bit] for bit in negative], "or"))
     manner = f", avoiding {_alternatives(avoided)}" if avoided else ""
-    return manner + (f", staying in {_join(kept, 'and')}" if kept else "")
+    return manner + (f", staying in {join_names(kept, 'and')}" if kept else "")
 
 
 def _cubes(letters: Bool[np.ndarray, " L"]) -> list[tuple[list[int], list[int]]]:
@@ -106,8 +106,8 @@ def _makes_progress(task: Task, source: int, cube: tuple[list[int], list[int]], 
 
 
 def _cube_words(task: Task, positive: Sequence[int], negative: Sequence[int]) -> str:
-    text = _join([task.propositions[bit] for bit in positive], "and") + (" together" if len(positive) > 1 else "")
-    return text + (f" without {_join([task.propositions[bit] for bit in negative], 'or')}" if negative else "")
+    text = join_names([task.propositions[bit] for bit in positive], "and") + (" together" if len(positive) > 1 else "")
+    return text + (f" without {join_names([task.propositions[bit] for bit in negative], 'or')}" if negative else "")
 
 
 def _alternatives(phrases: Sequence[str]) -> str:
@@ -115,8 +115,9 @@ def _alternatives(phrases: Sequence[str]) -> str:
     shown = list(dict.fromkeys(phrases))
     if len(shown) > MAX_ALTERNATIVES:
         shown = [*shown[: MAX_ALTERNATIVES - 1], f"one of {len(shown) - MAX_ALTERNATIVES + 1} more"]
-    return _join(shown, "or")
+    return join_names(shown, "or")
 
 
-def _join(names: Sequence[str], last: str) -> str:
+def join_names(names: Sequence[str], last: str) -> str:
+    """Joined by commas and, before the last one, a word such as "or"."""
     return f" {last} ".join(filter(None, (", ".join(names[:-1]), names[-1])))

@@ -47,7 +47,7 @@ def draw_map(image_map: OccupancyMap, clean: CleanMap, title: str) -> Figure:
         The figure, in metres.
     """
     figure, axes = _plan(image_map, clean, title, [])
-    _finish(figure, axes, clean, [])
+    _finish(figure, axes, clean, _closed_handles(image_map))
     return figure
 
 
@@ -69,8 +69,14 @@ def draw_places(family: RosMap, world: World, title: str) -> Figure:
     if family.places.start is not None:
         axes.plot(*family.places.start, "o", ms=9, mfc="white", mec=INK, mew=1.8, zorder=6)
         present.append(Line2D([], [], marker="o", ls="", ms=8, mfc="white", mec=INK, mew=1.6, label="start"))
-    _finish(figure, axes, family.clean, present)
+    _finish(figure, axes, family.clean, [*_closed_handles(family.image_map), *present])
     return figure
+
+
+def _closed_handles(image_map: OccupancyMap) -> list[Patch | Line2D]:
+    """What the legend says of closed outer walls."""
+    closed = image_map.closed
+    return [] if closed is None or not closed.any() else [Patch(facecolor=CHOSEN, label="gap in an outer wall, closed")]
 
 
 def _plan(
@@ -94,6 +100,8 @@ def _plan(
     for raster in (_painted(clean.free, REACHED), *letters):
         _show(axes, raster, clean.frame, zorder=1)
     _show(axes, _wall_raster(image_map, block), image_map.frame, zorder=2, block=block)
+    if image_map.closed is not None:
+        _show(axes, _painted(_any_in_blocks(image_map.closed, block), CHOSEN), image_map.frame, zorder=3, block=block)
     axes.set_xlabel("x (m)", size=9)
     axes.set_ylabel("y (m)", size=9)
     axes.tick_params(labelsize=8)

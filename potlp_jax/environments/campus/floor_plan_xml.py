@@ -23,7 +23,7 @@ from potlp_jax.environments.campus.furnishing import Kind
 from potlp_jax.environments.ros.map_files import LARGEST_NUMBER, read_yaml
 from potlp_jax.environments.ros.places import Point
 from potlp_jax.errors import MapError
-from potlp_jax.files import MOST_TEXT, one_line, read_bytes, reading, short
+from potlp_jax.files import one_line, read_xml, short
 
 _METRES = {"cm": 0.01, "m": 1.0, "mm": 0.001}
 
@@ -93,9 +93,7 @@ def read_plan(file: Path | str) -> FloorPlan:
             sense; the message names the room.
     """
     file = Path(file)
-    text = read_bytes(file, MapError, MOST_TEXT)
-    with reading(file, MapError, "valid XML"):
-        building = ElementTree.fromstring(text)
+    building = read_xml(file, MapError)
     # The corpus has legends in the same folder, which are XML, too.
     if building.tag != "building":
         raise MapError(

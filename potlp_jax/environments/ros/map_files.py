@@ -30,7 +30,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -40,6 +40,12 @@ from jaxtyping import Bool, Float64, Int8, Int64, Shaped
 from potlp_jax import files, images
 from potlp_jax.errors import MapError, MapWarning
 from potlp_jax.files import short
+
+if TYPE_CHECKING:
+    from potlp_jax.environments.ros.places import Places
+
+ROS_MAP = "ROS map"
+"""The kind of a map that is an image with a YAML file."""
 
 MODES = ("trinary", "scale", "raw")
 OCCUPIED = 100
@@ -150,7 +156,7 @@ class MapSettings:
 
 @dataclass(frozen=True, eq=False)
 class OccupancyMap:
-    """A map as its server would publish it, with row 0 at the top.
+    """A map as its server would publish it, with row 0 at the top; plans of other formats become one, too.
 
     Attributes:
         settings: the YAML.
@@ -158,6 +164,9 @@ class OccupancyMap:
         free: what the thresholds call free.
         occupied: what the thresholds call an obstacle; neither of the two is unknown.
         frame: metres to pixels.
+        kind: of file, for people.
+        closed: obstacles that the file does not have, added to close outer walls; None where nothing was to be closed.
+        places: what the file names; None where it names nothing.
     """
 
     settings: MapSettings
@@ -165,6 +174,14 @@ class OccupancyMap:
     free: Bool[np.ndarray, "H W"]
     occupied: Bool[np.ndarray, "H W"]
     frame: GridFrame
+    kind: str = ROS_MAP
+    closed: Bool[np.ndarray, "H W"] | None = None
+    places: "Places | None" = None
+
+    @property
+    def closed_gaps(self) -> int:
+        """Gaps in outer walls that were closed."""
+        return 0 if self.closed is None else cv2.connectedComponents(self.closed.astype(np.uint8))[0] - 1
 
 
 def load_map(file: Path | str) -> OccupancyMap:

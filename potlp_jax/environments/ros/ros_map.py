@@ -6,8 +6,10 @@ follow after commas: ``map:FILE.yaml,places=OTHER.yaml,resolution=0.2,radius=0.1
 Costs are in metres, since ``World.resolution`` is the size of a cell in metres.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Int32, PRNGKeyArray
@@ -15,13 +17,18 @@ from jaxtyping import Int32, PRNGKeyArray
 from potlp_jax.environments.base import Generator, host_generators
 from potlp_jax.environments.campus.furnishing import NARROW_DOORS
 from potlp_jax.environments.options import parse_options
-from potlp_jax.environments.ros.cleaning import clean_map, warn_of_cut_off
-from potlp_jax.environments.ros.map_files import OccupancyMap, load_map
-from potlp_jax.environments.ros.places import Places, load_places, place_letters
+from potlp_jax.environments.ros.buildings import load_building
+from potlp_jax.environments.ros.cleaning import CleanMap, clean_map, warn_of_cut_off
+from potlp_jax.environments.ros.map_files import OccupancyMap
+from potlp_jax.environments.ros.places import MAX_PROPOSITIONS, Places, load_places, place_letters
 from potlp_jax.errors import MapError
 from potlp_jax.world.grid import World, make_world
 
 PREFIX = "map:"
+
+_OPTIONS: Mapping[str, type[str] | type[float]] = MappingProxyType(
+    {"places": str, "resolution": float, "radius": float, "level": str}
+)
 
 
 @dataclass(frozen=True)
@@ -29,10 +36,11 @@ class RosMapConfig:
     """Which map, and how it becomes a grid.
 
     Attributes:
-        file: the map's YAML.
+        file: the map, in one of the formats of `environments.ros.buildings`.
         places: YAML of the propositions, or the propositions; None: ``FILE.places.yaml`` beside the map.
         resolution: size of a working cell in metres, not finer than the map's pixels.
         radius: the robot's radius in metres, by which obstacles grow.
+        level: of a building with several.
 
     With the defaults a door of 0.6 m stays open wherever it lies on the grid.
     """
@@ -41,6 +49,7 @@ class RosMapConfig:
     places: str | Places | None = None
     resolution: float = 0.2
     radius: float = 0.1
+    level: str | None = None
 
 
 class RosMap(Generator):
@@ -64,10 +73,10 @@ class RosMap(Generator):
 
         Warns:
             MapWarning: a part of the building cannot be reached; see also
-                `potlp_jax.environments.ros.map_files.load_map`.
+                `potlp_jax.environments.ros.buildings.load_building`.
         """
         self.config = config
-        self.image_map = load_map(config.file)
+        self.image_map = load_building(config.file, config.level)
         # From Python the places may be given as they are; from the command line they are a file.
         places = config.places if isinstance(config.places, Places) else _find_places(config, self.image_map)
         self.places = places
@@ -115,14 +124,23 @@ class RosMap(Generator):
         return self.clean.frame.cell_to_metres(row, col)
 
 
+def reachable_places(places: Places, clean: CleanMap) -> Places:
+    """The places that cover a cell which the robot can reach."""
+    found = (
+        (name, tuple(region for region in regions if region.covers(clean.free, clean.frame).any()))
+        for name, regions in places.propositions
+    )
+    return replace(places, propositions=tuple((name, regions) for name, regions in found if regions))
+
+
 def parse_spec(spec: str) -> RosMapConfig:
     """``map:FILE.yaml,option=value,...`` as a configuration.
 
     Raises:
         MapError: the text is not of that form.
     """
-    usage = "write map:FILE.yaml[,places=FILE][,resolution=METRES][,radius=METRES]"
-    file, values = parse_options(spec, PREFIX, "map", {"places": str, "resolution": float, "radius": float}, usage)
+    usage = "write map:FILE.yaml[,places=FILE][,resolution=METRES][,radius=METRES][,level=NAME]"
+    file, values = parse_options(spec, PREFIX, "map", _OPTIONS, usage)
     return RosMapConfig(file, **values)
 
 
@@ -131,14 +149,18 @@ def _find_places(config: RosMapConfig, image_map: OccupancyMap) -> Places:
     if config.places is not None or file.is_file():
         return load_places(file)
     clean = clean_map(image_map, config.resolution, config.radius)
+    named = None if image_map.places is None else reachable_places(image_map.places, clean)
+    if named is not None and 0 < len(named.propositions) <= MAX_PROPOSITIONS:
+        return named
+    many = "" if named is None else f"It names {len(named.names)} places: --named of `potlp map label` takes them. "
     # The example in the message has two points that exist on this very map.
     cells = np.argwhere(clean.free)
     (x0, y0), (x1, y1) = (clean.frame.cell_to_metres(*map(int, cells[i])) for i in (0, -1))
     raise MapError(
         Path(config.file),
         "places",
-        f"{file} does not exist, and a map has no propositions of its own. Write it with `potlp map label` or by hand, "
-        "in map metres, for instance\n"
+        f"{file} does not exist, and the map itself does not name 1 to {MAX_PROPOSITIONS} places that can be reached. "
+        f"{many}Write the file with `potlp map label` or by hand, in map metres, for instance\n"
         "propositions:\n"
         f"  document: [{{point: [{x0:.2f}, {y0:.2f}], radius: 0.5}}]\n"
         f"  package: [{{point: [{x1:.2f}, {y1:.2f}], radius: 0.5}}]\n"
