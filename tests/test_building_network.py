@@ -17,7 +17,7 @@ from potlp_jax.learning.building_network import (
     map_channels,
 )
 from potlp_jax.learning.imagined_paths import PROSPECTS, outlook, prospects, scenery
-from potlp_jax.learning.observing import ObservingEstimator, observe_panorama
+from potlp_jax.learning.observing import ObservingEstimator, looks_on_the_way, observe_panorama
 from potlp_jax.learning.painting import blank_painting
 from potlp_jax.learning.squares import SQUARE
 from potlp_jax.planning.policies import Policy
@@ -231,6 +231,7 @@ def test_a_place_reads_the_squares_around_its_cell(params):
 def test_trials_with_the_network_are_the_same_alone_and_in_a_batch(params):
     world = _world()
     assert isinstance(_estimator(params, world), ObservingEstimator)
+    assert looks_on_the_way(_estimator(params, world))
     task = Task.from_formula("!hazard U goal", propositions=NAMES)
     estimator = _estimator(params, world)
     trials = list(

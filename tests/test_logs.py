@@ -113,7 +113,7 @@ def test_a_dataset_from_a_bag_has_the_rows_of_the_simulator(bags, tmp_path, kind
     recorder.add_world(WORLD, 0)
     rng = np.random.default_rng([0, zlib.crc32(b"training"), 0])
     pool = [TaskDistribution(TOY.propositions).draw(rng) for _ in range(2)]
-    record_views(recorder, WORLD, _simulated_poses(), pool, rng, lambda pose: panorama_of(pose.step), most=200)
+    record_views(recorder, WORLD, _simulated_poses(), pool, rng, lambda _, step: panorama_of(step), most=200)
     expected = pd.DataFrame(recorder.samples)
     assert count == len(views) == len(recorder.views["view"]) > 2
     assert set(samples["success_probability"]) == {0.0, 1.0}
@@ -414,6 +414,9 @@ def test_a_robot_that_looks_stops_where_there_is_a_picture(bags):
     while not robot.ended:
         assert np.abs(np.asarray(robot.panorama()).astype(int) - panorama_of(tour_step(robot))).mean() < 4
         legs.append(len(robot.advance(path, stop).cells))
+        # Only where it stops there is a picture, but for the end of the log.
+        pictures = [robot.panorama_before(back) is not None for back in range(legs[-1])]
+        assert pictures == [not robot.ended, *[False] * (legs[-1] - 1)]
     assert legs == [7, 8, 3]
     with pytest.raises(LogError, match="there is no picture of cell number 18"):
         robot.panorama()

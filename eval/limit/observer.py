@@ -23,7 +23,7 @@ from eval.limit.buildings import (
 )
 from potlp_jax.environments.firefighting import Firefighting, FirefightingLayout, building_of
 from potlp_jax.learning.labels import true_labels
-from potlp_jax.learning.observing import ObservingEstimator, with_memory
+from potlp_jax.learning.observing import ObservingEstimator, looks_on_the_way, with_memory
 from potlp_jax.planning.estimates import Estimates, Estimator
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import Status, status_if
@@ -37,7 +37,7 @@ class IdealObserver:
     """Answers with the means of the true labels over buildings that agree with all that was seen.
 
     What was seen: the map, and the tiles and the smoke of every floor cell that has been in line of sight from where a
-    panorama was taken, at any distance.
+    panorama was taken, at any distance. It looks on the way, as the trained estimator of buildings does.
 
     Attributes:
         memory: what the camera showed so far.
@@ -52,6 +52,11 @@ class IdealObserver:
     noise: Noise
     truth: UInt8[Array, "H W"]
     blank: World
+
+    @property
+    def looks_on_the_way(self) -> bool:
+        """Always."""
+        return True
 
     def encode(self, panorama: UInt8[Array, "rows columns 3"]) -> None:
         """Nothing: what is in sight is taken from the building, not from pixels."""
@@ -138,6 +143,11 @@ class MixedEstimator:
     chances: Any
     costs: Any
     memory: tuple[Any, Any]
+
+    @property
+    def looks_on_the_way(self) -> bool:
+        """Whether one of them does; the other is shown the same."""
+        return any(looks_on_the_way(part) for part in (self.chances, self.costs))
 
     def encode(self, panorama: UInt8[Array, "rows columns 3"]) -> tuple[Any, Any]:
         """What each of them is to remember of a panorama."""

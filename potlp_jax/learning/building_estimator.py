@@ -28,6 +28,11 @@ class BuildingEstimator:
     memory: Painting
     config: BuildingConfig = struct.field(pytree_node=False)
 
+    @property
+    def looks_on_the_way(self) -> bool:
+        """Always: doorways that the robot passes between two decisions show what is behind them."""
+        return True
+
     def encode(self, panorama: UInt8[Array, "rows columns 3"]) -> UInt8[Array, "rows columns 3"]:
         """The panorama itself: what a pixel shows is known only with the belief."""
         return panorama

@@ -1,4 +1,4 @@
-"""What estimators that remember have in common: a trial shows them every panorama, a decision asks them what they know.
+"""What estimators that remember have in common: a trial shows them panoramas, a decision asks them what they know.
 
 The panorama network (``learning.estimator``) and the building network (``learning.building_estimator``) are two; one of
 your own is a pytree with the same fields and methods.
@@ -54,6 +54,42 @@ class AnswersFromPanoramas(Protocol):
     def observations(self, subgoals: Subgoals) -> Int32[Array, " S"]:
         """Number of that panorama for each subgoal, counted from 0 as they were shown; anything where masked. Pure."""
         ...
+
+
+@runtime_checkable
+class LooksOnTheWay(Protocol):
+    """An estimator that may be shown what the camera sees on the way; others are shown the panoramas of decisions."""
+
+    @property
+    def looks_on_the_way(self) -> bool:
+        """Whether it is; the same throughout a trial."""
+        ...
+
+
+def looks_on_the_way(estimator: Any) -> bool:
+    """Whether an estimator is shown what the camera sees on the way from one decision to the next."""
+    return isinstance(estimator, LooksOnTheWay) and estimator.looks_on_the_way
+
+
+_Count = TypeVar("_Count", int, Int32[Array, ""])
+
+
+def looks_between(before: _Count, now: _Count, every: int) -> _Count:
+    """How often the camera looks on the way, on host or device; this and ``look_step`` alone say when it does.
+
+    Args:
+        before, now: cells entered until one decision and until the next, at which it looks in any case.
+        every: number of cells, as ``TrialConfig.look_every``.
+
+    Returns:
+        The number of looks between; none if it is below 1.
+    """
+    return (now - before - 1) // every if every else 0 * now
+
+
+def look_step(before: _Count, number: _Count, every: int) -> _Count:
+    """After how many cells entered it looks for time ``number``, counted from 0, after ``before`` and a decision."""
+    return before + (number + 1) * every
 
 
 _Observing = TypeVar("_Observing", bound=ObservingEstimator)

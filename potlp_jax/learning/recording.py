@@ -32,6 +32,7 @@ from potlp_jax.learning.dataset import (
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.labels import true_labels
 from potlp_jax.learning.map_images import encode_view, encode_world
+from potlp_jax.learning.observing import look_step, looks_between
 from potlp_jax.learning.painting import Painting, blank_painting, paint
 from potlp_jax.learning.questions import Question, TaskDistribution, draw_questions, question_sheet
 from potlp_jax.learning.sample_weights import WeightBounds, Weights, loss_weights
@@ -41,6 +42,7 @@ from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.world.camera import CameraConfig, Disturbance, bearing
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
 from potlp_jax.world.grid import BeliefMap, World
+from potlp_jax.world.moves import Cell
 from potlp_jax.world.sensing import SensorConfig, visible
 
 
@@ -59,6 +61,7 @@ class RecordingConfig:
         seed: of everything but the worlds.
         held_out: formulas whose languages are never drawn.
         camera: takes the images.
+        look_every: how often it looks on the way, as in a trial (``TrialConfig``), to paint the map.
     """
 
     views_per_world: int = 12
@@ -72,6 +75,7 @@ class RecordingConfig:
     seed: int = 0
     held_out: tuple[str, ...] = ()
     camera: CameraConfig = CameraConfig()
+    look_every: int = 1
 
 
 def recording_metadata(
@@ -120,12 +124,21 @@ def draws_of_world(
 
 @dataclasses.dataclass(frozen=True)
 class Pose:
-    """Where the robot stands and what it knows; ``step`` counts cells entered, ``travelled`` is in cells."""
+    """Where the robot stands and what it knows.
+
+    Attributes:
+        belief: what it knows.
+        cell: where it stands.
+        step: cells entered so far.
+        travelled: so far, in cells.
+        way: cells entered since the pose before, ``cell`` not among them; none if there are no pictures.
+    """
 
     belief: BeliefMap
-    cell: tuple[int, int]
+    cell: Cell
     step: int
     travelled: float
+    way: tuple[Cell, ...] = ()
 
 
 @struct.dataclass(kw_only=True)
@@ -292,7 +305,7 @@ def record_views(
     poses: Iterable[Pose],
     tasks: Sequence[Task],
     rng: np.random.Generator,
-    photograph: Callable[[Pose], UInt8[np.ndarray, "rows columns 3"] | None],
+    photograph: Callable[[Cell, int], UInt8[np.ndarray, "rows columns 3"] | None],
     *,
     most: int,
     unexplored: Bool[np.ndarray, "H W"] | None = None,
@@ -305,7 +318,8 @@ def record_views(
         poses: of the robot, in order, nothing known before the first; not read further than needed.
         tasks: the pool that questions are drawn from.
         rng: moves on.
-        photograph: called once a pose, in their order; None: there is no picture, and the pose is passed over.
+        photograph: what the camera sees from a cell that was entered after so many others; called in their order. None:
+            there is no picture, and the pose is passed over.
         most: views to record.
         unexplored: as in ``is_answered``; subgoals that ``world`` does not answer for are left out. None: it answers
             for all.
@@ -318,8 +332,9 @@ def record_views(
     for pose in poses:
         if recorded == most:
             break
-        # At every pose, as in a trial, where each decision is preceded by a panorama.
-        image = photograph(pose)
+        # At every pose and on the way, as in a trial, where panoramas precede each decision.
+        painting = _painted_on_the_way(painting, pose, photograph, config)
+        image = photograph(pose.cell, pose.step)
         if image is None:
             continue
         painting = _painted(painting, image, pose.belief, jnp.asarray(pose.cell, jnp.int32), config.camera)
@@ -340,6 +355,23 @@ def record_views(
 
 
 _painted = jax.jit(paint, static_argnames="camera")
+
+
+def _painted_on_the_way(
+    painting: Painting,
+    pose: Pose,
+    photograph: Callable[[Cell, int], UInt8[np.ndarray, "rows columns 3"] | None],
+    config: RecordingConfig,
+) -> Painting:
+    """The painting with what the camera saw since the pose before, this pose's own panorama left out."""
+    before = pose.step - len(pose.way) - 1
+    for number in range(looks_between(before, pose.step, config.look_every)):
+        step = look_step(before, number, config.look_every)
+        cell = pose.way[step - before - 1]
+        image = photograph(cell, step)
+        if image is not None:
+            painting = _painted(painting, image, pose.belief, jnp.asarray(cell, jnp.int32), config.camera)
+    return painting
 
 
 def _answered_part(scene: Scene, world: World, belief: BeliefMap, unexplored: Bool[np.ndarray, "H W"]) -> Scene:

@@ -81,7 +81,7 @@ def collect_drives(
             poses_of(drive),
             pool,
             rng,
-            lambda pose, reader=reader: reader.panorama(pose.step),
+            lambda _, step, reader=reader: reader.panorama(step),
             most=config.views_per_world,
             unexplored=drive.unexplored(),
         )

@@ -21,8 +21,8 @@ from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import drive as drive_robot
 from potlp_jax.trials.loop import make_trial
-from potlp_jax.trials.record import LOG_PREFIX, NEVER_SEEN, Decision, Trial
-from potlp_jax.trials.replay import Views, recall_views
+from potlp_jax.trials.record import LOG_PREFIX, NEVER_SEEN, Trial
+from potlp_jax.trials.replay import Panorama, Views, recall_views
 from potlp_jax.trials.robot import Leg
 from potlp_jax.trials.rules import Knowledge, Stop, estimator_of
 from potlp_jax.world.camera import CameraConfig
@@ -40,6 +40,8 @@ class LoggedRobot:
 
     def __init__(self, drive: Drive, reader: PanoramaReader | None = None) -> None:
         self._drive, self._reader, self._step = drive, reader, 0
+        # Of the last advance: whoever asks for the first of them again would have the log read from its start.
+        self._pictures: list[Panorama | None] = []
 
     @property
     def ended(self) -> bool:
@@ -56,10 +58,15 @@ class LoggedRobot:
         Raises:
             LogError: there is no picture, or it is of no use.
         """
-        seen = None if self._reader is None else self._reader.panorama(self._step)
+        seen = self._pictures[-1] if self._pictures else self._first_picture()
         if seen is None:
             raise LogError(f"{self._drive.log.path}: there is no picture of cell number {self._step} of the path")
         return jnp.asarray(seen)
+
+    def panorama_before(self, back: int) -> UInt8[Array, "rows columns 3"] | None:
+        """What the camera saw on the last advance, ``back`` cells before the robot's cell, where there is a picture."""
+        seen = self._pictures[-1 - back]
+        return None if seen is None else jnp.asarray(seen)
 
     def advance(self, path: KnownPath, stop: Stop) -> Leg:
         """Go on along the log; ``path`` tells where its target was reached."""
@@ -69,8 +76,10 @@ class LoggedRobot:
         planned = [as_cell(cell) for cell in np.asarray(path.cells)[: int(path.length) + 1]]
         target = jnp.asarray(planned[-1], jnp.int32)
         follows = True
+        self._pictures = []
         while not self.ended:
             self._step += 1
+            self._pictures.append(None if self._reader is None else self._reader.panorama(self._step))
             moved, here = self._step - start, path_taken[self._step]
             follows = follows and moved < len(planned) and here == planned[moved]
             # A plan may pass its target's cell before it ends there.
@@ -79,19 +88,21 @@ class LoggedRobot:
                 continue
             travelled = jnp.float32(path_length(path_taken[start : self._step + 1]))
             is_due = arrived or bool(_is_due(stop, before, self._drive.belief_at(self._step), target, travelled))
-            # Last of all, for a picture is read and unrolled to tell.
-            if is_due and self._has_panorama():
+            if is_due and self._can_decide():
                 break
         return Leg(cells=path_taken[start + 1 : self._step + 1], ended=self.ended)
+
+    def _first_picture(self) -> Panorama | None:
+        return None if self._reader is None else self._reader.panorama(self._step)
 
     def _map_changed_since(self, start: int) -> bool:
         # Asked of the array of all steps: beliefs are made only where there is something new in them.
         first_seen = self._drive.first_seen
         return bool(np.any((first_seen > start) & (first_seen <= self._step)))
 
-    def _has_panorama(self) -> bool:
+    def _can_decide(self) -> bool:
         """Whether a policy can decide here: always, unless it needs a picture."""
-        return self._reader is None or self._reader.panorama(self._step) is not None
+        return self._reader is None or self._pictures[-1] is not None
 
 
 _is_due = jax.jit(Stop.is_due)
@@ -160,16 +171,8 @@ def replay(
 
 
 def _views(drive: Drive, trial: Trial, config: TrialConfig, asked: TrainedEstimator | Estimator | None) -> Views:
-    # A reader of its own: asked for the decisions in their order, it does not start the log again for each.
-    reader = PanoramaReader(drive, config.camera)
-
-    def panorama_of(decision: Decision) -> UInt8[np.ndarray, "rows columns 3"]:
-        seen = reader.panorama(decision.step)
-        # The robot decided only where there is one (``LoggedRobot.advance``).
-        assert seen is not None
-        return seen
-
-    return recall_views(trial, asked, config, panorama_of)
+    # A reader of its own: asked for the steps in their order, it does not start the log again for each.
+    return recall_views(trial, asked, config, PanoramaReader(drive, config.camera).panorama)
 
 
 def from_first_picture(drive: Drive, camera: CameraConfig) -> Drive:

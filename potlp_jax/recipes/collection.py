@@ -55,6 +55,7 @@ from potlp_jax.trials.config import trial_config_for
 from potlp_jax.trials.loop import versions
 from potlp_jax.world.camera import Disturbance, disturb
 from potlp_jax.world.grid import World
+from potlp_jax.world.moves import Cell
 from potlp_jax.world.renderer import render
 
 
@@ -248,10 +249,10 @@ def _collect_world(recorder: Recorder, world: World, index: int, tasks: TaskDist
     config = job.config
     rng, pool = draws_of_world(config, job.split, index, tasks)
 
-    def photograph(pose: Pose) -> UInt8[np.ndarray, "rows columns 3"]:
+    def photograph(cell: Cell, step: int) -> UInt8[np.ndarray, "rows columns 3"]:
         # By world and step, so that a picture does not depend on how many were taken before it.
-        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), index), pose.step)
-        return np.asarray(_image(world, jnp.asarray(pose.cell, jnp.int32), key, config))
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), index), step)
+        return np.asarray(_image(world, jnp.asarray(cell, jnp.int32), key, config))
 
     recorder.add_world(world, index)
     # Half of the questions are of the tasks that are pursued: they are asked in the states that pursuing them leads to.
@@ -273,7 +274,12 @@ def _drives(
     if config.driver == "explorer":
         return [Explorer(world, pool[: config.pursued], rng, config.explorer).poses()], 1
     tasks, key = pool[: config.drives], jax.random.fold_in(jax.random.key(config.seed), index)
-    settings = dataclasses.replace(trial_config_for(world), camera=config.camera, disturbance=config.disturbance)
+    settings = dataclasses.replace(
+        trial_config_for(world),
+        camera=config.camera,
+        disturbance=config.disturbance,
+        look_every=config.look_every,
+    )
     return policy_drives(world, tasks, Policy(config.driver), job.estimator, settings, key), len(tasks)
 
 

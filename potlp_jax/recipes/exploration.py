@@ -72,10 +72,10 @@ class Explorer:
     def poses(self) -> Iterator[Pose]:
         """Poses in order, the start first, until nothing can be reached any more or the limit has been travelled."""
         # The same observe and advance as in a trial, so that poses are where a planner would decide.
-        step, travelled = 0, 0.0
+        step, travelled, way = 0, 0.0, ()
         while True:
             belief, cell = self._robot.observe()
-            yield Pose(belief=belief, cell=cell, step=step, travelled=travelled)
+            yield Pose(belief=belief, cell=cell, step=step, travelled=travelled, way=way)
             chosen = self._choose(belief, cell) if travelled < self._limit else None
             if chosen is None:
                 return
@@ -91,7 +91,7 @@ class Explorer:
             assert cells, f"a path from {cell} to {target} has no moves"
             letters = np.asarray(self._robot.observe()[0].letters)
             self._read([int(letters[entered]) for entered in cells])
-            step += len(cells)
+            step, way = step + len(cells), cells[:-1]
             travelled += path_length([cell, *cells])
 
     def _take_task(self, letter: int) -> None:

@@ -58,12 +58,14 @@ def policy_drives(
             key=jax.random.fold_in(key, number),
         )
         travelled = np.cumsum([0.0, *step_lengths(trial.path)]).tolist()
+        befores = [0, *(decision.step for decision in trial.decisions)]
         yield [
             Pose(
                 belief=trial.belief_of(decision),
                 cell=decision.cell,
                 step=decision.step,
                 travelled=travelled[decision.step],
+                way=trial.path[before + 1 : decision.step],
             )
-            for decision in trial.decisions
+            for before, decision in zip(befores, trial.decisions, strict=False)
         ]

@@ -25,6 +25,8 @@ class TrialConfig:
         disturbance: of these panoramas.
         panoramas: how many an estimator with a camera remembers. Where that is too few for the frontiers that are open
             the trial's status has ``VIEW_OVERFLOW``.
+        look_every: on the way from one decision to the next, the number of cells after which the camera looks again,
+            for an estimator that ``learning.observing.LooksOnTheWay``; 0: it looks at decisions alone.
         replan_distance: cells travelled after which a changed map is worth a new decision.
         budget_factor: times the map's ``height + width`` is the number of cells that may be travelled.
         revealed: whether a simulated robot knows the whole map from the start.
@@ -36,6 +38,7 @@ class TrialConfig:
     disturbance: Disturbance = Disturbance()
     # Panoramas that still show a frontier: at most 9 in fire-fighting buildings (docs/estimator.md, "Panoramas").
     panoramas: int = 32
+    look_every: int = 1
     # Both are part of the model (docs/model.md section 7): another value gives other trials.
     replan_distance: float = 4.0
     budget_factor: float = 20.0
@@ -44,6 +47,8 @@ class TrialConfig:
     def __post_init__(self) -> None:
         if self.panoramas < 1:
             raise ValueError(f"panoramas is {self.panoramas}, must be at least 1")
+        if self.look_every < 0:
+            raise ValueError(f"look_every is {self.look_every}, must be at least 0")
 
 
 def trial_config_for(source: World | Generator) -> TrialConfig:

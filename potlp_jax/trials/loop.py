@@ -8,6 +8,7 @@ import dataclasses
 import importlib.metadata
 import logging
 from collections.abc import Callable, Sequence
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,13 @@ from jaxtyping import Int32, PRNGKeyArray
 
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import TrainedEstimator, identity_of
-from potlp_jax.learning.observing import ObservingEstimator, observe_panorama
+from potlp_jax.learning.observing import (
+    ObservingEstimator,
+    look_step,
+    looks_between,
+    looks_on_the_way,
+    observe_panorama,
+)
 from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.move import Move, MoveKind
@@ -28,7 +35,7 @@ from potlp_jax.trials import rules
 from potlp_jax.trials.config import TrialConfig, config_in
 from potlp_jax.trials.move_record import decision_of
 from potlp_jax.trials.record import Decision, Outcome, RunRecord, Trial, with_closed
-from potlp_jax.trials.robot import GrowingRobot, Leg, Robot, SimulatedRobot
+from potlp_jax.trials.robot import GrowingRobot, Leg, RemembersItsWay, Robot, SimulatedRobot
 from potlp_jax.trials.setbacks import SetbackConfig, Setbacks
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.moves import Cell, path_length
@@ -235,6 +242,7 @@ class _Loop:
         at, key = jnp.asarray(cell, jnp.int32), rules.decision_key(self._key, index)
         # Before the decision, so that its estimates know what can be seen from here.
         if isinstance(self._estimator, ObservingEstimator):
+            self._look_back(belief)
             self._estimator = observe_panorama(self._estimator, self._robot.panorama(), belief, at)
         # The robot's own cell is free, whatever was set aside.
         closed = tuple(entry for entry in self._setbacks.closed_at(index, belief) if entry != cell)
@@ -257,6 +265,21 @@ class _Loop:
         if self._listener is not None:
             self._listener(self._decisions[-1], planned_on)
         return move
+
+    def _look_back(self, belief: BeliefMap) -> None:
+        """Show the estimator what the camera saw on the way here from the decision before."""
+        robot = self._robot
+        if not (self._decisions and looks_on_the_way(self._estimator) and isinstance(robot, RemembersItsWay)):
+            return
+        before, now, every = self._decisions[-1].step, len(self._path) - 1, self._config.look_every
+        for number in range(looks_between(before, now, every)):
+            step = look_step(before, number, every)
+            seen = robot.panorama_before(now - step)
+            # A real robot's pictures are few; one of its own will come.
+            if seen is not None:
+                cell = jnp.asarray(self._path[step], jnp.int32)
+                # By the map as it is known now: what was mapped since hides what is behind it, too.
+                self._estimator = observe_panorama(cast(ObservingEstimator, self._estimator), seen, belief, cell)
 
     def _after(self, leg: Leg, cells: tuple[Cell, ...], move: Move, belief: BeliefMap) -> None:
         """Count a leg, where the robot really went and whether it failed; ``cells`` are those of the map now."""

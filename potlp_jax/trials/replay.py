@@ -14,7 +14,13 @@ from potlp_jax.codec import config_from_dict
 from potlp_jax.errors import EstimatorError, RecordError
 from potlp_jax.learning.estimator import TrainedEstimator, identity_of, shipped_estimators
 from potlp_jax.learning.labels import TrueMapEstimator
-from potlp_jax.learning.observing import ObservingEstimator, observe_panorama
+from potlp_jax.learning.observing import (
+    ObservingEstimator,
+    look_step,
+    looks_between,
+    looks_on_the_way,
+    observe_panorama,
+)
 from potlp_jax.learning.overlays import Overlay, ShowsOverlays, overlays_of
 from potlp_jax.planning.estimates import Estimator, ask
 from potlp_jax.planning.policies import Policy
@@ -35,6 +41,9 @@ from potlp_jax.world.grid import BeliefMap
 logger = logging.getLogger(__name__)
 
 Panorama = UInt8[np.ndarray, "rows columns 3"]
+
+PanoramaOfStep = Callable[[int], UInt8[Array, "rows columns 3"] | Panorama | None]
+"""What the camera saw after so many cells entered; None where there is no picture."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,7 +126,7 @@ def estimator_at(trial: Trial, index: int, estimator: TrainedEstimator | Estimat
     asked = _first(trial, found, config)
     # The decision's own panorama included: it is taken before the decision.
     for decision in trial.decisions[: index + 1]:
-        asked = _after_looking(asked, trial, decision, lambda at: panorama_at(trial, at, config))
+        asked = _after_looking(asked, trial, decision, config, lambda step: _panorama_of_step(trial, step, config))
     return asked
 
 
@@ -130,13 +139,27 @@ def _after_looking(
     asked: Estimator | None,
     trial: Trial,
     decision: Decision,
-    panorama_of: Callable[[Decision], UInt8[Array, "rows columns 3"] | Panorama],
+    config: TrialConfig,
+    panorama_of: PanoramaOfStep,
 ) -> Estimator | None:
-    """The estimator after the panorama of a decision; one that does not remember has seen nothing."""
+    """The estimator after the panoramas up to a decision from the one before; one that forgets has seen nothing."""
     if not isinstance(asked, ObservingEstimator):
         return asked
-    cell, belief = jnp.asarray(decision.cell, jnp.int32), trial.belief_of(decision)
-    return observe_panorama(asked, jnp.asarray(panorama_of(decision)), belief, cell)
+    belief = trial.belief_of(decision)
+    steps = [*_steps_on_the_way(trial, decision, config), decision.step] if looks_on_the_way(asked) else [decision.step]
+    for step in steps:
+        seen = panorama_of(step)
+        if seen is not None:
+            asked = observe_panorama(asked, jnp.asarray(seen), belief, jnp.asarray(trial.path[step], jnp.int32))
+    return asked
+
+
+def _steps_on_the_way(trial: Trial, decision: Decision, config: TrialConfig) -> list[int]:
+    """After how many cells entered the camera looked on the way to a decision."""
+    if decision.index == 0:
+        return []
+    before, every = trial.decisions[decision.index - 1].step, config.look_every
+    return [look_step(before, number, every) for number in range(looks_between(before, decision.step, every))]
 
 
 def _estimator_of_record(
@@ -163,6 +186,11 @@ def panorama_at(trial: Trial, decision: Decision, config: TrialConfig | None = N
     Raises:
         RecordError: the trial is from a log or a robot, or its camera was disturbed.
     """
+    config = config_from_dict(TrialConfig, trial.config, "trial record") if config is None else config
+    return _panorama_of_step(trial, decision.step, config)
+
+
+def _panorama_of_step(trial: Trial, step: int, config: TrialConfig) -> UInt8[Array, "rows columns 3"]:
     if trial.environment.startswith(ROBOT_PREFIX):
         raise RecordError("a robot drove the trial: what its camera saw is not in the record")
     if trial.environment.startswith(LOG_PREFIX):
@@ -170,11 +198,10 @@ def panorama_at(trial: Trial, decision: Decision, config: TrialConfig | None = N
             f"the trial is the replay of a robot's log, {trial.environment.removeprefix(LOG_PREFIX)}: its panoramas "
             "are in the log, and in the page that `potlp log replay` wrote"
         )
-    config = config_from_dict(TrialConfig, trial.config, "trial record") if config is None else config
     # The record does not hold the sensors' key.
     if config.disturbance != Disturbance():
         raise RecordError("the trial's camera was disturbed: its panoramas cannot be made without the trial's key")
-    cell = jnp.asarray(decision.cell, jnp.int32)
+    cell = jnp.asarray(trial.path[step], jnp.int32)
     return photograph(trial.world, cell, jax.random.key(0), config.camera, config.disturbance)
 
 
@@ -200,14 +227,14 @@ def views_of(trial: Trial, estimator: TrainedEstimator | Estimator | None = None
     asked = None if made_with is None else _estimator_of_record(trial, asked_of(Policy.POTLP, estimator))
     if made_with is not None and asked is None:
         logger.warning(f"the trial was made with the estimator {made_with}: give that one to see what it shows")
-    return recall_views(trial, asked, config, lambda decision: panorama_at(trial, decision, config))
+    return recall_views(trial, asked, config, lambda step: _panorama_of_step(trial, step, config))
 
 
 def recall_views(
     trial: Trial,
     asked: TrainedEstimator | Estimator | None,
     config: TrialConfig,
-    panorama_of: Callable[[Decision], UInt8[Array, "rows columns 3"] | Panorama],
+    panorama_of: PanoramaOfStep,
 ) -> Views:
     """The views of a trial, its estimator shown every panorama once more.
 
@@ -215,7 +242,8 @@ def recall_views(
         trial: a trial in simulation, or along a log.
         asked: the trial's estimator; None where there is none, or it is not known.
         config: the trial's.
-        panorama_of: what the camera saw at a decision.
+        panorama_of: what the camera saw after so many cells entered. Asked in their order; of steps between two
+            decisions there may be none.
 
     Returns:
         The panoramas that were used and the overlays of the estimator, one entry for each decision, if it has any.
@@ -223,8 +251,10 @@ def recall_views(
 
     # Several subgoals, and several decisions, share a panorama: each is rendered once.
     @functools.cache
-    def look(number: int) -> Panorama:
-        return np.asarray(panorama_of(trial.decisions[number]))
+    def look(step: int) -> Panorama:
+        return np.asarray(panorama_of(step))
+
+    steps = {decision.step for decision in trial.decisions}
 
     estimator = None if asked is None else _first(trial, asked, config)
     # One that does not say from which panorama it judges a subgoal has seen that of the decision.
@@ -233,9 +263,13 @@ def recall_views(
     overlays = {}
     if isinstance(estimator, ShowsOverlays):
         for decision in trial.decisions:
-            estimator = _after_looking(estimator, trial, decision, lambda at: look(at.index))
+            # Those of the way are seen once, and there are many.
+            estimator = _after_looking(
+                estimator, trial, decision, config, lambda at: look(at) if at in steps else panorama_of(at)
+            )
             overlays[decision.index] = overlays_of(estimator, trial.belief_of(decision))
-    return Views({number: look(number) for number in sorted({n for numbers in used for n in numbers})}, overlays)
+    numbers = sorted({number for numbers in used for number in numbers})
+    return Views({number: look(trial.decisions[number].step) for number in numbers}, overlays)
 
 
 # Compiled like the decision itself, so that rounding is the same and equal plans stay equal.

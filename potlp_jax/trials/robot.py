@@ -80,6 +80,19 @@ class GrowingRobot(Robot, Protocol):
         ...
 
 
+@runtime_checkable
+class RemembersItsWay(Protocol):
+    """A robot whose camera also took pictures on its way; what others saw there is not asked."""
+
+    def panorama_before(self, back: int) -> UInt8[Array, "rows columns 3"] | None:
+        """What the camera saw on the last advance, ``back`` cells before the robot's cell; None: there is no picture.
+
+        Asked before ``panorama``, from the first cell to the last, and only by policies whose estimator
+        ``LooksOnTheWay``.
+        """
+        ...
+
+
 class SimulatedRobot:
     """A robot in a known ``World`` that sees along lines of sight."""
 
@@ -96,6 +109,7 @@ class SimulatedRobot:
         self._key = jax.random.key(0) if key is None else key
         self._cell = world.start
         self._steps = 0
+        self._way: tuple[Cell, ...] = ()
         # What can be seen from the start counts as seen at step 0.
         self._belief = _observe(initial_belief(world, config), world, world.start, config.sensor)
         self._first_seen = first_seen_at_start(self._belief)
@@ -111,9 +125,16 @@ class SimulatedRobot:
 
     def panorama(self) -> UInt8[Array, "rows columns 3"]:
         """What the camera sees from the robot's cell, disturbed anew after every step."""
+        return self._photograph(self._cell, self._steps)
+
+    def panorama_before(self, back: int) -> UInt8[Array, "rows columns 3"]:
+        """What the camera saw on the last advance, ``back`` cells before the robot's cell."""
+        return self._photograph(jnp.asarray(self._way[-1 - back], jnp.int32), self._steps - back)
+
+    def _photograph(self, cell: Int32[Array, "2"], step: int) -> UInt8[Array, "rows columns 3"]:
         # By the number of moves, as in a batch: a panorama depends on where it was taken, not on how many were.
-        key = jax.random.fold_in(self._key, self._steps)
-        return photograph(self._world, self._cell, key, self._config.camera, self._config.disturbance)
+        key = jax.random.fold_in(self._key, step)
+        return photograph(self._world, cell, key, self._config.camera, self._config.disturbance)
 
     def advance(self, path: KnownPath, stop: Stop) -> Leg:
         """Follow ``path`` through known space, observing at every cell, until it ends or ``stop.is_due``."""
@@ -126,7 +147,8 @@ class SimulatedRobot:
         # Kept on the device: the next photograph and observation need it there.
         self._cell = path.cells[moved]
         self._steps += moved
-        return Leg(cells=tuple(as_cell(cell) for cell in cells))
+        self._way = tuple(as_cell(cell) for cell in cells)
+        return Leg(cells=self._way)
 
 
 def initial_belief(world: World, config: TrialConfig) -> BeliefMap:

@@ -18,7 +18,13 @@ from flax import struct
 from jaxtyping import Array, Bool, Int16, Int32, Key, PRNGKeyArray
 
 from potlp_jax.learning.labels import TrueMapEstimator
-from potlp_jax.learning.observing import ObservingEstimator, with_memory
+from potlp_jax.learning.observing import (
+    ObservingEstimator,
+    look_step,
+    looks_between,
+    looks_on_the_way,
+    with_memory,
+)
 from potlp_jax.planning.estimates import Estimates, Estimator, ask
 from potlp_jax.planning.move import Move, MoveKind
 from potlp_jax.planning.policies import Policy, PolicyFunction, planned_move, policy_function
@@ -73,6 +79,7 @@ class Progress:
     Attributes:
         belief: what is known of the map.
         memory: of the estimator; None where the policy asks none that remembers.
+        decided: cells entered until the last decision; -1 before the first.
         first_seen: step at which each cell was first observed.
         cell: where the robot is.
         path: cells so far, ``tally.steps + 1`` of them; what stands behind them means nothing.
@@ -81,6 +88,7 @@ class Progress:
 
     belief: BeliefMap
     memory: Any
+    decided: Int32[Array, "*batch"]
     first_seen: Int32[Array, "*batch H W"]
     cell: Int32[Array, "*batch 2"]
     path: Int16[Array, "*batch L 2"]
@@ -123,6 +131,7 @@ def begin(world: World, arrays: TaskArrays, key: PRNGKeyArray, memory: Any, *, s
     progress = Progress(
         belief=belief,
         memory=memory,
+        decided=jnp.int32(-1),
         first_seen=first_seen_at_start(belief),
         cell=world.start,
         path=jnp.zeros((length, 2), jnp.int16).at[0].set(world.start.astype(jnp.int16)),
@@ -229,9 +238,9 @@ def _consider(
     setup: Setup, asked: Asked, progress: Progress, scene: Scene
 ) -> tuple[Any, Situation, Estimates | None, PRNGKeyArray]:
     """What every policy is given: the situation, and estimates where it asks for them."""
-    # Panorama first: an estimator answers from what can be seen here too.
+    # Panoramas first: an estimator answers from what can be seen here too.
     running = progress.tally.running
-    memory = None if progress.memory is None else _memory_after_panorama(setup, asked, progress, scene)
+    memory = None if progress.memory is None else _memory_after_looking(setup, asked, progress, scene)
     situation = _phase(
         running,
         partial(assess, config=setup.config.decision.frontiers),
@@ -255,17 +264,23 @@ def _consider(
     return memory, situation, estimates, decision_key(scene.planning, progress.tally.decisions)
 
 
-def _memory_after_panorama(setup: Setup, asked: Asked, progress: Progress, scene: Scene) -> Any:
-    """What the estimator remembers after a panorama from here."""
+def _memory_after_looking(setup: Setup, asked: Asked, progress: Progress, scene: Scene) -> Any:
+    """What the estimator remembers after what the camera saw on the way here, where it is shown that, and from here."""
     assert isinstance(asked, ObservingEstimator)
-    config, running = setup.config, progress.tally.running
-    # As ``SimulatedRobot.panorama``.
-    key = jax.random.fold_in(scene.sensing, progress.tally.steps)
-    camera = partial(photograph, camera=config.camera, disturbance=config.disturbance)
-    panorama = _phase(running, camera, scene.world, progress.cell, key)
-    seen = _phase(running, lambda asked, panorama: asked.encode(panorama), asked, panorama)
-    # Not a phase of its own: a branch would copy the memory.
-    return with_memory(asked, progress.memory).remember(seen, progress.belief, progress.cell).memory
+    config, before, now = setup.config, progress.decided, progress.tally.steps
+    every = config.look_every if looks_on_the_way(asked) else 0
+    between = jnp.maximum(looks_between(before, now, every), 0)
+
+    def look(number: Int32[Array, ""], memory: Any) -> Any:
+        step = jnp.where(number < between, look_step(before, number, every), now)
+        cell = progress.path[step].astype(jnp.int32)
+        # As ``SimulatedRobot.panorama``.
+        key = jax.random.fold_in(scene.sensing, step)
+        seen = asked.encode(photograph(scene.world, cell, key, config.camera, config.disturbance))
+        return with_memory(asked, memory).remember(seen, progress.belief, cell).memory
+
+    # A loop of no turns where the trial is not running: a branch would copy the memory.
+    return jax.lax.fori_loop(0, jnp.where(progress.tally.running, between + 1, 0), look, progress.memory)
 
 
 def _estimator(setup: Setup, asked: Asked, memory: Any, scene: Scene) -> Estimator | None:
@@ -319,6 +334,7 @@ def _went(
     return dataclasses.replace(
         progress,
         belief=belief,
+        decided=tally.steps,
         first_seen=first_seen,
         cell=cells[moved],
         path=path,

@@ -14,7 +14,7 @@ from jaxtyping import Array, Int32, UInt8
 from potlp_jax.errors import RobotError
 from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.trials.record import NEVER_SEEN, Correction, belief_seen_by
-from potlp_jax.trials.robot import GrowingRobot, Leg, Robot
+from potlp_jax.trials.robot import GrowingRobot, Leg, RemembersItsWay, Robot
 from potlp_jax.trials.rules import Stop
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.moves import Cell
@@ -78,6 +78,10 @@ class WatchedRobot:
     def panorama(self) -> UInt8[Array, "rows columns 3"]:
         """What the robot's camera sees."""
         return self._robot.panorama()
+
+    def panorama_before(self, back: int) -> UInt8[Array, "rows columns 3"] | None:
+        """What the robot's camera saw on its way, where it remembers that."""
+        return self._robot.panorama_before(back) if isinstance(self._robot, RemembersItsWay) else None
 
     def advance(self, path: KnownPath, stop: Stop) -> Leg:
         """Follow a path."""
