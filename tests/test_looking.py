@@ -115,6 +115,7 @@ def test_the_camera_looks_as_often_as_is_said_and_a_batch_and_a_replay_do_the_sa
     # Otherwise nothing is told apart.
     assert (len(steps) > len(trial.decisions)) == bool(every and on_the_way)
     last = estimator_at(trial, len(trial.decisions) - 1, estimator)
+    assert isinstance(last, Counter)
     np.testing.assert_array_equal(last.memory, _counts(trial, steps))
     # The loop's own answers came from as many looks; what ends the task in known space is certain.
     chances = {action.success_probability for action in trial.decisions[-1].actions} - {1.0}
@@ -133,6 +134,7 @@ def test_a_robot_that_keeps_no_pictures_of_its_way_is_asked_at_decisions_alone()
 
     loop = trial_module._Loop(Forgetful(), TASK, TASK.arrays, Policy.POTLP, _counter(), jax.random.key(0), CONFIG)
     run = loop.run()
+    assert isinstance(loop._estimator, Counter)
     assert int(jnp.sum(loop._estimator.memory)) == len(run.decisions)
 
 
