@@ -28,7 +28,7 @@ ffi::Error scale_rows(ffi::ThreadPool pool, ffi::Buffer<ffi::F32> in, ffi::Resul
 }
 }  // namespace
 
-XLA_FFI_DEFINE_HANDLER_SYMBOL(HANDLER, scale_rows, ffi::Ffi::Bind().Ctx<ffi::ThreadPool>()
+XLA_FFI_DEFINE_HANDLER_SYMBOL(KERNEL_NAME, scale_rows, ffi::Ffi::Bind().Ctx<ffi::ThreadPool>()
                                                      .Arg<ffi::Buffer<ffi::F32>>().Ret<ffi::Buffer<ffi::F32>>());
 """
 
@@ -43,7 +43,7 @@ def kernels(tmp_path, monkeypatch) -> Path:
     (folder / "rows.h").write_text((build.KERNELS / "rows.h").read_text())
     # XLA registers a handler's name once in a process.
     handler = f"scale_{next(_numbers)}"
-    (folder / "scale.cc").write_text(SOURCE.replace("FACTOR", "2").replace("HANDLER", handler))
+    (folder / "scale.cc").write_text(SOURCE.replace("FACTOR", "2").replace("KERNEL_NAME", handler))
     monkeypatch.setattr(build, "KERNELS", folder)
     monkeypatch.setitem(libraries.LIBRARIES, "scale", (handler,))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
