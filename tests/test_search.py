@@ -15,7 +15,7 @@ from potlp_jax.bench.problems import family_problem
 from potlp_jax.planning.exact.api import solve_exact
 from potlp_jax.planning.search.api import plan_actions, plan_within, search, search_tree
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
-from potlp_jax.planning.search.graph import NodeValues, Tree
+from potlp_jax.planning.search.graph import NodeValues
 from potlp_jax.planning.search.inspect import tree_top
 from potlp_jax.planning.search.lockstep import SearchMethod, run_search
 from potlp_jax.planning.search.plan import Plan

@@ -33,8 +33,8 @@ on no guess, and no less than the optimum. By (1) it is no more.
 least floor has a gap, hence one of its outcomes, and so on: the descent meets an outcome without a node and links it to
 one, or it meets stored numbers that are older than their children's and renews them. There are finitely many histories.
 
-All reads of a simulation come before its writes, so that XLA updates the arrays in place and the cost of a simulation does
-not depend on their size.
+All reads of a simulation come before its writes, so that XLA updates the arrays in place and the cost of a simulation
+does not depend on their size.
 
 References:
   Nilsson, Principles of Artificial Intelligence, 1980 (AO*).
@@ -70,7 +70,7 @@ from potlp_jax.planning.search.graph import (
     guess_in,
     plant_tree,
 )
-from potlp_jax.planning.search.guess import Rule, guess_outcomes, make_rule
+from potlp_jax.planning.search.guess import Rule, guess_outcomes, make_rule, value_successes_anew
 from potlp_jax.planning.search.lockstep import SearchMethod
 from potlp_jax.planning.search.model import FAILURE, SUCCESS, Model, make_model
 from potlp_jax.planning.search.plan import Plan, plan_of_least_score
@@ -570,8 +570,9 @@ def _new_node(context: Context, history: History, config: BestFirstConfig) -> Ne
     free = dataclasses.replace(history, pending_cost=jnp.zeros_like(history.pending_cost))
     terms = jax.vmap(terms_of_all)(context.model.tables, free)
     chance, available = terms.success_probability, terms.available
+    rule = value_successes_anew(context.rule, context.model.tables, chance, terms.success_cost, config.guess_failures)
     failure_values, success_values = guess_outcomes(
-        context.rule,
+        rule,
         context.model.product_state(history.location, history.state),
         history.pending_cost,
         available,
