@@ -420,7 +420,8 @@ _PLAN_OUTPUTS = {
     "q_values": "expected cost of each action, inf where it is not available",
     "visits": "simulations that began with each action",
     "optimism_gap": "fraction by which value would fall if its guesses were too high by the optimism, no bound on the "
-    "error; 0: more simulations change nothing",
+    "error; 0: the optimum is no higher than value",
+    "lower_bound": "the optimum is no lower; equal to value: value is the optimum, more simulations change nothing",
     "status": "bits, see status_bits",
 }
 

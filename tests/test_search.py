@@ -15,7 +15,7 @@ from potlp_jax.bench.problems import family_problem
 from potlp_jax.planning.exact.api import solve_exact
 from potlp_jax.planning.search.api import plan_actions, plan_within, search, search_tree
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
-from potlp_jax.planning.search.graph import NodeValues, Tree
+from potlp_jax.planning.search.graph import NodeValues
 from potlp_jax.planning.search.inspect import tree_top
 from potlp_jax.planning.search.lockstep import SearchMethod, run_search
 from potlp_jax.planning.search.plan import Plan
@@ -217,7 +217,7 @@ def test_orders_of_the_same_events_share_a_node():
     _, tree = tree_jit(problem, jax.random.key(0), config=BestFirstConfig(simulations=64, optimism=1.0))
     size = int(tree.size)
     reached = np.asarray(tree.children)[:size]
-    reached = reached[reached != Tree.UNVISITED]
+    reached = reached[reached >= 0]
     assert set(reached) == set(range(1, size))
     what = [
         (int(tree.location[n]), int(tree.state[n]), tree.holds[n].tobytes(), tree.fails[n].tobytes())
@@ -448,6 +448,7 @@ def plan_of_pulls(pulls):
         q_values=jnp.zeros(pulls.shape, jnp.float32),
         visits=pulls,
         optimism_gap=count,
+        lower_bound=count,
         status=nothing.astype(jnp.uint32),
     )
 
@@ -456,10 +457,14 @@ def test_tree_is_consistent_with_equation_3():
     """Every Q in the tree is the expectation over its children; every value the minimum over its actions."""
     problem = shared_shape("F a & F b", 3, unreachable=0.1)
     plan, tree = tree_jit(problem, jax.random.key(0), config=dataclasses.replace(QUICK, optimism=1.0))
-    q_values, bounds = (np.asarray(tree.q_values)[: int(tree.size)], np.asarray(tree.bounds)[: int(tree.size)])
+    q_values, bounds, floors = (
+        np.asarray(values)[: int(tree.size)] for values in (tree.q_values, tree.bounds, tree.floors)
+    )
     values = NodeValues.unpack(tree.values[: int(tree.size)])
-    np.testing.assert_array_equal(q_values.min(axis=1), np.minimum(values.leave, values.stay))
-    np.testing.assert_array_equal(bounds.min(axis=1), np.minimum(values.leave_bound, values.stay_bound))
+    np.testing.assert_array_equal(q_values.min(axis=1), np.minimum(values.leave.value, values.stay.value))
+    np.testing.assert_array_equal(bounds.min(axis=1), np.minimum(values.leave.bound, values.stay.bound))
+    np.testing.assert_array_equal(floors.min(axis=1), np.minimum(values.leave.floor, values.stay.floor))
+    assert np.all(floors <= bounds)
     assert np.all(bounds <= q_values)
     assert int(plan.visits.sum()) == int(tree.simulations) <= QUICK.simulations
     top = tree_top(problem, tree, depth=3, width=4)

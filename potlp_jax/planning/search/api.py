@@ -138,7 +138,7 @@ def plan_within(
     jax.block_until_ready(_more(problem, key, warm, config=config))
     spent, plan, tree = _timed(_first, problem, key, config=config)
     # A round begins as long as time is left, so the last one may end late by its own length.
-    while spent < seconds and float(plan.optimism_gap) > 0 and int(tree.size) < config.tree_capacity:
+    while spent < seconds and float(plan.value) > float(plan.lower_bound) and int(tree.size) < config.tree_capacity:
         step, plan, tree = _timed(_more, problem, key, tree, config=config)
         spent += step
     return plan, tree

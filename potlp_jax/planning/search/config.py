@@ -27,7 +27,7 @@ class BestFirstConfig:
 
     simulations: int = 300
     optimism: float | None = None
-    max_depth: int = 32
+    max_depth: int = 64
     tree_capacity: int | None = None
     guess_failures: int = 24
     kind: Literal["best-first"] = "best-first"
