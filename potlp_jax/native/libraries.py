@@ -12,13 +12,15 @@ from typing import Any, TypeVar
 
 import jax
 import jax.ffi
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
 
 from potlp_jax.native.build import BuildError, built_library
 
 SWITCH: str = "POTLP_NATIVE"
 """Environment variable that turns all native kernels off where it is 0; read once in a process."""
 
-LIBRARIES: dict[str, tuple[str, ...]] = {}
+LIBRARIES: dict[str, tuple[str, ...]] = {"search": ("best_first",)}
 """Handlers by library: the name of the source in ``kernels`` without ``.cc``, and the symbols that it defines."""
 
 _Result = TypeVar("_Result")
@@ -73,7 +75,47 @@ def by_platform(library: str, native: Callable[..., _Result], twin: Callable[...
     """
     if not is_usable(library):
         return twin(*arguments)
-    return jax.lax.platform_dependent(*arguments, cpu=native, default=twin)
+    leaves, structure = jax.tree.flatten(arguments)
+    if any(jax.typeof(leaf).manual_axis_type.varying for leaf in leaves):
+        return jax.lax.platform_dependent(*arguments, cpu=native, default=twin)
+    results, kinds = jax.tree.flatten(jax.eval_shape(native, *arguments))
+
+    def of_leaves(function: Callable[..., _Result]) -> Callable[..., list[jax.Array]]:
+        return lambda *leaves: jax.tree.leaves(function(*jax.tree.unflatten(structure, leaves)))
+
+    shapes = tuple((result.shape, result.dtype) for result in results)
+    found = _choice.bind(*leaves, native=of_leaves(native), twin=of_leaves(twin), shapes=shapes)
+    return jax.tree.unflatten(kinds, found)
+
+
+# A primitive and not `platform_dependent`, which traces both: the twins take seconds, and a program for CPU alone never
+# needs them. Within `shard_map`, whose marks a primitive would have to know, both are traced.
+_choice = Primitive("potlp_by_platform")
+_choice.multiple_results = True
+
+
+@_choice.def_impl
+def _run(*leaves: jax.Array, **choice: Any) -> list[jax.Array]:
+    return jax.jit(lambda *leaves: _choice.bind(*leaves, **choice))(*leaves)
+
+
+@_choice.def_abstract_eval
+def _shapes_of_results(*_leaves: Any, shapes: tuple[tuple[tuple[int, ...], Any], ...], **_choice: Any) -> list[Any]:
+    return [jax.core.ShapedArray(shape, dtype) for shape, dtype in shapes]
+
+
+def _vectorise(leaves: list[jax.Array], axes: list[Any], *, native: Any, twin: Any, shapes: Any) -> tuple[Any, Any]:
+    size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
+    wider = tuple(((size, *shape), dtype) for shape, dtype in shapes)
+    of_rows = [jax.vmap(function, in_axes=tuple(axes)) for function in (native, twin)]
+    return _choice.bind(*leaves, native=of_rows[0], twin=of_rows[1], shapes=wider), [0] * len(wider)
+
+
+batching.primitive_batchers[_choice] = _vectorise
+mlir.register_lowering(_choice, mlir.lower_fun(lambda *leaves, twin, **_: twin(*leaves), multiple_results=True))
+mlir.register_lowering(
+    _choice, mlir.lower_fun(lambda *leaves, native, **_: native(*leaves), multiple_results=True), platform="cpu"
+)
 
 
 def twin_only() -> AbstractContextManager[Any]:

@@ -28,6 +28,7 @@ from potlp_jax.planning.search.uct import UCT, UctTree
 from potlp_jax.precision import in_32_bits
 
 
+@in_32_bits
 def plan_actions(
     problem: PlanningProblem, key: PRNGKeyArray, config: BestFirstConfig | UctConfig = BestFirstConfig()
 ) -> Plan:
@@ -52,7 +53,7 @@ def plan_actions(
     Raises:
       ProblemError: the shapes of the problem's arrays do not agree.
     """
-    return search_tree(problem, key, config)[0]
+    return _search_one(problem, key, config, None, with_trees=False)[0]
 
 
 @in_32_bits
@@ -77,10 +78,7 @@ def search_tree(
     Raises:
       ProblemError: the shapes of the problem's arrays do not agree.
     """
-    check_shapes(problem)
-    # One problem is a batch of one: there is one kernel.
-    problems, seeds, trees = jax.tree.map(lambda leaf: leaf[None], (problem, _seed(key), tree))
-    return jax.tree.map(lambda leaf: leaf[0], run_search(_search_for(config), config, problems, seeds, trees))
+    return _search_one(problem, key, config, tree, with_trees=True)
 
 
 @in_32_bits
@@ -106,6 +104,20 @@ def search(
     """
     check_shapes(problems, keys.shape)
     return run_search(_search_for(config), config, problems, jax.vmap(_seed)(keys), trees)
+
+
+def _search_one(
+    problem: PlanningProblem,
+    key: PRNGKeyArray,
+    config: BestFirstConfig | UctConfig,
+    tree: Tree | UctTree | None,
+    with_trees: bool,
+) -> tuple[Plan, Any]:
+    check_shapes(problem)
+    # One problem is a batch of one: there is one kernel.
+    problems, seeds, trees = jax.tree.map(lambda leaf: leaf[None], (problem, _seed(key), tree))
+    found = run_search(_search_for(config), config, problems, seeds, trees, with_trees)
+    return jax.tree.map(lambda leaf: leaf[0], found)
 
 
 def plan_within(

@@ -71,8 +71,9 @@ from potlp_jax.planning.search.graph import (
     plant_tree,
 )
 from potlp_jax.planning.search.guess import Rule, guess_outcomes, make_rule, value_successes_anew
-from potlp_jax.planning.search.lockstep import SearchMethod
+from potlp_jax.planning.search.lockstep import SearchKernel, SearchMethod
 from potlp_jax.planning.search.model import FAILURE, SUCCESS, Model, make_model
+from potlp_jax.planning.search.native import LIBRARY, fits_kernel, search_natively
 from potlp_jax.planning.search.plan import Plan, plan_of_least_score
 from potlp_jax.planning.sharding import vary_alike
 from potlp_jax.task.relations import transitive_closure
@@ -280,7 +281,15 @@ def choose(context: Context, tree: Tree) -> Plan:
     return plan_of_least_score(context.model, q_values, q_values, tree.root_visits, root.bound, root.floor, tree.status)
 
 
-BEST_FIRST = SearchMethod(tree=Tree, prepare=prepare, plant=plant, is_open=is_open, simulate=simulate, choose=choose)
+BEST_FIRST = SearchMethod(
+    tree=Tree,
+    prepare=prepare,
+    plant=plant,
+    is_open=is_open,
+    simulate=simulate,
+    choose=choose,
+    kernel=SearchKernel(library=LIBRARY, fits=fits_kernel, run=search_natively),
+)
 
 
 def _root_costs(context: Context, tree: Tree) -> Costs:
