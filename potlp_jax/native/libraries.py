@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import jax
 import jax.ffi
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
@@ -101,7 +102,7 @@ def _run(*leaves: jax.Array, **choice: Any) -> list[jax.Array]:
 
 @_choice.def_abstract_eval
 def _shapes_of_results(*_leaves: Any, shapes: tuple[tuple[tuple[int, ...], Any], ...], **_choice: Any) -> list[Any]:
-    return [jax.core.ShapedArray(shape, dtype) for shape, dtype in shapes]
+    return [ShapedArray(shape, dtype) for shape, dtype in shapes]
 
 
 def _vectorise(leaves: list[jax.Array], axes: list[Any], *, native: Any, twin: Any, shapes: Any) -> tuple[Any, Any]:
