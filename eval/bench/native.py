@@ -110,7 +110,7 @@ def main() -> None:
     """Measure, print one line a row and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="one family and small batches")
-    parser.add_argument("--out", type=Path, default=Path("docs/results/planner/native.json"))
+    parser.add_argument("--out", type=Path, default=Path("docs/results/planner") / "native.json")
     options = parser.parse_args()
     if not is_usable("search"):
         raise SystemExit(f"the kernel is not used: {status()[0].reason}")
