@@ -13,6 +13,7 @@ from jaxtyping import Array, Int32
 
 from potlp_jax.bench.problems import family_problem
 from potlp_jax.planning.exact.api import solve_exact
+from potlp_jax.planning.search import best_first
 from potlp_jax.planning.search.api import plan_actions, plan_within, search, search_tree
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
 from potlp_jax.planning.search.graph import NodeValues
@@ -144,10 +145,52 @@ def rare_successes():
     return made
 
 
-def test_the_optimism_gap_says_what_its_description_says(rare_successes):
+@pytest.fixture(scope="module")
+def rare_solutions(rare_successes):
+    return [solve_exact(problem) for problem in rare_successes]
+
+
+def assert_ended_searches_are_exact(plans, solutions):
+    """And that no lower bound is above the optimum; returns how many had ended."""
+    ended = np.asarray(plans.lower_bound >= plans.value)
+    for i, solution in enumerate(solutions):
+        assert float(plans.lower_bound[i]) <= solution.value * (1 + 1e-5)
+        if ended[i] and solution.action != NO_ACTION:
+            np.testing.assert_allclose(plans.value[i], solution.value, rtol=1e-5)
+            assert solution.q_values[int(plans.action[i])] <= solution.value * (1 + 1e-5)
+    return ended.sum()
+
+
+def test_an_ended_search_is_exact(rare_successes, rare_solutions):
+    plans = plan_many(rare_successes, keys(len(rare_successes)), BestFirstConfig(simulations=400))
+    assert assert_ended_searches_are_exact(plans, rare_solutions) > 200
+
+
+@pytest.mark.parametrize("family", ["rare", "shared"])
+def test_a_search_ends_where_failures_are_shared_or_rarely_successes(family):
+    """With an optimism below 1 alone, one in ten of the first family ended at a wrong choice."""
+    problems = [family_problem(family, 2, "tuning", index) for index in range(24)]
+    plans = plan_many(problems, keys(len(problems)), BestFirstConfig(simulations=500))
+    assert assert_ended_searches_are_exact(plans, [solve_exact(problem) for problem in problems]) > 12
+
+
+def test_successes_are_valued_by_what_has_failed():
+    """One condition on both steps to acceptance: having failed at the first subgoal it fails there for the second too."""
+    coupled = [make_rule_of(family_problem(family, 2, "tuning", 0)).coupled for family in ("shared", "rare")]
+    apart = [make_rule_of(family_problem(family, 2, "tuning", 0)).coupled for family in ("three-single", "firefighting")]
+    assert np.all(coupled)
+    assert not np.any(apart)
+
+
+def make_rule_of(problem):
+    batch = jax.tree.map(lambda leaf: leaf[None], problem)
+    return best_first.prepare(batch, jnp.zeros((1, 2), jnp.uint32), BestFirstConfig()).rule
+
+
+def test_the_optimism_gap_says_what_its_description_says(rare_successes, rare_solutions):
     """0: the value is that of a policy, which no optimum exceeds. Above 0: no bound on the error (docs/planner.md)."""
     plans = plan_many(rare_successes, keys(len(rare_successes)), BestFirstConfig(simulations=16))
-    solutions = [solve_exact(problem) for problem in rare_successes]
+    solutions = rare_solutions
     gap, value, optimum = np.asarray(plans.optimism_gap), np.asarray(plans.value), [x.value for x in solutions]
     chooses = np.asarray(plans.action) != NO_ACTION
     closed = chooses & (gap == 0)
