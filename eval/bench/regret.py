@@ -406,7 +406,8 @@ def table(rows: Sequence[Row]) -> str:
         lines.append(f"| {family} | {subgoals} | {len(own[0].instances)} | " + " | ".join(shown) + " |")
     lines += [
         "",
-        "| family | S | planner | budget | CPU ms | mean % (95 %) | worst % | mean | worst | not exact | ended, wrong |",
+        "| family | S | planner | budget | CPU ms | mean % (95 %) | worst % | mean | worst | not exact | ended, wrong"
+        " |",
         "|---" * 11 + "|",
     ]
     for row in rows:
