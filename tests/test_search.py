@@ -114,8 +114,8 @@ def test_regret_is_small_at_the_default_budget(plans, solutions):
     ("family", "subgoals", "instances"), [("three-single", 1, (0, 1, 2, 3)), ("firefighting", 6, (0, 1, 2, 5))]
 )
 def test_a_wrong_guess_is_found_out_where_actions_are_few(family, subgoals, instances):
-    """In one of each four the best action's guess is far too high (by 44 % in the first family), and an optimism of 0.3
-    ends without it, 17 and 13 % too expensive."""
+    """In one of each four the best action's guess is far too high (by 44 % in the first family), and a search
+    that ended with an optimism of 0.3 would do without it, 17 and 13 % too expensive."""
     problems = [family_problem(family, subgoals, "test", index) for index in instances]
     plans = plan_many(problems, keys(len(problems)), BestFirstConfig())
     np.testing.assert_allclose(plans.value, [solve_exact(problem).value for problem in problems], rtol=1e-5)

@@ -16,8 +16,8 @@ class BestFirstConfig:
         to be the optimum.
       optimism: fraction by which guessed values are assumed to be too high: the descent takes the action that would be
         best if they all were. Once nothing is left to examine under this assumption, the search goes on as if it
-        were 1, so that one that ends by itself is exact. None: 0.7 in problems of up to 41 actions, where one wrong guess weighs more and there
-        is less to examine, otherwise 0.3 (docs/results/planner.md, "How optimistic?").
+        were 1, so that one that ends by itself is exact. None: 0.7 in problems of up to 41 actions, where one wrong
+        guess weighs more and there is less to examine, otherwise 0.3 (docs/results/planner.md, "How optimistic?").
       max_depth: actions per descent. A descent that gets there is cut, valued by what is known of its last node, and
         flagged.
       tree_capacity: nodes per tree, at least 1; None for one more than simulations. A full tree is flagged.
