@@ -10,9 +10,9 @@ family, and writes ``ended.json``.
 """
 
 import argparse
+import dataclasses
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import jax
@@ -34,7 +34,7 @@ TOLERANCE = 1e-4
 """Share of the optimum that 32 bits may cost."""
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Count:
     """Searches of one family.
 
@@ -97,7 +97,7 @@ def judge(family: str, instances: int, simulations: int, seconds: float) -> Coun
 def _with_few_subgoals(family: str, index: int) -> PlanningProblem:
     """An instance with one, two or three subgoals in arrays of one shape."""
     kept = np.arange(SUBGOALS) <= index % SUBGOALS
-    return family_problem(family, SUBGOALS, "tuning", index).replace(subgoal_mask=jnp.asarray(kept))
+    return dataclasses.replace(family_problem(family, SUBGOALS, "tuning", index), subgoal_mask=jnp.asarray(kept))
 
 
 def _errors(plan: Plan, solution: ExactSolution) -> tuple[float, float]:
@@ -128,7 +128,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     out = Path(parsed.out)
     out.mkdir(parents=True, exist_ok=True)
     content = {"provenance": provenance(), "arguments": vars(parsed), "total": total}
-    (out / "ended.json").write_text(json.dumps(content | {"families": [asdict(count) for count in counts]}, indent=1))
+    (out / "ended.json").write_text(
+        json.dumps(content | {"families": [dataclasses.asdict(count) for count in counts]}, indent=1)
+    )
 
 
 if __name__ == "__main__":

@@ -252,17 +252,10 @@ def mctx(problems: Sequence[PlanningProblem], budgets: Sequence[int]) -> Iterato
     rows, key = min(16, len(problems)), jax.random.key(0)
     for budget in budgets:
         compiled = mctx_plan.lower(_stack(problems[:rows]), key, simulations=2 * budget).compile()
-        yield (
-            "mctx",
-            budget,
-            *_in_batches(
-                lambda batch, _, compiled=compiled: compiled(batch, key).action,
-                problems,
-                np.arange(len(problems)),
-                rows,
-            ),
-            [False] * len(problems),
+        seconds, actions = _in_batches(
+            lambda batch, _, compiled=compiled: compiled(batch, key).action, problems, np.arange(len(problems)), rows
         )
+        yield "mctx", budget, seconds, actions, [False] * len(problems)
 
 
 def _in_batches(
