@@ -176,7 +176,7 @@ def test_a_search_ends_where_failures_are_shared_or_rarely_successes(family):
 
 def test_successes_are_valued_by_what_has_failed():
     """One condition on both steps to acceptance: what has failed at a subgoal fails there for the second step too."""
-    coupled = [make_rule_of(family_problem(family, 2, "tuning", 0)).coupled for family in ("shared", "rare")]
+    coupled = [make_rule_of(family_problem(family, 2, "tuning", 0)).coupled for family in ("shared", "shared-joint")]
     apart = [
         make_rule_of(family_problem(family, 2, "tuning", 0)).coupled for family in ("three-single", "firefighting")
     ]
