@@ -36,7 +36,7 @@ def enable_compilation_cache(folder: Path | None = None) -> Path | None:
     Returns:
       The folder in use; None where there is none.
     """
-    if os.environ.get(SWITCH, "0") not in ("", "0"):
+    if is_switched_on(SWITCH):
         return None
     # Imported here, so that programs that only offer the cache start without jax.
     import jax
@@ -46,7 +46,7 @@ def enable_compilation_cache(folder: Path | None = None) -> Path | None:
     if chosen:
         return Path(chosen)
     folder = cache_folder() if folder is None else folder
-    if not _is_private_folder(folder):
+    if not is_private_folder(folder):
         return None
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", LEAST_COMPILE_SECONDS)
@@ -69,7 +69,12 @@ def machine_fingerprint() -> str:
     return hashlib.sha256("\n".join(sorted(words)).encode()).hexdigest()[:16]
 
 
-def _is_private_folder(folder: Path) -> bool:
+def is_switched_on(variable: str) -> bool:
+    """Whether an environment variable is set, and neither empty nor 0."""
+    return os.environ.get(variable, "0") not in ("", "0")
+
+
+def is_private_folder(folder: Path) -> bool:
     """Make the folder if it is not there; whether it can be used and nobody else may write to it."""
     # Mode 700 at once, and tested afterwards: the folder may have been there before.
     try:

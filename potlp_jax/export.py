@@ -32,6 +32,7 @@ from jaxtyping import Array, UInt32
 
 from potlp_jax.errors import ExportError
 from potlp_jax.files import MIB, MOST_TEXT, one_line, read_bytes, read_json, reading
+from potlp_jax.native import twin_only
 from potlp_jax.planning.decision import decide_from_estimates, frontier_subgoals, subgoals_at
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.move import Move, MoveKind
@@ -166,7 +167,9 @@ def export_program(program: _Program, config: ExportConfig) -> jax.export.Export
     lead = batch_shape(config.batch)
     function = program.function if config.batch is None else jax.vmap(program.function)
     arguments = [jax.ShapeDtypeStruct((*lead, *value.shape), value.dtype) for value in program.inputs]
-    return jax.export.export(jax.jit(function), platforms=config.platforms)(*arguments)
+    # Native kernels are no part of a program that needs jax alone.
+    with twin_only():
+        return jax.export.export(jax.jit(function), platforms=config.platforms)(*arguments)
 
 
 def batch_shape(batch: int | str | None) -> tuple[Any, ...]:
@@ -417,7 +420,8 @@ _PLAN_OUTPUTS = {
     "q_values": "expected cost of each action, inf where it is not available",
     "visits": "simulations that began with each action",
     "optimism_gap": "fraction by which value would fall if its guesses were too high by the optimism, no bound on the "
-    "error; 0: more simulations change nothing",
+    "error; 0: the optimum is no higher than value",
+    "lower_bound": "the optimum is no lower; equal to value: value is the optimum, more simulations change nothing",
     "status": "bits, see status_bits",
 }
 

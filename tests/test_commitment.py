@@ -48,6 +48,7 @@ def _plan(q_values, action=None):
         q_values=jnp.asarray(table),
         visits=jnp.zeros(len(table), jnp.int32),
         optimism_gap=jnp.float32(0),
+        lower_bound=jnp.float32(0),
         status=jnp.uint32(0),
     )
 

@@ -17,6 +17,7 @@ ORDER = (
     "plugins",
     "codec",
     "cache",
+    "native",
     "engine",
     "task",
     "world",

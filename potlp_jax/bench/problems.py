@@ -1,4 +1,4 @@
-"""Benchmark problems for planners: eight families of tasks on random maps, as many instances as wanted.
+"""Benchmark problems for planners: families of tasks on random maps, as many instances as wanted.
 
 An instance is a map about 100 cells on a side, with the robot, S subgoals and sometimes a few labelled cells on it.
 These locations are joined by paths of octile length times a random detour, closed under shortest paths, so travel is a
@@ -16,8 +16,9 @@ import zlib
 from collections.abc import Mapping
 from functools import cache
 from types import MappingProxyType
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float64, Int32
 
@@ -28,11 +29,14 @@ from potlp_jax.world.moves import DIAGONAL
 
 Split = Literal["tuning", "test"]
 
+Chances = Literal["estimated", "rare", "extreme"]
+"""How P_S is drawn: like a trained estimator's; from 0.005 to 0.08; 0.001 or 0.999."""
+
 SUBGOAL_COUNTS: tuple[int, ...] = (1, 2, 4, 6, 8)
 """Numbers of subgoals that the benchmark reports."""
 
 DEAD_END_COST: float = 500.0
-"""Cost of a dead end in every problem, in cells; the map's diagonal is 141."""
+"""Cost of a dead end unless the family says otherwise, in cells; the map's diagonal is 141."""
 
 _SIDE = 100.0
 """Side of the map in cells."""
@@ -50,6 +54,10 @@ _CHANCE_OTHER_START = 0.2
 _CHANCE_IMPOSSIBLE = 0.05
 _MOST_CONFIDENT = 0.7
 _CHANCE_CONFIDENT_SUCCESS = 0.15
+_RARE = (0.005, 0.08)
+_EXTREME = (0.001, 0.999)
+_CLUSTER_RADIUS = 6.0
+"""How far from the centre of its cluster a location lies, along either axis at most."""
 
 # Transitions whose guard needs several cubes: b or c together with a, two of three, one without another.
 _SEVERAL_CUBES = (
@@ -122,6 +130,11 @@ class Family:
         sizes: array sizes of every task.
         max_positive_literals: as in ``Task.from_formula``.
         disjoint_tasks: whether every second task is kept for the test split.
+        shares_conditions: whether edges that look for the same things have one condition, whatever the state: what
+            fails in one state then fails in all.
+        chances: how P_S is drawn.
+        clustered: whether subgoals lie in two clusters.
+        dead_end_cost: of every problem.
     """
 
     name: str
@@ -130,12 +143,27 @@ class Family:
     sizes: TaskSizes
     max_positive_literals: int | None = None
     disjoint_tasks: bool = False
+    shares_conditions: bool = False
+    chances: Chances = "estimated"
+    clustered: bool = False
+    dead_end_cost: float = DEAD_END_COST
 
     def formula(self, split: Split, index: int) -> str:
         """The task of an instance."""
         # Every second formula belongs to the test split, so that both have automata of every size.
         own = self.formulas[get_args(Split).index(split) :: 2] if self.disjoint_tasks else self.formulas
         return own[index % len(own)]
+
+
+_DEAR: float = 5000.0
+
+
+def _shared(name: str, max_positive_literals: int | None, **options: Any) -> Family:
+    """Three things in any order: 3 conditions on 12 edges, or 7 on 19 where several at one cell count as well."""
+    count = 12 if max_positive_literals else 19
+    sizes = TaskSizes(8, 3, count, count, 0, 1)
+    formulas, propositions = ("F a & F b & F c",), ("a", "b", "c")
+    return Family(name, formulas, propositions, sizes, max_positive_literals, shares_conditions=True, **options)
 
 
 _FIREFIGHTING = Firefighting.tasks["1"]
@@ -155,6 +183,24 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
             Family("reuse", ("F(a & F(b & F a))",), ("a", "b"), TaskSizes(4, 2, 5, 5, 0, 1)),
             Family("random", _RANDOM, ("a", "b", "c"), TaskSizes(8, 3, 9, 9, 1, 2), disjoint_tasks=True),
             Family("cubes", _SEVERAL_CUBES, ("a", "b", "c"), TaskSizes(4, 3, 5, 8, 3, 3)),
+            _shared("shared", 1),
+            _shared("shared-joint", None),
+            _shared("shared-dear", 1, dead_end_cost=_DEAR),
+            _shared("shared-rare", 1, chances="rare"),
+            _shared("shared-extreme", 1, chances="extreme"),
+            Family(
+                "rare",
+                ("F(a & F(b & F a))",),
+                ("a", "b"),
+                TaskSizes(4, 2, 5, 5, 0, 1),
+                chances="rare",
+                dead_end_cost=_DEAR,
+            ),
+            Family("extreme", ("F a & F b",), ("a", "b"), TaskSizes(4, 2, 5, 5, 0, 1), chances="extreme"),
+            Family("cheap", ("F a & F b",), ("a", "b"), TaskSizes(4, 2, 5, 5, 0, 1), dead_end_cost=50.0),
+            Family("dear", ("F a & F b",), ("a", "b"), TaskSizes(4, 2, 5, 5, 0, 1), dead_end_cost=_DEAR),
+            Family("clustered", ("F a & F b",), ("a", "b"), TaskSizes(4, 2, 5, 5, 0, 1), clustered=True),
+            Family("four", ("F a & F b & F c & F d",), ("a", "b", "c", "d"), TaskSizes(16, 4, 32, 32, 0, 1), 1),
         )
     }
 )
@@ -165,6 +211,11 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
 * reuse: what was found once is needed again
 * random: co-safe formulas whose automata have 2 to 8 states
 * cubes: transitions that have several cubes
+* shared, shared-joint: as three-single and three-joint, but what fails in one state of the automaton fails in all;
+  -dear with a dead end of 5000, -rare and -extreme with such chances
+* rare: as reuse, with small chances and a dead end of 5000
+* extreme, cheap, dear, clustered: as two, with extreme chances, dead ends of 50 and 5000, subgoals in two clusters
+* four: look for four things
 """
 
 
@@ -196,19 +247,31 @@ def family_problem(family: str, subgoals: int, split: Split, index: int) -> Plan
     # The order of drawing is part of the definition: geometry, estimates, start.
     problem = PlanningProblem.from_arrays(
         arrays,
-        **_geometry(task, spec.sizes, subgoals, rng),
-        **_estimates(task, spec.sizes, subgoals, rng),
+        **_geometry(task, spec, subgoals, rng),
+        **_estimates(task, spec, arrays, subgoals, rng),
         dfa_state=_start_state(task, rng),
         subgoal_mask=np.ones(subgoals, bool),
-        dead_end_cost=DEAD_END_COST,
+        dead_end_cost=spec.dead_end_cost,
     )
     problem.check()
     return problem
 
 
-def random_metric(locations: int, rng: np.random.Generator) -> Float64[np.ndarray, "N N"]:
-    """Shortest paths between random locations on the map: symmetric, 0 on the diagonal only, triangle inequality."""
+def random_metric(locations: int, rng: np.random.Generator, clustered: bool = False) -> Float64[np.ndarray, "N N"]:
+    """Shortest paths between random locations on the map: symmetric, 0 on the diagonal only, triangle inequality.
+
+    Args:
+        locations: N.
+        rng: where they are drawn from.
+        clustered: whether the locations lie in two clusters.
+
+    Returns:
+        Path costs.
+    """
     points = rng.uniform(0.0, _SIDE, (locations, 2))
+    if clustered:
+        offsets = rng.uniform(-_CLUSTER_RADIUS, _CLUSTER_RADIUS, (locations, 2))
+        points = rng.uniform(0.0, _SIDE, (2, 2))[np.arange(locations) % 2] + offsets
     offset = np.abs(points[:, None] - points[None])
     octile = offset.max(axis=-1) + (DIAGONAL - 1.0) * offset.min(axis=-1)
     # One detour for both directions; the shortest paths through other locations restore the triangle inequality.
@@ -220,7 +283,26 @@ def random_metric(locations: int, rng: np.random.Generator) -> Float64[np.ndarra
 def _compile(family: Family, formula: str) -> tuple[Task, TaskArrays]:
     """A family's task and its padded arrays: compiled once, since Spot takes longer than drawing a problem."""
     task = Task.from_formula(formula, family.propositions, family.max_positive_literals)
-    return task, task.padded(family.sizes)
+    arrays = task.padded(family.sizes)
+    return task, _with_shared_conditions(arrays) if family.shares_conditions else arrays
+
+
+def _with_shared_conditions(arrays: TaskArrays) -> TaskArrays:
+    """With the first class that needs the same things in place of every class; all have one cube.
+
+    What needs more things implies what needs fewer.
+    """
+    needs = np.asarray(arrays.class_phi)[:, 1] > 0
+    first = np.array([np.flatnonzero((needs == own).all(axis=1))[0] for own in needs])
+    kept = np.arange(len(first)) == first
+    implies = (needs[:, None] >= needs[None]).all(axis=2) & kept[:, None] & kept[None]
+    return dataclasses.replace(
+        arrays,
+        edge_condition=jnp.asarray(first[np.asarray(arrays.edge_condition)], jnp.int32),
+        class_mask=jnp.asarray(kept),
+        condition_mask=jnp.asarray(kept),
+        implies=jnp.asarray(implies),
+    )
 
 
 def _start_state(task: Task, rng: np.random.Generator) -> int:
@@ -239,15 +321,15 @@ def _after_empty_letters(task: Task) -> Int32[np.ndarray, " Z"]:
     return state
 
 
-def _geometry(task: Task, sizes: TaskSizes, subgoals: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def _geometry(task: Task, family: Family, subgoals: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
     """``travel`` and ``finish``: shortest paths in the product of locations and automaton.
 
     Locations are subgoals, robot, labelled cells, in this order. Labelled cells lie off the map's middle, each at the
     end of a path of its own.
     """
-    dfa, states, robot = task.dfa, task.dfa.num_states, subgoals
+    dfa, states, robot, sizes = task.dfa, task.dfa.num_states, subgoals, family.sizes
     labelled = int(rng.integers(1, _MOST_LABELLED + 1)) if rng.random() < _CHANCE_LABELLED_CELLS else 0
-    path_cost = random_metric(subgoals + 1 + labelled, rng)
+    path_cost = random_metric(subgoals + 1 + labelled, rng, family.clustered)
     aside = np.concatenate([np.zeros(subgoals + 1), rng.uniform(0.0, _FARTHEST_LABELLED, labelled)])
     path_cost = np.where(np.eye(len(path_cost), dtype=bool), 0.0, path_cost + aside[:, None] + aside[None, :])
     letters = _location_letters(task, subgoals, labelled, rng)
@@ -303,7 +385,9 @@ def _shortest(cost: Float64[np.ndarray, "N N"]) -> Float64[np.ndarray, "N N"]:
     return cost
 
 
-def _estimates(task: Task, sizes: TaskSizes, subgoals: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def _estimates(
+    task: Task, family: Family, arrays: TaskArrays, subgoals: int, rng: np.random.Generator
+) -> dict[str, np.ndarray]:
     """P_S, R_S and R_F. What implies more is less likely and lies farther away."""
     shape = (subgoals, task.sizes.classes)
     confident = rng.random(shape) < rng.uniform(0.0, _MOST_CONFIDENT)
@@ -312,16 +396,20 @@ def _estimates(task: Task, sizes: TaskSizes, subgoals: int, rng: np.random.Gener
         rng.random(shape) < _CHANCE_CONFIDENT_SUCCESS, rng.uniform(0.9, 0.995, shape), rng.uniform(0.005, 0.1, shape)
     )
     probability = np.where(confident, extreme, rng.uniform(0.05, 0.75, shape))
+    if family.chances == "rare":
+        probability = rng.uniform(*_RARE, shape)
+    elif family.chances == "extreme":
+        probability = rng.choice(_EXTREME, shape)
     probability[rng.random(shape) < _CHANCE_IMPOSSIBLE] = 0.0
     success = rng.uniform(3.0, 60.0, shape)
     failure = rng.uniform(5.0, 80.0, shape)
     # A condition that implies others holds no more often than they do, and is not met before them; independent draws
     # would contradict each other, and with them the closure of what a rollout knows.
-    implies = task.outcomes.implies[: shape[1], : shape[1]]
+    implies = np.asarray(arrays.implies)[: shape[1], : shape[1]] | np.eye(shape[1], dtype=bool)
     probability = np.where(implies, probability[:, None, :], np.inf).min(axis=2)
     success = np.where(implies, success[:, None, :], 0.0).max(axis=2)
     return {
-        name: np.pad(values, [(0, 0), (0, sizes.classes - shape[1])], constant_values=fill)
+        name: np.pad(values, [(0, 0), (0, family.sizes.classes - shape[1])], constant_values=fill)
         for name, values, fill in (
             ("success_probability", probability, 0.0),
             ("success_cost", success, 1.0),

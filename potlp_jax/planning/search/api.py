@@ -28,6 +28,7 @@ from potlp_jax.planning.search.uct import UCT, UctTree
 from potlp_jax.precision import in_32_bits
 
 
+@in_32_bits
 def plan_actions(
     problem: PlanningProblem, key: PRNGKeyArray, config: BestFirstConfig | UctConfig = BestFirstConfig()
 ) -> Plan:
@@ -44,7 +45,8 @@ def plan_actions(
       key: consumed under ``UctConfig``. Under ``BestFirstConfig`` nothing is drawn and any key gives the same plan; the
         argument is there so that one call serves both.
       config: which search, and its settings. Best-first search ends by itself on a small problem, on a large one after
-        ``config.simulations``; ``Plan.optimism_gap`` is 0 in the first case. PO-UCT always runs all simulations.
+        ``config.simulations``; ``Plan.lower_bound`` is ``Plan.value`` in the first case. PO-UCT always runs all
+        simulations.
 
     Returns:
       The plan.
@@ -52,7 +54,7 @@ def plan_actions(
     Raises:
       ProblemError: the shapes of the problem's arrays do not agree.
     """
-    return search_tree(problem, key, config)[0]
+    return _search_one(problem, key, config, None, with_trees=False)[0]
 
 
 @in_32_bits
@@ -77,10 +79,7 @@ def search_tree(
     Raises:
       ProblemError: the shapes of the problem's arrays do not agree.
     """
-    check_shapes(problem)
-    # One problem is a batch of one: there is one kernel.
-    problems, seeds, trees = jax.tree.map(lambda leaf: leaf[None], (problem, _seed(key), tree))
-    return jax.tree.map(lambda leaf: leaf[0], run_search(_search_for(config), config, problems, seeds, trees))
+    return _search_one(problem, key, config, tree, with_trees=True)
 
 
 @in_32_bits
@@ -106,6 +105,20 @@ def search(
     """
     check_shapes(problems, keys.shape)
     return run_search(_search_for(config), config, problems, jax.vmap(_seed)(keys), trees)
+
+
+def _search_one(
+    problem: PlanningProblem,
+    key: PRNGKeyArray,
+    config: BestFirstConfig | UctConfig,
+    tree: Tree | UctTree | None,
+    with_trees: bool,
+) -> tuple[Plan, Any]:
+    check_shapes(problem)
+    # One problem is a batch of one: there is one kernel.
+    problems, seeds, trees = jax.tree.map(lambda leaf: leaf[None], (problem, _seed(key), tree))
+    found = run_search(_search_for(config), config, problems, seeds, trees, with_trees)
+    return jax.tree.map(lambda leaf: leaf[0], found)
 
 
 def plan_within(
@@ -138,7 +151,7 @@ def plan_within(
     jax.block_until_ready(_more(problem, key, warm, config=config))
     spent, plan, tree = _timed(_first, problem, key, config=config)
     # A round begins as long as time is left, so the last one may end late by its own length.
-    while spent < seconds and float(plan.optimism_gap) > 0 and int(tree.size) < config.tree_capacity:
+    while spent < seconds and float(plan.value) > float(plan.lower_bound) and int(tree.size) < config.tree_capacity:
         step, plan, tree = _timed(_more, problem, key, tree, config=config)
         spent += step
     return plan, tree

@@ -4,21 +4,37 @@ This is not the search of the paper, which is PO-UCT (``search.uct``). It is det
 key is used. AO* grows a graph of choices (OR) and outcomes (AND) along the policy that looks best, and backs up
 expectations and minima, as this does. Three things are different. The leaf to expand is found as in bounded real-time
 dynamic programming and HSVI, by following the widest gap, but without their random outcomes. The estimates at leaves
-are guesses, which may be too high, so that AO*'s guarantee is lost; the bounds discount them by a fixed fraction
-instead of being admissible. And the search ends when it is spent, proven or not.
+are guesses, which may be too high: the search first discounts them by a fixed fraction, which is no bound but leads to
+good choices soon, and then goes on with admissible bounds. And the search ends when it is spent, proven or not.
 
 Values are those of Eq. 3 itself: expectations over both outcomes, minima over actions. Outcomes that have no node yet
-have a guessed value (``search.guess``). Every node also has a **bound**: its value if every guess were too high by the
-fraction ``optimism``. One simulation of all rows of a batch is
+have a guessed value (``search.guess``). Beside its value every node has a **bound**, its value if every guess were too
+high by the fraction ``optimism``, and a **floor**, its value if every guess were 0. One simulation of all rows of a
+batch is
 
 1. **descend**: from the root, take the action of least bound, and of its two outcomes the one that contributes more to
-   the gap between value and bound, until an outcome without a node is reached. Only reads.
+   the gap between value and bound, until an outcome without a node is reached. Where no gap between value and bound is
+   left at the root, the descent does the same with floors in place of bounds: it **certifies**. Only reads.
 2. **expand**: give that outcome a node, or find the one that another order of the same events led to.
-3. **back up** values and bounds along the descent. Only writes.
+3. **back up** values, bounds and floors along the descent. Only writes.
 
-Once no gap is left at the root the search ends: what could be best under the optimistic guesses has been examined. All
-reads of a simulation come before its writes, so that XLA updates the arrays in place and the cost of a simulation does
-not depend on their size.
+Once value and floor of the root are equal the search ends.
+
+**A search that has ended is exact**, up to rounding, unless its status has an overflow. (1) Costs are not negative, so
+that 0 is no more than what follows any outcome; Eq. 3 is monotone in these; so no floor exceeds the true cost, also a
+floor computed earlier, from children that have grown since. (2) Let the root's value equal its floor. The action of
+least value has a floor no greater than its value, and no less than the root's floor: both are equal. They were computed
+together, by the same operations, from values and floors of its outcomes, which therefore were equal too where they have
+a probability. A guess is never equal to its floor of 0 (``LEAST_GUESS``), so that these outcomes had nodes, satisfied
+the task, or were dead ends; and so on down to the end of every history. So the value is the cost of a policy that rests
+on no guess, and no less than the optimum. By (1) it is no more.
+
+**Every search ends**, given simulations and memory. While value and floor (or bound) of the root differ, the action of
+least floor has a gap, hence one of its outcomes, and so on: the descent meets an outcome without a node and links it to
+one, or it meets stored numbers that are older than their children's and renews them. There are finitely many histories.
+
+All reads of a simulation come before its writes, so that XLA updates the arrays in place and the cost of a simulation
+does not depend on their size.
 
 References:
   Nilsson, Principles of Artificial Intelligence, 1980 (AO*).
@@ -30,6 +46,7 @@ References:
 """
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,10 +58,22 @@ from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.rounding import rounded_product
 from potlp_jax.planning.search.arrays import first_of_least, least_of_each, status_of_rows
 from potlp_jax.planning.search.config import BestFirstConfig
-from potlp_jax.planning.search.graph import NewNode, NodeValues, Tree, add_node, find, plant_tree
-from potlp_jax.planning.search.guess import Rule, guess_outcomes, make_rule
-from potlp_jax.planning.search.lockstep import SearchMethod
+from potlp_jax.planning.search.graph import (
+    VALUE_COLUMNS,
+    Costs,
+    NewNode,
+    NodeValues,
+    Tree,
+    add_node,
+    as_guess,
+    find,
+    guess_in,
+    plant_tree,
+)
+from potlp_jax.planning.search.guess import Rule, guess_outcomes, make_rule, value_successes_anew
+from potlp_jax.planning.search.lockstep import SearchKernel, SearchMethod
 from potlp_jax.planning.search.model import FAILURE, SUCCESS, Model, make_model
+from potlp_jax.planning.search.native import LIBRARY, fits_kernel, search_natively
 from potlp_jax.planning.search.plan import Plan, plan_of_least_score
 from potlp_jax.planning.sharding import vary_alike
 from potlp_jax.task.relations import transitive_closure
@@ -61,6 +90,10 @@ the search too early. Tuned as ``OPTIMISM``."""
 OPTIMISM_OF_FEW: float = 0.7
 """Optimism of small problems. Tuned as ``OPTIMISM``: the mean regret over 12 rows of problems falls from 0.08 to 0.06 %
 and the worst from 5.9 to 4.1 %."""
+
+LEAST_GUESS: float = 1e-4
+"""Guesses at outcomes that do not satisfy the task are at least this share of the dead-end cost, so that an outcome
+without a node leaves a gap that 24 bits can hold: one that rounding hides changes the value by less than 0.06 %."""
 
 ALL_CONDITIONS = 0xFFFFFFFF
 """A word of a mask over conditions in which every bit is set."""
@@ -95,23 +128,19 @@ class Path:
       actions: action taken there.
       inside: whether the action stays in the unknown region.
       values: packed ``NodeValues`` of the node before the descent.
-      base: the part of Q that the followed outcome does not change.
-      base_bound: the same part of the bound.
+      base: the part of Q, bound and floor that the followed outcome does not change.
       weight: probability of the followed outcome.
-      rival: least Q of the node's other actions of the same kind (that stay inside, or that leave).
-      rival_bound: least bound of those.
+      rival: least Q, bound and floor of the node's other actions of the same kind (that stay inside, or that leave).
       pending_cost: at the node.
     """
 
     nodes: Int32[Array, "*D B"]
     actions: Int32[Array, "*D B"]
     inside: Bool[Array, "*D B"]
-    values: Float32[Array, "*D B 5"]
-    base: Float32[Array, "*D B"]
-    base_bound: Float32[Array, "*D B"]
+    values: Float32[Array, "*D B 7"]
+    base: Costs
     weight: Float32[Array, "*D B"]
-    rival: Float32[Array, "*D B"]
-    rival_bound: Float32[Array, "*D B"]
+    rival: Costs
     pending_cost: Float32[Array, "*D B"]
 
     @staticmethod
@@ -121,26 +150,22 @@ class Path:
         batch = rows.shape[0]
         # Separate arrays: stacked into one, XLA recomputed the step for each part (docs/results/dropped.md, "Search").
         floats = jnp.zeros((depth, batch), jnp.float32)
+        costs = Costs(value=floats, bound=floats, floor=floats)
         return Path(
             nodes=jnp.full((depth, batch), spare, jnp.int32),
             actions=jnp.zeros((depth, batch), jnp.int32),
             inside=jnp.zeros((depth, batch), jnp.bool_),
-            values=jnp.zeros((depth, batch, len(dataclasses.fields(NodeValues))), jnp.float32),
-            base=floats,
-            base_bound=floats,
+            values=jnp.zeros((depth, batch, VALUE_COLUMNS), jnp.float32),
+            base=costs,
             weight=floats,
-            rival=floats,
-            rival_bound=floats,
+            rival=costs,
             pending_cost=floats,
         )
 
-    def record(self, level: Int32[Array, ""], **entries: Array) -> "Path":
+    def record(self, level: Int32[Array, ""], **entries: Any) -> "Path":
         """With all fields of one level written."""
-        return Path(
-            **{
-                name: jax.lax.dynamic_update_index_in_dim(getattr(self, name), entry, level, 0)
-                for name, entry in entries.items()
-            }
+        return jax.tree.map(
+            lambda array, entry: jax.lax.dynamic_update_index_in_dim(array, entry, level, 0), self, Path(**entries)
         )
 
 
@@ -177,13 +202,11 @@ class Leaf:
 
     Attributes:
       child: node of the last action's outcome, ``Tree.UNVISITED`` where it has none.
-      value: expected cost after the descent's last outcome.
-      bound: the same with optimistic guesses.
+      costs: expected cost after the descent's last outcome.
     """
 
     child: Int32[Array, "B"]
-    value: Float32[Array, "B"]
-    bound: Float32[Array, "B"]
+    costs: Costs
 
 
 def prepare(problems: PlanningProblem, seeds: UInt32[Array, "B 2"], config: BestFirstConfig) -> Context:
@@ -228,9 +251,9 @@ def plant(context: Context, config: BestFirstConfig) -> Tree:
 
 
 def is_open(context: Context, tree: Tree) -> Bool[Array, "B"]:
-    """Whether a gap between value and bound is left at the root, so that more simulations can change something."""
-    value, bound = _root_value(context, tree)
-    return value > bound
+    """Whether a gap between value and floor is left at the root, so that more simulations can change something."""
+    root = _root_costs(context, tree)
+    return root.value > root.floor
 
 
 def simulate(context: Context, tree: Tree, config: BestFirstConfig) -> Tree:
@@ -252,17 +275,25 @@ def simulate(context: Context, tree: Tree, config: BestFirstConfig) -> Tree:
 
 def choose(context: Context, tree: Tree) -> Plan:
     """The action of least Q at the root."""
-    _, bound = _root_value(context, tree)
+    root = _root_costs(context, tree)
     # Q, not the bound: the bound says where to look, Q what is believed. At the root nothing is pending.
     q_values = tree.q_values[:, Tree.ROOT]
-    return plan_of_least_score(context.model, q_values, q_values, tree.root_visits, bound, tree.status)
+    return plan_of_least_score(context.model, q_values, q_values, tree.root_visits, root.bound, root.floor, tree.status)
 
 
-BEST_FIRST = SearchMethod(tree=Tree, prepare=prepare, plant=plant, is_open=is_open, simulate=simulate, choose=choose)
+BEST_FIRST = SearchMethod(
+    tree=Tree,
+    prepare=prepare,
+    plant=plant,
+    is_open=is_open,
+    simulate=simulate,
+    choose=choose,
+    kernel=SearchKernel(library=LIBRARY, fits=fits_kernel, run=search_natively),
+)
 
 
-def _root_value(context: Context, tree: Tree) -> tuple[Float32[Array, "B"], Float32[Array, "B"]]:
-    """Value and bound of the problems."""
+def _root_costs(context: Context, tree: Tree) -> Costs:
+    """Value, bound and floor of the problems."""
     values = NodeValues.unpack(tree.values[:, Tree.ROOT])
     return values.on_arrival(context.model.root.pending_cost, context.model.dead_end_cost)
 
@@ -270,6 +301,9 @@ def _root_value(context: Context, tree: Tree) -> tuple[Float32[Array, "B"], Floa
 def _descend(context: Context, tree: Tree, config: BestFirstConfig) -> Descent:
     """Follow the graph from the root to an outcome without a node, or to the rollout's end."""
     batch = tree.size.shape[0]
+    root = _root_costs(context, tree)
+    # No gap is left between value and bound: what remains is to prove it, or to find that a guess was too high.
+    certifies = root.value <= root.bound
     nowhere = jnp.zeros((batch,), jnp.bool_)
     start = Descent(
         level=jnp.int32(0),
@@ -288,22 +322,38 @@ def _descend(context: Context, tree: Tree, config: BestFirstConfig) -> Descent:
     def goes_on(descent: Descent) -> Bool[Array, ""]:
         return jnp.any(descent.active) & (descent.level < config.max_depth)
 
-    return jax.lax.while_loop(goes_on, lambda descent: _descend_once(context, tree, descent), vary_alike(start))
+    def take_action(descent: Descent) -> Descent:
+        is_last = descent.level + 1 >= config.max_depth
+        return _descend_once(context, tree, descent, certifies, is_last)
+
+    return jax.lax.while_loop(goes_on, take_action, vary_alike(start))
 
 
-def _descend_once(context: Context, tree: Tree, descent: Descent) -> Descent:
-    """Take one action in every row that is still descending."""
+def _descend_once(
+    context: Context, tree: Tree, descent: Descent, certifies: Bool[Array, "B"], is_last: Bool[Array, ""]
+) -> Descent:
+    """Take one action in every row that is still descending.
+
+    Args:
+      context: of the problems.
+      tree: the graphs.
+      descent: so far.
+      certifies: True in rows that minimise floors instead of bounds.
+      is_last: True at the last level that ``max_depth`` allows.
+
+    Returns:
+      The descent, one level further.
+    """
     model, node = context.model, descent.node
     rows = model.rows
-    selection = _select_action(model, tree, descent)
+    selection = _select_action(model, tree, descent, certifies)
     action, moves = selection.action, selection.moves
-    children = tree.children[rows, node, action]
     accepts = model.accepts[rows, action]
-    step = _follow_gap(context, _attempt_at(model, tree, descent, selection), children, accepts, tree)
+    step = _follow_gap(context, tree, _attempt_at(model, tree, descent, selection), accepts, certifies, is_last)
     # An outcome that satisfies the task has no node: the descent ends there.
-    child = children[rows, step.success.astype(jnp.int32)]
+    child = step.child
     accepted = moves & step.success & accepts
-    expands = moves & ~accepted & (child == Tree.UNVISITED)
+    expands = moves & ~accepted & (child < 0)
     deeper = moves & ~accepted & ~expands
     path = descent.path.record(
         descent.level,
@@ -313,10 +363,8 @@ def _descend_once(context: Context, tree: Tree, descent: Descent) -> Descent:
         inside=selection.inside,
         values=selection.values,
         base=step.base,
-        base_bound=step.base_bound,
         weight=step.weight,
         rival=selection.rival,
-        rival_bound=selection.rival_bound,
         pending_cost=descent.pending_cost,
     )
     return Descent(
@@ -338,49 +386,44 @@ class _Selection:
     """The action that a row takes next.
 
     Attributes:
-      action: the action of least bound, ties by lowest index; finish where none is available.
+      action: the action of least bound or floor, ties by lowest index; finish where none is available.
       moves: True where the row is descending and has an action.
       inside: whether the action stays in the unknown region.
       values: packed ``NodeValues`` of the row's node.
-      rival: least Q of the node's other actions of the same kind.
-      rival_bound: least bound of those.
+      rival: least Q, bound and floor of the node's other actions of the same kind.
     """
 
     action: Int32[Array, "B"]
     moves: Bool[Array, "B"]
     inside: Bool[Array, "B"]
-    values: Float32[Array, "B 5"]
-    rival: Float32[Array, "B"]
-    rival_bound: Float32[Array, "B"]
+    values: Float32[Array, "B 7"]
+    rival: Costs
 
 
-def _select_action(model: Model, tree: Tree, descent: Descent) -> _Selection:
-    """The action of least bound at every row's node."""
+def _select_action(model: Model, tree: Tree, descent: Descent, certifies: Bool[Array, "B"]) -> _Selection:
+    """The action of least bound at every row's node, or of least floor where the row certifies."""
     rows, node = model.rows, descent.node
     # Without the barrier XLA would look every entry up again for each of the minima below.
-    q_values, bounds, values = jax.lax.optimization_barrier(
-        (tree.q_values[rows, node], tree.bounds[rows, node], tree.values[rows, node])
+    q_values, bounds, floors, values = jax.lax.optimization_barrier(
+        (tree.q_values[rows, node], tree.bounds[rows, node], tree.floors[rows, node], tree.values[rows, node])
     )
+    costs = Costs(value=q_values, bound=bounds, floor=floors)
     inside = model.stays_inside(tree.location[rows, node], tree.state[rows, node])
     # Only actions that leave the unknown region pay the pending cost.
-    score = bounds + jnp.where(inside, 0.0, descent.pending_cost[:, None])
+    score = costs.low(certifies[:, None]) + jnp.where(inside, 0.0, descent.pending_cost[:, None])
     action, least = first_of_least(score)
     goes_inside = inside[rows, action]
     chosen = jnp.arange(score.shape[1], dtype=jnp.int32)[None, :] == action[:, None]
     # The backup changes the chosen action's Q. With the least of the others of its kind, the new minimum is known
     # without reading the row again.
     rivals = (inside == goes_inside[:, None]) & ~chosen
-    rival, rival_bound = (
-        least_of_each(jnp.where(rivals, values_of_actions, jnp.inf), jnp.inf)
-        for values_of_actions in (q_values, bounds)
-    )
+    rival = jax.tree.map(lambda own: least_of_each(jnp.where(rivals, own, jnp.inf), jnp.inf), costs)
     return _Selection(
         action=action,
         moves=descent.active & ~jnp.isinf(least),
         inside=goes_inside,
         values=values,
         rival=rival,
-        rival_bound=rival_bound,
     )
 
 
@@ -393,16 +436,14 @@ class _Attempt:
       chance: P_S.
       success_cost: R_S.
       failure_cost: R_F.
-      success_value: guessed expected cost after success.
-      failure_value: guessed expected cost after failure.
+      children: of its outcomes, as in ``Tree``.
     """
 
     path_cost: Float32[Array, "B"]
     chance: Float32[Array, "B"]
     success_cost: Float32[Array, "B"]
     failure_cost: Float32[Array, "B"]
-    success_value: Float32[Array, "B"]
-    failure_value: Float32[Array, "B"]
+    children: Int32[Array, "B 2"]
 
 
 def _attempt_at(model: Model, tree: Tree, descent: Descent, selection: _Selection) -> _Attempt:
@@ -415,8 +456,7 @@ def _attempt_at(model: Model, tree: Tree, descent: Descent, selection: _Selectio
         chance=tree.chances[rows, node, action],
         success_cost=tree.success_costs[rows, node, action],
         failure_cost=model.tables.actions.failure_cost[rows, action],
-        success_value=tree.success_values[rows, node, action],
-        failure_value=tree.failure_values[rows, node, action],
+        children=tree.children[rows, node, action],
     )
 
 
@@ -426,59 +466,86 @@ class _Step:
 
     Attributes:
       success: which outcome.
+      child: its entry of ``Tree.children``.
       pending_cost: after it.
       base: see ``Path``.
-      base_bound: see ``Path``.
       weight: see ``Path``.
     """
 
     success: Bool[Array, "B"]
+    child: Int32[Array, "B"]
     pending_cost: Float32[Array, "B"]
-    base: Float32[Array, "B"]
-    base_bound: Float32[Array, "B"]
+    base: Costs
     weight: Float32[Array, "B"]
 
 
 def _follow_gap(
-    context: Context, attempt: _Attempt, children: Int32[Array, "B 2"], accepts: Bool[Array, "B"], tree: Tree
+    context: Context,
+    tree: Tree,
+    attempt: _Attempt,
+    accepts: Bool[Array, "B"],
+    certifies: Bool[Array, "B"],
+    is_last: Bool[Array, ""],
 ) -> _Step:
-    """Follow the outcome that contributes more to the gap between the action's Q and its bound."""
-    chance = attempt.chance
-    success_value, success_bound = _outcome_value(
-        context, tree, children[:, SUCCESS], attempt.success_value, attempt.success_cost
-    )
-    failure_value, failure_bound = _outcome_value(
-        context, tree, children[:, FAILURE], attempt.failure_value, attempt.failure_cost
-    )
-    success = chance * (success_value - success_bound) >= (1.0 - chance) * (failure_value - failure_bound)
+    """Follow the outcome that contributes more to the gap between the action's Q and its bound or floor.
+
+    Args:
+      context: of the problems.
+      tree: the graphs.
+      attempt: the action of each row.
+      accepts: whether its success satisfies the task.
+      certifies: True where the gap is that to the floor.
+      is_last: True at the last level: what has a node is taken as it is, without a gap.
+
+    Returns:
+      The outcome that is followed.
+    """
+    chance, failure_child, success_child = attempt.chance, attempt.children[:, FAILURE], attempt.children[:, SUCCESS]
+    after_success = _outcome_costs(context, tree, success_child, attempt.success_cost, is_last)
+    after_failure = _outcome_costs(context, tree, failure_child, attempt.failure_cost, is_last)
+    success_gap = after_success.value - after_success.low(certifies)
+    failure_gap = after_failure.value - after_failure.low(certifies)
+    success = chance * success_gap >= (1.0 - chance) * failure_gap
     # Nothing is to be learnt from satisfying the task, and a certain success cannot fail.
     success = (success & ~accepts) | (chance >= 1.0)
     # Eq. 3 without the part that the followed outcome contributes: that is added during the backup.
     known = attempt.path_cost + rounded_product(chance, attempt.success_cost)
     known += rounded_product(1.0 - chance, attempt.failure_cost)
     weight, rest = jnp.where(success, chance, 1.0 - chance), jnp.where(success, 1.0 - chance, chance)
+
+    def without_followed(after_failure: Array, after_success: Array) -> Array:
+        return known + rounded_product(rest, jnp.where(success, after_failure, after_success))
+
     return _Step(
         success=success,
+        child=jnp.where(success, success_child, failure_child),
         pending_cost=jnp.where(success, attempt.success_cost, attempt.failure_cost),
-        base=known + rounded_product(rest, jnp.where(success, failure_value, success_value)),
-        base_bound=known + rounded_product(rest, jnp.where(success, failure_bound, success_bound)),
+        base=jax.tree.map(without_followed, after_failure, after_success),
         weight=weight,
     )
 
 
-def _outcome_value(
+def _outcome_costs(
     context: Context,
     tree: Tree,
     child: Int32[Array, "B"],
-    guessed: Float32[Array, "B"],
     pending_cost: Float32[Array, "B"],
-) -> tuple[Float32[Array, "B"], Float32[Array, "B"]]:
-    """Value and bound of an outcome: those of its node, or by the guess where there is none."""
+    is_last: Bool[Array, ""],
+) -> Costs:
+    """Costs after an outcome: those of its node, or by the guess where there is none."""
     # Index 0 where there is no child: read, and not used.
-    values = tree.values_at(context.model.rows, jnp.maximum(child, 0))
-    value, bound = values.on_arrival(pending_cost, context.model.dead_end_cost)
-    new = child == Tree.UNVISITED
-    return jnp.where(new, guessed, value), jnp.where(new, (1.0 - context.optimism) * guessed, bound)
+    node = tree.values_at(context.model.rows, jnp.maximum(child, 0))
+    visited = node.on_arrival(pending_cost, context.model.dead_end_cost)
+    visited = _closed_where(is_last, visited)
+    guess = guess_in(child)
+    optimistic = rounded_product(1.0 - context.optimism, guess)
+    unvisited = Costs(value=guess, bound=optimistic, floor=jnp.zeros_like(guess))
+    return jax.tree.map(lambda new, old: jnp.where(child < 0, new, old), unvisited, visited)
+
+
+def _closed_where(cut: Bool[Array, "*B"], costs: Costs) -> Costs:
+    """Without a gap where a descent is cut by ``max_depth``: it would lead to the same place again and again."""
+    return jax.tree.map(lambda own: jnp.where(cut, costs.value, own), costs)
 
 
 def _expand(context: Context, tree: Tree, descent: Descent, config: BestFirstConfig) -> tuple[Tree, Leaf]:
@@ -497,16 +564,12 @@ def _expand(context: Context, tree: Tree, descent: Descent, config: BestFirstCon
     existing = tree.values[model.rows, end]
     tree, values, added = add_node(tree, model, node, history, lookup, is_new)
     values = NodeValues.unpack(jnp.where(is_new[:, None], values.pack(), existing))
-    value, bound = values.on_arrival(descent.pending_cost, model.dead_end_cost)
+    costs = _closed_where(descent.active, values.on_arrival(descent.pending_cost, model.dead_end_cost))
     child = jnp.where(added, tree.size - 1, jnp.where(descent.expands, lookup.node, Tree.UNVISITED))
     overflow = status_of_rows(is_new & ~added, Status.TREE_OVERFLOW)
     # Rows that are still active when the descent is over have reached the depth limit.
     overflow |= status_of_rows(descent.active, Status.DEPTH_OVERFLOW)
-    leaf = Leaf(
-        child=child,
-        value=jnp.where(descent.accepted, 0.0, value),
-        bound=jnp.where(descent.accepted, 0.0, bound),
-    )
+    leaf = Leaf(child=child, costs=jax.tree.map(lambda own: jnp.where(descent.accepted, 0.0, own), costs))
     return dataclasses.replace(tree, status=tree.status | overflow), leaf
 
 
@@ -516,8 +579,9 @@ def _new_node(context: Context, history: History, config: BestFirstConfig) -> Ne
     free = dataclasses.replace(history, pending_cost=jnp.zeros_like(history.pending_cost))
     terms = jax.vmap(terms_of_all)(context.model.tables, free)
     chance, available = terms.success_probability, terms.available
+    rule = value_successes_anew(context.rule, context.model.tables, chance, terms.success_cost, config.guess_failures)
     failure_values, success_values = guess_outcomes(
-        context.rule,
+        rule,
         context.model.product_state(history.location, history.state),
         history.pending_cost,
         available,
@@ -525,7 +589,10 @@ def _new_node(context: Context, history: History, config: BestFirstConfig) -> Ne
         terms.success_cost,
         config.guess_failures,
     )
-    # Eq. 3 with guessed values, and the same with the guesses reduced by the optimism.
+    least = LEAST_GUESS * context.model.dead_end_cost[:, None]
+    failure_values = jnp.maximum(failure_values, least)
+    success_values = jnp.where(context.model.accepts, 0.0, jnp.maximum(success_values, least))
+    # Eq. 3 with guessed values, the same with the guesses reduced by the optimism, and without them.
     known = terms.distance + rounded_product(chance, terms.success_cost)
     known += rounded_product(1.0 - chance, terms.failure_cost)
     guessed = rounded_product(chance, success_values) + rounded_product(1.0 - chance, failure_values)
@@ -533,10 +600,10 @@ def _new_node(context: Context, history: History, config: BestFirstConfig) -> Ne
     return NewNode(
         q_values=jnp.where(available, known + guessed, jnp.inf),
         bounds=jnp.where(available, known + optimistic, jnp.inf),
+        floors=jnp.where(available, known, jnp.inf),
         chances=chance,
         success_costs=terms.success_cost,
-        failure_values=failure_values,
-        success_values=success_values,
+        children=as_guess(jnp.stack([failure_values, success_values], axis=-1)),
     )
 
 
@@ -545,15 +612,17 @@ def _back_up(tree: Tree, descent: Descent, leaf: Leaf) -> Tree:
     rows = jnp.arange(tree.size.shape[0], dtype=jnp.int32)
 
     def ascend(carry):
-        level, value, bound, tree = carry
+        level, after, tree = carry
         step = jax.tree.map(lambda records: records[level], descent.path)
         # Rows with a shorter descent wait at their leaf until the level of their last action.
         taken = step.nodes < tree.capacity
-        q_value = step.base + rounded_product(step.weight, value)
-        low = step.base_bound + rounded_product(step.weight, bound)
-        values = _with_action(step, q_value, low)
-        value = jnp.where(taken, jnp.minimum(step.pending_cost + values.leave, values.stay), value)
-        bound = jnp.where(taken, jnp.minimum(step.pending_cost + values.leave_bound, values.stay_bound), bound)
+        action = jax.tree.map(lambda base, after: base + rounded_product(step.weight, after), step.base, after)
+        values = _with_action(step, action)
+
+        def arrive(after: Array, leave: Array, stay: Array) -> Array:
+            return jnp.where(taken, jnp.minimum(step.pending_cost + leave, stay), after)
+
+        after = jax.tree.map(arrive, after, values.leave, values.stay)
 
         # One node per row, so that no index occurs twice.
         def write(array: Array, new: Array, *index: Array) -> Array:
@@ -561,30 +630,33 @@ def _back_up(tree: Tree, descent: Descent, leaf: Leaf) -> Tree:
 
         tree = dataclasses.replace(
             tree,
-            q_values=write(tree.q_values, q_value, step.actions),
-            bounds=write(tree.bounds, low, step.actions),
+            q_values=write(tree.q_values, action.value, step.actions),
+            bounds=write(tree.bounds, action.bound, step.actions),
+            floors=write(tree.floors, action.floor, step.actions),
             values=write(tree.values, values.pack()),
         )
-        return level - 1, value, bound, tree
+        return level - 1, after, tree
 
-    start = (descent.level - 1, leaf.value, leaf.bound, tree)
-    tree = jax.lax.while_loop(lambda carry: carry[0] >= 0, ascend, vary_alike(start))[3]
+    start = (descent.level - 1, leaf.costs, tree)
+    tree = jax.lax.while_loop(lambda carry: carry[0] >= 0, ascend, vary_alike(start))[2]
     # Link the child last, to the node that the descent left the graph from.
     parent = jnp.where(leaf.child == Tree.UNVISITED, tree.capacity, descent.node)
     at = (rows, parent, descent.action, descent.success.astype(jnp.int32))
     return dataclasses.replace(tree, children=tree.children.at[at].set(leaf.child, mode="drop", unique_indices=True))
 
 
-def _with_action(step: Path, q_value: Float32[Array, "B"], bound: Float32[Array, "B"]) -> NodeValues:
-    """What a node passes up once the action taken there has this Q and bound; ``step`` is one level of a path."""
+def _with_action(step: Path, action: Costs) -> NodeValues:
+    """What a node passes up once the action taken there costs this; ``step`` is one level of a path."""
     # The other kind of action is as it was; a descent touches one action of a node.
     before = NodeValues.unpack(step.values)
-    least, least_bound = jnp.minimum(step.rival, q_value), jnp.minimum(step.rival_bound, bound)
+    least = jax.tree.map(jnp.minimum, step.rival, action)
+
+    def of_kind(taken: Bool[Array, "B"], before: Costs) -> Costs:
+        return jax.tree.map(lambda new, old: jnp.where(taken, new, old), least, before)
+
     return NodeValues(
-        leave=jnp.where(step.inside, before.leave, least),
-        stay=jnp.where(step.inside, least, before.stay),
-        leave_bound=jnp.where(step.inside, before.leave_bound, least_bound),
-        stay_bound=jnp.where(step.inside, least_bound, before.stay_bound),
+        leave=of_kind(~step.inside, before.leave),
+        stay=of_kind(step.inside, before.stay),
         visits=before.visits + 1.0,
     )
 

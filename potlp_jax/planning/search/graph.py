@@ -26,53 +26,75 @@ PROBES: int = 8
 is then not shared between orders, which costs simulations but no correctness. At most half of the slots are taken, so
 that eight in a row are rare. No experiment on the number is recorded."""
 
+VALUE_COLUMNS: int = 7
+"""Numbers in a row of ``Tree.values``."""
+
 KEY_WORDS: int = 2
 """Words of a history's key in the hash table; the node's index follows them. Two of ten thousand histories of one tree
 share all 64 bits with a probability below 3e-12."""
 
 
 @struct.dataclass(kw_only=True)
+class Costs:
+    """Three estimates of one expected cost; ``floor <= bound <= value``.
+
+    Attributes:
+      value: with guesses as they are; what is believed.
+      bound: with every guess reduced by the search's optimism; where to look first.
+      floor: with every guess replaced by 0. Costs are not negative, so that the true cost is no lower.
+    """
+
+    value: Float32[Array, "*B"]
+    bound: Float32[Array, "*B"]
+    floor: Float32[Array, "*B"]
+
+    def low(self, certifies: Bool[Array, "..."]) -> Float32[Array, "..."]:
+        """What a descent minimises: the floor where the row certifies, elsewhere the bound."""
+        return jnp.where(certifies, self.floor, self.bound)
+
+
+@struct.dataclass(kw_only=True)
 class NodeValues:
     """What a node passes up, by kind of action: those that leave the unknown region, and those that stay inside.
 
-    Stored packed, one row of five numbers per node, so that a level of a descent reads them with one lookup.
+    Stored packed, one row of seven numbers per node, so that a level of a descent reads them with one lookup.
 
     Attributes:
-      leave: least Q of the actions that leave, without the pending cost; inf where there is none.
-      stay: least Q of the actions that stay inside.
-      leave_bound: least optimistic bound of the actions that leave, without the pending cost.
-      stay_bound: least optimistic bound of the actions that stay inside.
+      leave: least Q, bound and floor of the actions that leave, without the pending cost; inf where there is none.
+      stay: the same of the actions that stay inside.
       visits: descents that went on from the node.
     """
 
-    leave: Float32[Array, "*B"]
-    stay: Float32[Array, "*B"]
-    leave_bound: Float32[Array, "*B"]
-    stay_bound: Float32[Array, "*B"]
+    leave: Costs
+    stay: Costs
     visits: Float32[Array, "*B"]
 
-    def pack(self) -> Float32[Array, "*B 5"]:
+    def pack(self) -> Float32[Array, "*B 7"]:
         """As a row of ``Tree.values``."""
-        return jnp.stack([self.leave, self.stay, self.leave_bound, self.stay_bound, self.visits], axis=-1)
+        leave, stay = self.leave, self.stay
+        columns = [leave.value, stay.value, leave.bound, stay.bound, leave.floor, stay.floor, self.visits]
+        return jnp.stack(columns, axis=-1)
 
     @staticmethod
-    def unpack(row: Float32[Array, "*B 5"]) -> "NodeValues":
+    def unpack(row: Float32[Array, "*B 7"]) -> "NodeValues":
         """From rows of ``Tree.values``."""
         # The one place that knows the order of the columns, with `pack`.
-        leave, stay, leave_bound, stay_bound, visits = jnp.moveaxis(row, -1, 0)
-        return NodeValues(leave=leave, stay=stay, leave_bound=leave_bound, stay_bound=stay_bound, visits=visits)
+        leave, stay, leave_bound, stay_bound, leave_floor, stay_floor, visits = jnp.moveaxis(row, -1, 0)
+        return NodeValues(
+            leave=Costs(value=leave, bound=leave_bound, floor=leave_floor),
+            stay=Costs(value=stay, bound=stay_bound, floor=stay_floor),
+            visits=visits,
+        )
 
-    def on_arrival(
-        self, pending_cost: Float32[Array, "*B"], dead_end_cost: Float32[Array, "*B"]
-    ) -> tuple[Float32[Array, "*B"], Float32[Array, "*B"]]:
-        """Value and bound of a history that arrives at the node with this pending cost."""
+    def on_arrival(self, pending_cost: Float32[Array, "*B"], dead_end_cost: Float32[Array, "*B"]) -> Costs:
+        """Of a history that arrives at the node with this pending cost."""
 
         def least(leave: Array, stay: Array) -> Array:
             # Leaving pays the pending cost, staying inside does not. A node without any action is a dead end.
             best = jnp.minimum(pending_cost + leave, stay)
             return jnp.where(jnp.isinf(best), dead_end_cost, best)
 
-        return least(self.leave, self.stay), least(self.leave_bound, self.stay_bound)
+        return jax.tree.map(least, self.leave, self.stay)
 
 
 @struct.dataclass(kw_only=True)
@@ -84,13 +106,13 @@ class Tree:
 
     Attributes:
       q_values: expected cost of each action at each node, inf where it is not available.
-      bounds: the same with optimistic guesses; what the descent minimises. Never above ``q_values``.
+      bounds: the same with optimistic guesses. Never above ``q_values``.
+      floors: the same with guesses of 0: no policy costs less. Never above ``bounds``.
       chances: P_S of each action, given what is known at the node.
       success_costs: R_S of each action, given what is known at the node.
-      failure_values: guessed expected cost after each action's failure.
-      success_values: guessed expected cost after each action's success.
-      children: node reached by each action after ``FAILURE`` and after ``SUCCESS`` (``search.model``), or
-        ``UNVISITED``. Outcomes that satisfy the task have no node: their value is 0.
+      children: each action's outcomes, ``FAILURE`` and ``SUCCESS`` (``search.model``): the index of the outcome's node;
+        where it has none, a negative number that holds its guessed value (``as_guess``). Outcomes that satisfy the task
+        never have a node: their value is 0.
       values: packed ``NodeValues`` of each node.
       location: of the node's history, as in ``history.History``.
       state: of the node's history.
@@ -107,12 +129,11 @@ class Tree:
 
     q_values: Float32[Array, "*B N A"]
     bounds: Float32[Array, "*B N A"]
+    floors: Float32[Array, "*B N A"]
     chances: Float32[Array, "*B N A"]
     success_costs: Float32[Array, "*B N A"]
-    failure_values: Float32[Array, "*B N A"]
-    success_values: Float32[Array, "*B N A"]
     children: Int32[Array, "*B N A 2"]
-    values: Float32[Array, "*B N 5"]
+    values: Float32[Array, "*B N 7"]
     location: Int32[Array, "*B N"]
     state: Int32[Array, "*B N"]
     holds: UInt32[Array, "*B N S W"]
@@ -126,7 +147,7 @@ class Tree:
     status: UInt32[Array, "*B"]
 
     ROOT = 0
-    UNVISITED = -1
+    UNVISITED = -1  # in the hash table; as a child, any negative number
     Q_INCLUDES_PENDING_COST = False
 
     @property
@@ -161,10 +182,23 @@ class NewNode:
 
     q_values: Float32[Array, "*B A"]
     bounds: Float32[Array, "*B A"]
+    floors: Float32[Array, "*B A"]
     chances: Float32[Array, "*B A"]
     success_costs: Float32[Array, "*B A"]
-    failure_values: Float32[Array, "*B A"]
-    success_values: Float32[Array, "*B A"]
+    children: Int32[Array, "*B A 2"]
+
+
+def as_guess(value: Float32[Array, "*N"]) -> Int32[Array, "*N"]:
+    """A guessed value as an entry of ``Tree.children``: its bits with the sign set, so that it is no node's index.
+
+    An outcome has a node or a guess, never both, so that one word holds either.
+    """
+    return jax.lax.bitcast_convert_type(-jnp.abs(value), jnp.int32)
+
+
+def guess_in(child: Int32[Array, "*N"]) -> Float32[Array, "*N"]:
+    """The guessed value in an entry of ``Tree.children``; it means something only where the entry is negative."""
+    return jnp.abs(jax.lax.bitcast_convert_type(child, jnp.float32))
 
 
 def plant_tree(model: Model, root: NewNode, config: BestFirstConfig) -> Tree:
@@ -179,21 +213,20 @@ def plant_tree(model: Model, root: NewNode, config: BestFirstConfig) -> Tree:
       One tree per row.
     """
     # Nodes beyond `size` are never read, but inf keeps the spare node from ever looking cheap.
-    values = least_values(model, root.q_values, root.bounds, model.root)
+    values = least_values(model, Costs(value=root.q_values, bound=root.bounds, floor=root.floors), model.root)
     batch, actions = root.q_values.shape
 
-    def first(values: Array, fill: float = 0) -> Array:
+    def first(values: Array, fill: int | float = 0) -> Array:
         shape = (batch, config.capacity + 1, *values.shape[1:])
         return jnp.full(shape, fill, values.dtype).at[:, Tree.ROOT].set(values)
 
     return Tree(
         q_values=first(root.q_values, jnp.inf),
         bounds=first(root.bounds, jnp.inf),
+        floors=first(root.floors, jnp.inf),
         chances=first(root.chances),
         success_costs=first(root.success_costs),
-        failure_values=first(root.failure_values),
-        success_values=first(root.success_values),
-        children=jnp.full((batch, config.capacity + 1, actions, 2), Tree.UNVISITED, jnp.int32),
+        children=first(root.children, Tree.UNVISITED),
         values=first(values.pack()),
         location=first(model.root.location),
         state=first(model.root.state),
@@ -210,15 +243,12 @@ def plant_tree(model: Model, root: NewNode, config: BestFirstConfig) -> Tree:
     )
 
 
-def least_values(
-    model: Model, q_values: Float32[Array, "B A"], bounds: Float32[Array, "B A"], history: History
-) -> NodeValues:
+def least_values(model: Model, costs: Costs, history: History) -> NodeValues:
     """What a node that nothing has been seen below passes up.
 
     Args:
       model: the problems.
-      q_values: of the node of each row, inf where an action is not available.
-      bounds: likewise.
+      costs: of each action of the node of each row, ``[B, A]``, inf where an action is not available.
       history: of the node of each row; its location and state tell which actions stay inside.
 
     Returns:
@@ -226,14 +256,12 @@ def least_values(
     """
     inside = model.stays_inside(history.location, history.state)
 
-    def least(values: Array, kind: Bool[Array, "B A"]) -> Float32[Array, "B"]:
-        return least_of_each(jnp.where(kind, values, jnp.inf), jnp.inf)
+    def least(kind: Bool[Array, "B A"]) -> Costs:
+        return jax.tree.map(lambda values: least_of_each(jnp.where(kind, values, jnp.inf), jnp.inf), costs)
 
     return NodeValues(
-        leave=least(q_values, ~inside),
-        stay=least(q_values, inside),
-        leave_bound=least(bounds, ~inside),
-        stay_bound=least(bounds, inside),
+        leave=least(~inside),
+        stay=least(inside),
         visits=jnp.zeros(history.location.shape, jnp.float32),
     )
 
@@ -340,10 +368,10 @@ def add_node(
         tree,
         q_values=write(tree.q_values, node.q_values),
         bounds=write(tree.bounds, node.bounds),
+        floors=write(tree.floors, node.floors),
         chances=write(tree.chances, node.chances),
         success_costs=write(tree.success_costs, node.success_costs),
-        failure_values=write(tree.failure_values, node.failure_values),
-        success_values=write(tree.success_values, node.success_values),
+        children=write(tree.children, node.children),
         location=write(tree.location, history.location),
         state=write(tree.state, history.state),
         holds=write(tree.holds, history.holds),
@@ -355,5 +383,6 @@ def add_node(
     )
     # Read back what was written: XLA would compute rows that are still to be written anew for each minimum over them,
     # which made the search up to ten times slower (docs/results/dropped.md, "Search").
-    values = least_values(model, tree.q_values[rows, index], tree.bounds[rows, index], history)
+    costs = Costs(value=tree.q_values[rows, index], bound=tree.bounds[rows, index], floor=tree.floors[rows, index])
+    values = least_values(model, costs, history)
     return dataclasses.replace(tree, values=write(tree.values, values.pack())), values, added

@@ -3,9 +3,13 @@
 A simple rule is followed: take the action of least cost per chance of success. While attempts fail, one history follows
 another and no branch opens, so the expected cost of the rule is a sum along a single **chain** of failures, with exact
 knowledge of what has failed, exact path costs, and a dead end where no action remains. Each success along the chain is
-worth what the rule costs from there on with nothing known. Ordering by cost per chance is optimal for independent tests
-without path costs between them (Mitten 1960). With path costs the rule is a policy like any other, so that a guess is
-seldom too low.
+worth what the rule costs from there on with nothing known (``make_rule``). Where a failure closes conditions of later
+states of the automaton too, the problem is **coupled**, and that would forget what matters: there every node values its
+successes anew, with its own chances (``value_successes_anew``). What fails within a chain is still forgotten after its
+successes, so that guesses are too low where dead ends are expensive and conditions shared.
+
+Ordering by cost per chance is optimal for independent tests without path costs between them (Mitten 1960). With path
+costs the rule is a policy like any other, so that a guess is seldom too low in problems that are not coupled.
 
 Everything here has a leading batch axis, written out by hand: a chain is a loop of a few operations on all rows.
 
@@ -47,6 +51,8 @@ class Rule:
       after_success: guessed expected cost after each action's success, the cost that is then pending included; 0 where
         the success satisfies the task, and for finish.
       dead_end_cost: of each problem.
+      reach: ``[r, z, z']``: from z the rollout can get to z'.
+      coupled: True where what fails in one state of the automaton closes a condition of a later one.
     """
 
     path_costs: Float32[Array, "*R P A"]
@@ -55,6 +61,8 @@ class Rule:
     closes: Bool[Array, "*R A A"]
     after_success: Float32[Array, "*R A"]
     dead_end_cost: Float32[Array, "*R"]
+    reach: Bool[Array, "*R Z Z"]
+    coupled: Bool[Array, "*R"]
 
 
 @struct.dataclass(kw_only=True)
@@ -83,12 +91,14 @@ class _Chain:
     """Actions in the order in which the rule tries them as long as they fail, by level.
 
     Attributes:
+      levels: of the longest chain.
       action: the action; A where the chain has ended.
       cost: expected cost of its attempt, what follows its success included.
       chance: its P_S.
       rest: expected cost from this level on, given that all before have failed.
     """
 
+    levels: Int32[Array, ""]
     action: Int32[Array, "L N"]
     cost: Float32[Array, "L N"]
     chance: Float32[Array, "L N"]
@@ -155,12 +165,59 @@ def make_rule(
         product_states=product_states,
         failure_cost=rows.failure_cost,
         closes=closes,
-        # Until they are valued, successes lead nowhere.
-        after_success=jnp.where(rows.accepts, 0.0, dead_end_cost[:, None]).at[:, -1].set(0.0),
+        after_success=_unvalued(tables, dead_end_cost),
         dead_end_cost=dead_end_cost,
+        reach=reach,
+        coupled=_is_coupled(tables, closes, reach),
     )
-    real = (rows.from_state != NO_STATE).at[:, -1].set(True)
-    return _value_successes(rule, tables, jnp.where(real, chance, 0.0), success_cost, reach, length)
+    return _value_successes(rule, tables, chance, success_cost, length)
+
+
+def value_successes_anew(
+    rule: Rule,
+    tables: ActionTables,
+    chance: Float32[Array, "R A"],
+    success_cost: Float32[Array, "R A"],
+    length: int,
+) -> Rule:
+    """In coupled problems, the rule with its successes valued by what one history of each problem knows.
+
+    Order of operations: as in ``make_rule``, with the history's chances and costs in place of the root's; so what has
+    failed stays out of every chain. What fails within a chain is still forgotten after its successes.
+
+    Args:
+      rule: of the problems.
+      tables: of the problems.
+      chance: P_S of every action, given what the history knows; 0 where its condition has failed.
+      success_cost: R_S, likewise.
+      length: failures in a row that are followed.
+
+    Returns:
+      The rule; where a problem is not coupled, as it was.
+    """
+
+    def value_anew(rule: Rule) -> Rule:
+        unvalued = dataclasses.replace(rule, after_success=_unvalued(tables, rule.dead_end_cost))
+        anew = _value_successes(unvalued, tables, chance, success_cost, length)
+        own = jnp.where(rule.coupled[:, None], anew.after_success, rule.after_success)
+        return dataclasses.replace(rule, after_success=own)
+
+    # The batch pays for it only if one of its problems needs it.
+    return jax.lax.cond(jnp.any(rule.coupled), value_anew, lambda rule: rule, rule)
+
+
+def _unvalued(tables: ActionTables, dead_end_cost: Float32[Array, "R"]) -> Float32[Array, "R A"]:
+    """What successes are worth until they are valued: they lead nowhere, unless they satisfy the task."""
+    return jnp.where(tables.actions.accepts, 0.0, dead_end_cost[:, None]).at[:, -1].set(0.0)
+
+
+def _is_coupled(tables: ActionTables, closes: Bool[Array, "R A A"], reach: Bool[Array, "R Z Z"]) -> Bool[Array, "R"]:
+    """Whether a failure can close an action of another state that is reached from the failed one's."""
+    rows = tables.actions
+    states, problems = jnp.maximum(rows.from_state, 0), jnp.arange(closes.shape[0], dtype=jnp.int32)[:, None, None]
+    real = rows.from_state != NO_STATE
+    later = reach[problems, states[:, :, None], states[:, None, :]] & (states[:, :, None] != states[:, None, :])
+    return jnp.any(closes & later & real[:, :, None] & real[:, None, :], axis=(1, 2))
 
 
 def guess_outcomes(
@@ -190,7 +247,7 @@ def guess_outcomes(
       The guess after failure and the guess after success, the costs that are then pending included.
     """
     rows = jnp.arange(product_state.shape[0], dtype=jnp.int32)
-    # What has been learnt enters the chances and costs here. The values after successes stay those of the root.
+    # What has been learnt enters the chances and costs here.
     attempt_cost = _attempt_cost(rule, rows, chance, success_cost)
     starts = _Starts(
         problem=rows,
@@ -201,25 +258,28 @@ def guess_outcomes(
         attempt_cost=attempt_cost,
     )
     chain = _follow_chain(rule, starts, length)
-    # An action that the chain does not contain leaves it whole.
-    whole = jnp.broadcast_to(chain.rest[0][:, None], available.shape)
-    without = whole.at[rows[None, :], chain.action].set(_costs_without(chain), mode="drop", unique_indices=True)
+    without = _costs_without(chain, available.shape[1])
     return without + _cost_to_begin_elsewhere(rule, starts, chain), rule.after_success
 
 
-def _costs_without(chain: _Chain) -> Float32[Array, "L N"]:
-    """Expected cost of each chain with the action of one level left out."""
+def _costs_without(chain: _Chain, actions: int) -> Float32[Array, "N A"]:
+    """Expected cost of each chain with one action left out."""
+    count = chain.action.shape[1]
+    number = jnp.arange(count, dtype=jnp.int32)
 
-    def skip(carry, level):
+    def skip(level, carry):
         # What the levels before cost, and then the rest of the chain behind the level that is left out.
-        spent, reached = carry
+        spent, reached, without = carry
         left_out = spent + rounded_product(reached, chain.rest[level + 1])
+        # Where a chain has ended the index is A, and the write is dropped.
+        without = without.at[number, chain.action[level]].set(left_out, mode="drop", unique_indices=True)
         spent += rounded_product(reached, chain.cost[level])
-        return (spent, reached * (1.0 - chain.chance[level])), left_out
+        return spent, reached * (1.0 - chain.chance[level]), without
 
-    levels, count = chain.action.shape
-    nothing_yet = jnp.zeros((count,), jnp.float32), jnp.ones((count,), jnp.float32)
-    return jax.lax.scan(skip, vary_alike(nothing_yet, chain), jnp.arange(levels, dtype=jnp.int32))[1]
+    # An action that the chain does not contain leaves it whole.
+    whole = jnp.broadcast_to(chain.rest[0][:, None], (count, actions))
+    start = jnp.zeros((count,), jnp.float32), jnp.ones((count,), jnp.float32), whole
+    return jax.lax.fori_loop(0, chain.levels, skip, vary_alike(start, chain))[2]
 
 
 def _cost_to_begin_elsewhere(rule: Rule, starts: _Starts, chain: _Chain) -> Float32[Array, "R A"]:
@@ -277,17 +337,18 @@ def _value_successes(
     tables: ActionTables,
     chance: Float32[Array, "R A"],
     success_cost: Float32[Array, "R A"],
-    reach: Bool[Array, "R Z Z"],
     length: int,
 ) -> Rule:
     """Fill in ``after_success``: a chain from every subgoal, for one edge of every problem at a time."""
     count, actions = rule.product_states.shape
-    states, subgoals = reach.shape[1], tables.distance.shape[1] - 1
+    states, subgoals = rule.reach.shape[1], tables.distance.shape[1] - 1
     edges = (actions - 1) // max(subgoals, 1)
     # No subgoals or no edges: finish alone.
     if edges == 0:
         return rule
-    order = _order_of_successes(tables, reach, subgoals, edges)
+    order = _order_of_successes(tables, rule.reach, subgoals, edges)
+    real = (tables.actions.from_state != NO_STATE).at[:, -1].set(True)
+    chance = jnp.where(real, chance, 0.0)
     # The batch runs as long as the problem with most edges to value.
     todo = jnp.max(jnp.sum(~order.is_final, axis=1, dtype=jnp.int32))
     # One chain per problem and subgoal, all subgoals of one problem side by side.
@@ -351,15 +412,16 @@ def _follow_chain(rule: Rule, starts: _Starts, length: int) -> _Chain:
         vary_alike(walk, rule),
     )
 
-    def add(rest, level):
+    def add(step: Int32[Array, ""], rest: Float32[Array, "L1 N"]) -> Float32[Array, "L1 N"]:
         # From the chain's end backward. Levels that a chain did not reach cost nothing and cannot succeed.
-        rest = walk.cost[level] + rounded_product(1.0 - walk.chance[level], rest)
-        return rest, rest
+        level = walk.level - 1 - step
+        below = walk.cost[level] + rounded_product(1.0 - walk.chance[level], rest[level + 1])
+        return jax.lax.dynamic_update_index_in_dim(rest, below, level, 0)
 
     # A chain that is cut, or that has no action left, ends at a dead end.
-    end = rule.dead_end_cost[starts.problem]
-    _, rest = jax.lax.scan(add, end, jnp.arange(length, dtype=jnp.int32), reverse=True)
-    return _Chain(action=walk.action, cost=walk.cost, chance=walk.chance, rest=jnp.concatenate([rest, end[None]]))
+    end = jnp.broadcast_to(rule.dead_end_cost[starts.problem], (length + 1, count))
+    rest = jax.lax.fori_loop(0, walk.level, add, vary_alike(end, rule))
+    return _Chain(levels=walk.level, action=walk.action, cost=walk.cost, chance=walk.chance, rest=rest)
 
 
 def _fail_once(rule: Rule, starts: _Starts, walk: _Walk) -> _Walk:

@@ -77,7 +77,7 @@ class _TreeViewer:
     def _visits(self, index: int, action: int) -> int:
         if index == Tree.ROOT:
             return int(self._root_visits[action])
-        reached = [int(child) for child in self._children[index, action] if child != Tree.UNVISITED]
+        reached = [int(child) for child in self._children[index, action] if child >= 0]
         return sum(int(self._node_visits[child]) for child in reached)
 
     def _action(
@@ -115,7 +115,7 @@ class _TreeViewer:
             satisfied = {"value": 0.0, "visits": 0, "accepting": True, "dead_end": False, "actions": []}
             return {"value": 0.0, "node": {**self._where(after), **satisfied}}
         child = int(self._children[index, action, int(success)])
-        if child == Tree.UNVISITED:
+        if child < 0:
             return {"value": None, "node": None}
         node = self.node(child, after, depth - 1)
         return {"value": node["value"], "node": node}

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, UInt32
 
+from potlp_jax.native import by_platform
 from potlp_jax.planning.problem import PlanningProblem, screen
 from potlp_jax.planning.search.plan import Plan
 from potlp_jax.planning.sharding import vary_alike
@@ -31,6 +32,7 @@ class SearchMethod:
       is_open: ``(context, tree) -> bool [B]``: whether more simulations can change anything.
       simulate: ``(context, tree, config) -> tree``: one descent of every row that is open; others stay as they are.
       choose: ``(context, tree) -> plan``.
+      kernel: the same search as one call on CPU, where there is one.
     """
 
     tree: type
@@ -39,10 +41,31 @@ class SearchMethod:
     is_open: Callable[..., Any]
     simulate: Callable[..., Any]
     choose: Callable[..., Plan]
+    kernel: "SearchKernel | None" = None
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchKernel:
+    """A search in native code that gives the plans of a ``SearchMethod``.
+
+    Attributes:
+      library: that holds it (``potlp_jax.native``).
+      fits: ``(problems) -> bool``: whether it takes problems of these shapes.
+      run: ``(problems, trees or None, config, with_trees) -> (plan, trees or None)``.
+    """
+
+    library: str
+    fits: Callable[[PlanningProblem], bool]
+    run: Callable[..., tuple[Plan, Any]]
 
 
 def run_search(
-    search: SearchMethod, config: Any, problems: PlanningProblem, seeds: UInt32[Array, "B 2"], trees: Any
+    search: SearchMethod,
+    config: Any,
+    problems: PlanningProblem,
+    seeds: UInt32[Array, "B 2"],
+    trees: Any,
+    with_trees: bool = True,
 ) -> tuple[Plan, Any]:
     """Search a batch of problems; ``jax.vmap`` of this adds its axis to the batch.
 
@@ -52,19 +75,22 @@ def run_search(
       problems: every leaf has the leading axis B.
       seeds: two random words per row.
       trees: of an earlier search of the same problems, to go on with; None to begin.
+      with_trees: whether the trees are wanted.
 
     Returns:
-      Plans and trees with the leading axis B.
+      Plans and trees with the leading axis B; None for trees that are not wanted.
     """
     leaves, structure = jax.tree.flatten(problems)
-    kernel = _routed_kernel(search, config, structure, len(leaves))
+    kernel = _routed_kernel(search, config, structure, len(leaves), with_trees)
     arrays = kernel(seeds, *leaves, *([] if trees is None else _arrays_of(trees)))
     count = len(dataclasses.fields(Plan))
-    return _from_arrays(Plan, arrays[:count]), _from_arrays(search.tree, arrays[count:])
+    return _from_arrays(Plan, arrays[:count]), _from_arrays(search.tree, arrays[count:]) if with_trees else None
 
 
 @functools.lru_cache(maxsize=64)
-def _routed_kernel(search: SearchMethod, config: Any, structure: Any, leaf_count: int) -> Callable[..., Any]:
+def _routed_kernel(
+    search: SearchMethod, config: Any, structure: Any, leaf_count: int, with_trees: bool
+) -> Callable[..., Any]:
     """The search on flat lists of arrays with a leading batch axis; vmap merges its own axis into that one.
 
     Flat lists, because the rule of a ``custom_vmap`` receives and returns flags in the structure of its arguments, and
@@ -78,8 +104,8 @@ def _routed_kernel(search: SearchMethod, config: Any, structure: Any, leaf_count
         leaves, trees = arrays[:leaf_count], arrays[leaf_count:]
         problems = jax.tree.unflatten(structure, leaves)
         tree = _from_arrays(search.tree, trees) if trees else None
-        plan, tree = _search_batch(problems, seeds, tree, search=search, config=config)
-        return _arrays_of(plan) + _arrays_of(tree)
+        plan, tree = _search_batch(problems, seeds, tree, search=search, config=config, with_trees=with_trees)
+        return _arrays_of(plan) + (_arrays_of(tree) if with_trees else [])
 
     # Called where the caller's vmap is traced, which may be outside of the library's own functions.
     @kernel.def_vmap
@@ -99,8 +125,35 @@ def _routed_kernel(search: SearchMethod, config: Any, structure: Any, leaf_count
     return kernel
 
 
-@functools.partial(jax.jit, static_argnames=("search", "config"))
+@functools.partial(jax.jit, static_argnames=("search", "config", "with_trees"))
 def _search_batch(
+    problems: PlanningProblem,
+    seeds: UInt32[Array, "B 2"],
+    tree: Any,
+    *,
+    search: SearchMethod,
+    config: Any,
+    with_trees: bool,
+) -> tuple[Plan, Any]:
+    """By the search's kernel on CPU, where it has one that can be used; otherwise in lockstep."""
+
+    def in_lockstep(problems: PlanningProblem, seeds: UInt32[Array, "B 2"], tree: Any) -> tuple[Plan, Any]:
+        plan, tree = _search_in_lockstep(problems, seeds, tree, search=search, config=config)
+        return plan, tree if with_trees else None
+
+    kernel = search.kernel
+    if kernel is None or not kernel.fits(problems):
+        return in_lockstep(problems, seeds, tree)
+
+    def natively(problems: PlanningProblem, seeds: UInt32[Array, "B 2"], tree: Any) -> tuple[Plan, Any]:
+        # A search that has a kernel draws nothing.
+        del seeds
+        return kernel.run(problems, tree, config, with_trees)
+
+    return by_platform(kernel.library, natively, in_lockstep, problems, seeds, tree)
+
+
+def _search_in_lockstep(
     problems: PlanningProblem, seeds: UInt32[Array, "B 2"], tree: Any, *, search: SearchMethod, config: Any
 ) -> tuple[Plan, Any]:
     """Simulate until no row is open or the simulations are spent, then choose."""

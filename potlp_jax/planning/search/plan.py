@@ -25,11 +25,13 @@ class Plan:
       visits: simulations that began with each action.
       optimism_gap: fraction of ``value`` by which it would fall if every guess that it rests on were too high by the
         search's optimism (``BestFirstConfig``). Above 0 it is **no bound on the error**: it looks down only, a guess
-        may also be too low, and it may be too high by more than the optimism. 0 says two things. More simulations
-        change nothing. And if the optimism is not 0, ``value`` rests on no guess: it is what the plan's own policy
-        costs, so that the optimum is no higher, but it may be lower. With an optimism of 1 and no overflow in
-        ``status`` it is then the optimum. inf from ``UctConfig``, which has no bounds. ``planning.exact`` gives
-        certified intervals.
+        may also be too low, and it may be too high by more than the optimism. 0 says, if the optimism is not 0, that
+        ``value`` rests on no guess: it is what the plan's own policy costs, so that the optimum is no higher. inf from
+        ``UctConfig``, which has no bounds.
+      lower_bound: certified: the optimum is no lower, up to rounding, unless ``status`` has ``DEPTH_OVERFLOW``. Where
+        ``optimism_gap`` is 0 the optimum lies between it and ``value``. Where it equals ``value`` the search has ended,
+        and ``value`` is the optimum (proof: ``search.best_first``). -inf from ``UctConfig``. ``planning.exact`` gives
+        tighter intervals, on the host.
       status: bits of ``types.Status``.
     """
 
@@ -41,6 +43,7 @@ class Plan:
     q_values: Float32[Array, "*B A"]
     visits: Int32[Array, "*B A"]
     optimism_gap: Float32[Array, "*B"]
+    lower_bound: Float32[Array, "*B"]
     status: UInt32[Array, "*B"]
 
 
@@ -50,6 +53,7 @@ def plan_of_least_score(
     q_values: Float32[Array, "B A"],
     visits: Int32[Array, "B A"],
     root_bound: Float32[Array, "B"],
+    root_floor: Float32[Array, "B"],
     status: UInt32[Array, "B"],
 ) -> Plan:
     """The plan that takes the action of least score at the root, ties by lowest index.
@@ -60,6 +64,7 @@ def plan_of_least_score(
       q_values: expected cost of each action at the root, inf where it is not available.
       visits: simulations that began with each action.
       root_bound: optimistic value of the root, -inf where the search has none.
+      root_floor: certified lower bound of the root's value, -inf where the search has none.
       status: bits set during the search.
 
     Returns:
@@ -90,5 +95,6 @@ def plan_of_least_score(
         q_values=q_values,
         visits=visits,
         optimism_gap=jnp.where(available, gap, 0.0),
+        lower_bound=jnp.where(available, root_floor, value),
         status=status | ended,
     )

@@ -248,7 +248,7 @@ def choose(context: Context, tree: UctTree) -> Plan:
     # The most visited one, not the one of least mean: a mean over few rollouts may be low by chance.
     score = jnp.where(jnp.isinf(q_values), jnp.inf, -tree.root_visits.astype(jnp.float32))
     no_bound = jnp.full(score.shape[:1], -jnp.inf, jnp.float32)
-    return plan_of_least_score(context.model, score, q_values, tree.root_visits, no_bound, tree.status)
+    return plan_of_least_score(context.model, score, q_values, tree.root_visits, no_bound, no_bound, tree.status)
 
 
 UCT = SearchMethod(tree=UctTree, prepare=prepare, plant=plant, is_open=is_open, simulate=simulate, choose=choose)

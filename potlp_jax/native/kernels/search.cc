@@ -1,0 +1,1351 @@
+// Best-first search on bounds over a graph of histories: the twin of potlp_jax/planning/search/best_first.py.
+//
+// The whole search of a row of a batch in one call, with the same operations in the same order, so that plans are equal
+// bit for bit; the Python modules say why things are as they are. What differs is what is left out: actions that are
+// padding or that no rollout can reach have no entries, and a node has entries for its available actions alone.
+//
+// Names are those of the twin: R_S success_cost, R_F failure_cost, a product state is location * Z + state.
+
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <vector>
+
+#include "rows.h"
+#include "xla/ffi/api/ffi.h"
+
+namespace ffi = xla::ffi;
+
+namespace {
+
+using Set = uint32_t;
+
+constexpr float kInf = INFINITY;
+constexpr float kCostLimit = 1e30f;
+constexpr float kNegligible = 1e-3f;   // guess.NEGLIGIBLE
+constexpr int kPasses = 4;             // guess.PASSES
+constexpr float kLeastGuess = 1e-4f;   // best_first.LEAST_GUESS
+constexpr int kProbes = 8;             // graph.PROBES
+constexpr int kNone = -1;              // NO_STATE, NO_SUBGOAL, NO_ACTION, NO_CLASS, NOWHERE, UNVISITED
+constexpr uint32_t kTreeOverflow = 2, kDepthOverflow = 4, kDeadEnd = 8, kAcceptingRoot = 16, kInvalid = 512;
+constexpr size_t kKeptEntries = size_t{1} << 20;  // Memory that a thread keeps from one search to the next.
+
+// best_first.OPTIMISM, FEW_ACTIONS, OPTIMISM_OF_FEW come as attributes, so that they are written once.
+struct Settings {
+  int64_t simulations, max_depth, capacity, slots, guess_failures, few_actions;
+  float optimism, optimism_of_few, default_optimism;
+};
+
+struct Shape {
+  int64_t S, Z, E, C, M, K, A;
+};
+
+// One row of the problems' arrays.
+struct Arrays {
+  const bool *accepting, *state_mask;
+  const int32_t* edges;
+  const bool* edge_mask;
+  const int32_t* edge_condition;
+  const bool* class_mask;
+  const int32_t* condition_classes;
+  const bool *condition_mask, *implies;
+  const float *travel, *finish, *success_probability, *success_cost, *failure_cost;
+  int32_t dfa_state;
+  const bool* subgoal_mask;
+  float dead_end_cost;
+};
+
+// One row of the arrays of a tree (graph.Tree); holds, fails and visited have one word.
+struct TreeArrays {
+  float *q_values, *bounds, *floors, *chances, *success_costs;
+  int32_t* children;
+  float* values;
+  int32_t *location, *state;
+  uint32_t *holds, *fails, *visited;
+  int32_t *table, *root_visits, *size, *simulations, *steps;
+  uint32_t* status;
+};
+
+struct PlanArrays {
+  int32_t *action, *subgoal, *from_state, *to_state;
+  float *value, *q_values;
+  int32_t* visits;
+  float *optimism_gap, *lower_bound;
+  uint32_t* status;
+};
+
+// Eight lanes at a time: compilers do not vectorise a minimum of floats by themselves, because of NaN.
+typedef float Lanes __attribute__((vector_size(32)));
+
+inline Lanes load(const float* values) {
+  Lanes lanes;
+  std::memcpy(&lanes, values, sizeof lanes);
+  return lanes;
+}
+
+inline float lesser(float first, float second) { return first < second ? first : second; }
+
+inline float least_of(const float* values, int count) {
+  float least = kInf;
+  int i = 0;
+  if (count >= 8) {
+    Lanes lanes = load(values);
+    for (i = 8; i + 8 <= count; i += 8) {
+      const Lanes next = load(values + i);
+      lanes = next < lanes ? next : lanes;
+    }
+    for (int lane = 0; lane < 8; ++lane) least = lesser(lanes[lane], least);
+  }
+  for (; i < count; ++i) least = lesser(values[i], least);
+  return least;
+}
+
+inline int first_at_most(const float* values, int count, float least) {
+  int i = 0;
+  while (i < count && !(values[i] <= least)) ++i;
+  return i;
+}
+
+inline uint32_t mix(uint32_t bits) {
+  bits = (bits ^ (bits >> 16)) * 0x85EBCA6Bu;
+  bits = (bits ^ (bits >> 13)) * 0xC2B2AE35u;
+  return bits ^ (bits >> 16);
+}
+
+inline int32_t as_guess(float value) {
+  const float negative = -std::fabs(value);
+  int32_t bits;
+  std::memcpy(&bits, &negative, sizeof bits);
+  return bits;
+}
+
+inline float guess_in(int32_t child) {
+  float value;
+  std::memcpy(&value, &child, sizeof value);
+  return std::fabs(value);
+}
+
+struct Costs {
+  float value, bound, floor;
+
+  float low(bool certifies) const { return certifies ? floor : bound; }
+};
+
+struct NodeValues {
+  Costs leave, stay;
+  float visits;
+
+  Costs on_arrival(float pending_cost, float dead_end_cost) const {
+    const auto least = [&](float leave, float stay) {
+      const float best = lesser(pending_cost + leave, stay);
+      return std::isinf(best) ? dead_end_cost : best;
+    };
+    return {least(leave.value, stay.value), least(leave.bound, stay.bound), least(leave.floor, stay.floor)};
+  }
+};
+
+// An action that is real and that a rollout can get to; the last one is finish.
+struct Action {
+  int id;  // in the problem
+  int subgoal, from_state, to_state, product_state;
+  bool accepts;
+  float failure_cost, chance, success_cost;  // with nothing known
+  Set condition, forward, backward, end;
+};
+
+struct Node {
+  int first, count;             // its entries
+  int stay_begin, stay_end;     // those that stay inside, counted from `first`
+  int location, state;
+  NodeValues values;
+};
+
+struct History {
+  int location, state;
+  float pending_cost;
+  std::vector<Set> holds, fails, visited;
+};
+
+// Actions with what a chain of failures needs of them; `chain` takes them in the order of the problem.
+struct Candidates {
+  std::vector<int> action, product_state;
+  std::vector<float> attempt_cost, inverse_chance, chance;
+
+  void clear() {
+    action.clear();
+    product_state.clear();
+    attempt_cost.clear();
+    inverse_chance.clear();
+    chance.clear();
+  }
+  int size() const { return static_cast<int>(action.size()); }
+};
+
+struct Chain {
+  std::vector<int> position;
+  std::vector<float> cost, chance, rest;
+  int length;
+};
+
+struct Level {
+  int node, entry;
+  bool inside;
+  NodeValues before;
+  Costs base, rival;
+  float weight, pending_cost;
+};
+
+class Search {
+ public:
+  void run(const Shape& shape, const Settings& settings, const Arrays& arrays, const TreeArrays* tree, bool resumes,
+           const PlanArrays& plan) {
+    shape_ = shape;
+    settings_ = settings;
+    in_ = arrays;
+    prepare();
+    if (resumes) {
+      read_tree(*tree);
+    } else {
+      plant();
+    }
+    for (int64_t count = 0; count < settings_.simulations && is_open(); ++count) simulate();
+    choose(plan);
+    if (tree != nullptr) write_tree(*tree);
+    forget();
+  }
+
+ private:
+  // ---- What stays the same during a search --------------------------------------------------------------------------
+
+  void prepare() {
+    const int S = shape_.S, Z = shape_.Z, E = shape_.E;
+    screen();
+    dead_end_cost_ = invalid_ ? kInf : in_.dead_end_cost;
+    start_ = invalid_ ? 0 : in_.dfa_state;
+    state_accepts_.assign(Z, 0);
+    for (int z = 0; z < Z; ++z) state_accepts_[z] = in_.accepting[z] && in_.state_mask[z] && !invalid_;
+    int subgoals = 0, edges = 0;
+    for (int s = 0; s < S; ++s) subgoals += subgoal_real_[s];
+    for (int e = 0; e < E; ++e) edges += in_.edge_mask[e];
+    const bool few = subgoals * edges + 1 <= settings_.few_actions;
+    // Negative where the configuration names none.
+    optimism_ = settings_.optimism >= 0 ? settings_.optimism : few ? settings_.optimism_of_few : settings_.default_optimism;
+    relate_states(subgoals > 0);
+    list_conditions();
+    list_actions();
+    coupled_ = is_coupled();
+    order_edges();
+    rows_.assign((S + 1) * Z, PathRow{});
+    path_costs_.resize((S + 1) * Z * actions_.size());
+    // The rule values successes with the chances of the root, where nothing is known.
+    const int count = actions_.size();
+    all_chance_.resize(count);
+    all_cost_.resize(count);
+    for (int k = 0; k < count; ++k) {
+      all_chance_[k] = actions_[k].chance;
+      all_cost_[k] = actions_[k].success_cost;
+    }
+    value_successes(after_root_);
+  }
+
+  // problem.screen: one wrong value among those that count makes the row a dead end. Also collects between which states
+  // paths lead, because both look at every path cost.
+  void screen() {
+    const int S = shape_.S, Z = shape_.Z, C = shape_.C;
+    const int32_t state = in_.dfa_state;
+    bool wrong = !(state >= 0 && state < Z && in_.state_mask[state]);
+    wrong |= !(in_.dead_end_cost > 0 && in_.dead_end_cost < kCostLimit);
+    Set states = 0;
+    for (int z = 0; z < Z; ++z) states |= Set{in_.state_mask[z]} << z;
+    reach_.assign(Z, 0);
+    for (int u = 0; u <= S; ++u) {
+      if (u < S && !in_.subgoal_mask[u]) continue;
+      for (int z = 0; z < Z; ++z) {
+        if (!in_.state_mask[z]) continue;
+        wrong |= !is_path_cost(in_.finish[u * Z + z]);
+        for (int s = 0; s < S; ++s) {
+          if (!in_.subgoal_mask[s]) continue;
+          const float* costs = in_.travel + ((int64_t{u} * Z + z) * S + s) * Z;
+          Set finite = 0, right = 0;
+          for (int to = 0; to < Z; ++to) {
+            finite |= Set{costs[to] < kCostLimit} << to;
+            right |= Set{is_path_cost(costs[to])} << to;
+          }
+          reach_[z] |= finite & states;
+          wrong |= (~right & states) != 0;
+        }
+      }
+    }
+    for (int s = 0; s < S; ++s) {
+      if (!in_.subgoal_mask[s]) continue;
+      for (int c = 0; c < C; ++c) {
+        if (!in_.class_mask[c]) continue;
+        const float chance = in_.success_probability[s * C + c], success = in_.success_cost[s * C + c];
+        const float failure = in_.failure_cost[s * C + c];
+        wrong |= !(chance >= 0 && chance <= 1) || !(success > 0 && success < kCostLimit);
+        wrong |= !(failure >= 0 && failure < kCostLimit);
+      }
+    }
+    invalid_ = wrong;
+    subgoal_real_.assign(S, 0);
+    for (int s = 0; s < S; ++s) subgoal_real_[s] = in_.subgoal_mask[s] && !wrong;
+  }
+
+  static bool is_path_cost(float value) { return (value >= 0 && value < kCostLimit) || value == kInf; }
+
+  // best_first._reachable_states; `reach_` holds the states that paths lead to.
+  void relate_states(bool any_subgoal) {
+    const int Z = shape_.Z;
+    Set attempted = 0;
+    for (int e = 0; e < shape_.E; ++e) {
+      if (in_.edge_mask[e] && any_subgoal) attempted |= Set{1} << in_.edges[2 * e];
+    }
+    for (int z = 0; z < Z; ++z) reach_[z] = (invalid_ ? 0 : reach_[z] & attempted) | Set{1} << z;
+    for (int e = 0; e < shape_.E; ++e) {
+      if (in_.edge_mask[e] && any_subgoal) reach_[in_.edges[2 * e]] |= Set{1} << in_.edges[2 * e + 1];
+    }
+    for (int via = 0; via < Z; ++via) {
+      for (int z = 0; z < Z; ++z) {
+        if (reach_[z] >> via & 1) reach_[z] |= reach_[via];
+      }
+    }
+    cyclic_ = false;
+    for (int z = 0; z < Z; ++z) {
+      for (int to = 0; to < Z; ++to) cyclic_ |= z != to && (reach_[z] >> to & 1) && (reach_[to] >> z & 1);
+    }
+  }
+
+  bool leads(int from, int to) const { return reach_[from] >> to & 1; }
+
+  // Implications between conditions, cubes of those that have several, and what matters from each state on.
+  void list_conditions() {
+    const int M = shape_.M, C = shape_.C, K = shape_.K, Z = shape_.Z;
+    forward_of_.assign(M, 0);
+    backward_of_.assign(M, 0);
+    for (int a = 0; a < M; ++a) {
+      for (int b = 0; b < M; ++b) {
+        if (!in_.implies[a * M + b]) continue;
+        forward_of_[a] |= Set{1} << b;
+        backward_of_[b] |= Set{1} << a;
+      }
+    }
+    compound_ = false;
+    cubes_of_.assign(M - C, 0);
+    for (int q = 0; q < M - C; ++q) {
+      compound_ |= in_.condition_mask[C + q];
+      for (int k = 0; k < K; ++k) {
+        const int32_t cube = in_.condition_classes[(C + q) * K + k];
+        if (cube >= 0) cubes_of_[q] |= Set{1} << cube;
+      }
+    }
+    bool any_subgoal = false;
+    for (const uint8_t real : subgoal_real_) any_subgoal |= real != 0;
+    relevant_.assign(Z, compound_ ? ~Set{0} : Set{0});
+    for (int e = 0; e < shape_.E; ++e) {
+      if (!in_.edge_mask[e] || !any_subgoal) continue;
+      for (int z = 0; z < Z; ++z) {
+        if (leads(z, in_.edges[2 * e])) relevant_[z] |= Set{1} << condition_of(e);
+      }
+    }
+  }
+
+  int condition_of(int edge) const { return std::max<int32_t>(in_.edge_condition[edge], 0); }
+
+  // Those that a rollout can get to; the others would be available nowhere.
+  void list_actions() {
+    const int S = shape_.S, Z = shape_.Z, E = shape_.E, K = shape_.K;
+    actions_.clear();
+    cube_probability_.clear();
+    cube_cost_.clear();
+    cube_bits_.clear();
+    action_at_.assign(S * E, kNone);
+    for (int s = 0; s < S; ++s) {
+      for (int e = 0; e < E && subgoal_real_[s]; ++e) {
+        const int from = in_.edges[2 * e], to = in_.edges[2 * e + 1], condition = condition_of(e);
+        if (!in_.edge_mask[e] || !leads(start_, from)) continue;
+        action_at_[s * E + e] = actions_.size();
+        Action action{};
+        action.id = s * E + e;
+        action.subgoal = s;
+        action.from_state = from;
+        action.to_state = to;
+        action.product_state = s * Z + from;
+        action.accepts = state_accepts_[to];
+        action.condition = Set{1} << condition;
+        action.forward = forward_of_[condition];
+        action.backward = backward_of_[condition];
+        action.end = Set{1} << to;
+        action.failure_cost = list_cubes(s, condition);
+        actions_.push_back(action);
+      }
+    }
+    Action finish{};
+    finish.id = S * E;
+    finish.subgoal = S;
+    finish.from_state = finish.product_state = kNone;
+    finish.to_state = 0;
+    while (finish.to_state + 1 < Z && !state_accepts_[finish.to_state]) ++finish.to_state;
+    if (!state_accepts_[finish.to_state]) finish.to_state = 0;
+    finish.accepts = state_accepts_[finish.to_state];
+    finish.end = Set{1} << finish.to_state;
+    for (int k = 0; k < K; ++k) add_cube(k == 0 ? 1.0f : 0.0f, k == 0 ? 0.0f : kInf, 0);
+    actions_.push_back(finish);
+    for (size_t k = 0; k < actions_.size(); ++k) knowledge_terms(k, 0, 0, actions_[k].chance, actions_[k].success_cost);
+  }
+
+  void add_cube(float probability, float cost, Set bits) {
+    cube_probability_.push_back(probability);
+    cube_cost_.push_back(cost);
+    cube_bits_.push_back(bits);
+  }
+
+  // Adds a condition's cubes in order of R_S at a subgoal; cubes of equal cost keep the task's order. Gives R_F.
+  float list_cubes(int subgoal, int condition) {
+    const int K = shape_.K, C = shape_.C, begin = cube_cost_.size();
+    float failure = 0;
+    for (int k = 0; k < K; ++k) {
+      const int32_t cube = in_.condition_classes[condition * K + k];
+      if (cube < 0) {
+        add_cube(0, kInf, 0);
+        continue;
+      }
+      // Entries of absent classes may hold anything.
+      const bool real = in_.class_mask[cube];
+      const int at = subgoal * C + cube;
+      failure = std::max(failure, real ? in_.failure_cost[at] : 0.0f);
+      add_cube(real ? in_.success_probability[at] : 0.0f, real ? in_.success_cost[at] : 1.0f, Set{1} << cube);
+    }
+    for (int end = begin + 1; end < begin + K; ++end) {
+      for (int i = end; i > begin && cube_cost_[i] < cube_cost_[i - 1]; --i) {
+        std::swap(cube_cost_[i], cube_cost_[i - 1]);
+        std::swap(cube_probability_[i], cube_probability_[i - 1]);
+        std::swap(cube_bits_[i], cube_bits_[i - 1]);
+      }
+    }
+    return failure;
+  }
+
+  // guess._is_coupled, of the actions that a rollout can get to and of those that it cannot alike.
+  bool is_coupled() const {
+    for (int a = 0; a < shape_.E; ++a) {
+      for (int b = 0; b < shape_.E; ++b) {
+        if (!in_.edge_mask[a] || !in_.edge_mask[b]) continue;
+        const int from = in_.edges[2 * a], later = in_.edges[2 * b];
+        const bool closes = backward_of_[condition_of(a)] >> condition_of(b) & 1;
+        if (closes && from != later && leads(from, later)) return true;
+      }
+    }
+    return false;
+  }
+
+  // guess._order_of_successes: edges that end nearest to acceptance first, without those that need no value.
+  void order_edges() {
+    edge_order_.clear();
+    for (int depth = 0; depth <= shape_.Z; ++depth) {
+      for (int e = 0; e < shape_.E; ++e) {
+        const int to = in_.edges[2 * e + 1];
+        const bool counts = in_.edge_mask[e] && !state_accepts_[to] && leads(start_, in_.edges[2 * e]);
+        if (counts && __builtin_popcount(reach_[to]) == depth) edge_order_.push_back(e);
+      }
+    }
+  }
+
+  const float* path_costs(int product_state) {
+    const int count = actions_.size(), Z = shape_.Z;
+    float* costs = path_costs_.data() + int64_t{product_state} * count;
+    if (rows_[product_state].made) return costs;
+    rows_[product_state].made = true;
+    const int u = product_state / Z, z = product_state % Z;
+    const bool real = (u == shape_.S || subgoal_real_[u] != 0) && in_.state_mask[z] && !invalid_;
+    const float* travel = in_.travel + int64_t{product_state} * shape_.S * Z;
+    for (int k = 0; k + 1 < count; ++k) {
+      const Action& action = actions_[k];
+      const bool counts = real && in_.state_mask[action.from_state];
+      costs[k] = counts ? travel[action.subgoal * Z + action.from_state] : kInf;
+    }
+    costs[count - 1] = real ? in_.finish[product_state] : kInf;
+    return costs;
+  }
+
+  // Actions that a path leads to from a product state, and those that go on inside.
+  const std::vector<int>& candidates(int product_state) {
+    PathRow& row = rows_[product_state];
+    if (!row.listed) {
+      const float* costs = path_costs(product_state);
+      row.listed = true;
+      for (int k = 0; k < static_cast<int>(actions_.size()); ++k) {
+        if (actions_[k].product_state == product_state || costs[k] < kInf) row.candidates.push_back(k);
+      }
+    }
+    return row.candidates;
+  }
+
+  // ---- What a history knows -----------------------------------------------------------------------------------------
+
+  // history.knowledge_terms; gives whether the action's condition is known to hold.
+  bool knowledge_terms(int k, Set holds, Set fails, float& chance_out, float& cost_out) const {
+    const int K = shape_.K;
+    const bool certain = holds & actions_[k].condition;
+    float probability = 0, cost = kInf;
+    for (int i = k * K; i < (k + 1) * K; ++i) {
+      const Set bits = cube_bits_[i];
+      const float cube_cost = cube_cost_[i];
+      const bool failed = fails & bits;
+      const float chance = holds & bits ? 1.0f : failed ? 0.0f : cube_probability_[i];
+      const float share = (1.0f - probability) * chance;
+      const float total = probability + share;
+      const bool first = probability == 0 && (chance > 0 || (std::isinf(cost) && !failed));
+      if (first) {
+        cost = cube_cost;
+      } else if (share > 0) {
+        cost = (cost * probability + cube_cost * share) / (total > 0 ? total : 1.0f);
+      }
+      probability = first ? chance : total;
+    }
+    chance_out = certain ? 1.0f : probability;
+    cost_out = std::isinf(cost) ? 0.0f : cost;
+    return certain;
+  }
+
+  Set propagate_failures(Set fails) const {
+    const int count = cubes_of_.size(), C = shape_.C;
+    for (int round = 0; round < count; ++round) {
+      for (int q = 0; q < count; ++q) {
+        if (in_.condition_mask[C + q] && (cubes_of_[q] & ~fails) == 0) fails |= backward_of_[C + q];
+      }
+    }
+    return fails;
+  }
+
+  // history.step_row: `history_` becomes what it is after an action.
+  void step(const Action& action, bool success) {
+    const bool somewhere = action.subgoal < static_cast<int>(shape_.S);
+    Set holds = somewhere ? history_.holds[action.subgoal] : 0, fails = somewhere ? history_.fails[action.subgoal] : 0;
+    const bool certain = holds & action.condition;
+    if (success) {
+      holds |= action.forward;
+    } else {
+      fails |= action.backward;
+    }
+    if (!cubes_of_.empty()) {
+      fails = propagate_failures(fails);
+      // A condition holds if its failure would refute what is known to hold.
+      Set known = 0;
+      for (int m = 0; holds != 0 && m < static_cast<int>(shape_.M); ++m) {
+        if (propagate_failures(fails | backward_of_[m]) & holds) known |= Set{1} << m;
+      }
+      holds = known;
+    }
+    if (somewhere) {
+      history_.holds[action.subgoal] = holds;
+      history_.fails[action.subgoal] = fails;
+    }
+    history_.location = action.subgoal;
+    history_.state = success ? action.to_state : action.from_state;
+    // Having learnt something, the rollout may go anywhere again.
+    if (!certain) std::fill(history_.visited.begin(), history_.visited.end(), 0);
+    history_.visited[action.subgoal] |= Set{1} << history_.state;
+  }
+
+  // ---- Guesses ------------------------------------------------------------------------------------------------------
+
+  void add_candidate(Candidates& list, int k, float chance, float success_cost, const std::vector<float>& after) const {
+    list.action.push_back(k);
+    list.product_state.push_back(actions_[k].product_state);
+    list.chance.push_back(chance);
+    list.inverse_chance.push_back(1.0f / chance);
+    const float succeeds = chance * (success_cost + after[k]);
+    list.attempt_cost.push_back(succeeds + (1.0f - chance) * actions_[k].failure_cost);
+  }
+
+  // guess._value_successes, with the chances and costs of all actions in `all_chance_` and `all_cost_`.
+  void value_successes(std::vector<float>& after) {
+    const int count = actions_.size(), S = shape_.S, E = shape_.E, Z = shape_.Z;
+    after.resize(count);
+    for (int k = 0; k < count; ++k) after[k] = actions_[k].accepts ? 0.0f : dead_end_cost_;
+    after[count - 1] = 0;
+    new_values_.resize(S);
+    for (int pass = 0; pass < (cyclic_ ? kPasses : 1); ++pass) {
+      for (const int edge : edge_order_) {
+        const int to = in_.edges[2 * edge + 1];
+        valued_.clear();
+        for (int k = 0; k < count; ++k) {
+          const bool counts = k == count - 1 || leads(to, actions_[k].from_state);
+          if (counts && all_chance_[k] > 0) add_candidate(valued_, k, all_chance_[k], all_cost_[k], after);
+        }
+        for (int s = 0; s < S; ++s) {
+          if (!subgoal_real_[s]) continue;
+          follow(valued_, s * Z + to, all_cost_[action_at_[s * E + edge]]);
+          new_values_[s] = chain_.rest[0];
+        }
+        // All at once: no value of this edge enters another one of it.
+        for (int s = 0; s < S; ++s) {
+          if (subgoal_real_[s]) after[action_at_[s * E + edge]] = new_values_[s];
+        }
+      }
+    }
+  }
+
+  // guess._follow_chain: the action of least cost per chance, as long as all fail.
+  void follow(const Candidates& list, int product_state, float pending_cost) {
+    const int count = list.size(), most = settings_.guess_failures;
+    inverse_ = list.inverse_chance;
+    ratio_.resize(count);
+    chain_.position.clear();
+    chain_.cost.clear();
+    chain_.chance.clear();
+    float reached = 1;
+    bool active = true;
+    for (chain_.length = 0; active && chain_.length < most; ++chain_.length) {
+      const float* costs = path_costs(product_state);
+      for (int i = 0; i < count; ++i) {
+        const float away = costs[list.action[i]] + pending_cost;
+        const float distance = list.product_state[i] == product_state ? 0.0f : away;
+        const float ratio = (distance + list.attempt_cost[i]) * inverse_[i];
+        ratio_[i] = inverse_[i] == kInf ? kInf : ratio;
+      }
+      const float least = least_of(ratio_.data(), count);
+      if (std::isinf(least)) break;
+      const int taken = first_at_most(ratio_.data(), count, least);
+      const Action& action = actions_[list.action[taken]];
+      const float chance = list.chance[taken];
+      chain_.position.push_back(taken);
+      chain_.cost.push_back(least * chance);
+      chain_.chance.push_back(chance);
+      reached *= 1.0f - chance;
+      active = reached > kNegligible;
+      close_failed(list, taken, action);
+      product_state = action.product_state;
+      pending_cost = action.failure_cost;
+    }
+    chain_.rest.resize(chain_.length + 1);
+    chain_.rest[chain_.length] = dead_end_cost_;
+    for (int level = chain_.length - 1; level >= 0; --level) {
+      chain_.rest[level] = chain_.cost[level] + (1.0f - chain_.chance[level]) * chain_.rest[level + 1];
+    }
+  }
+
+  // Takes out what fails with an action; actions of one subgoal lie side by side.
+  void close_failed(const Candidates& list, int taken, const Action& action) {
+    const auto closes = [&](int i) {
+      const Action& other = actions_[list.action[i]];
+      if (other.subgoal != action.subgoal) return false;
+      if (action.backward & other.condition) inverse_[i] = kInf;
+      return true;
+    };
+    for (int i = taken; i >= 0 && closes(i); --i) continue;
+    for (int i = taken + 1; i < list.size() && closes(i); ++i) continue;
+  }
+
+  // guess._costs_without and _cost_to_begin_elsewhere: the guess after each candidate's failure, into `without_`.
+  void guess_failures(const Candidates& list) {
+    const int count = list.size();
+    without_.assign(count, chain_.rest[0]);
+    float spent = 0, reached = 1;
+    for (int level = 0; level < chain_.length; ++level) {
+      without_[chain_.position[level]] = spent + reached * chain_.rest[level + 1];
+      spent += reached * chain_.cost[level];
+      reached *= 1.0f - chain_.chance[level];
+    }
+    if (chain_.length == 0) return;
+    const int first = chain_.position[0], start = list.action[first];
+    const float cost_here = chain_.cost[0] - list.attempt_cost[first];
+    for (int i = 0; i < count; ++i) {
+      if (i == first) continue;
+      const Action& action = actions_[list.action[i]];
+      float cost_there = path_costs(std::max(action.product_state, 0))[start] + action.failure_cost;
+      if (action.product_state == actions_[start].product_state) cost_there = 0;
+      if (std::isinf(cost_there)) cost_there = cost_here;
+      without_[i] += cost_there - cost_here;
+    }
+  }
+
+  // ---- Nodes --------------------------------------------------------------------------------------------------------
+
+  // best_first._new_node: the entries of `history_` behind all others.
+  Node new_node() {
+    Node node{};
+    node.first = q_.size();
+    node.location = history_.location;
+    node.state = history_.state;
+    list_available(node);
+    const int count = node.count = list_.size();
+    const std::vector<float>& after = coupled_ ? after_ : after_root_;
+    follow(list_, node.location * shape_.Z + node.state, history_.pending_cost);
+    guess_failures(list_);
+    const float least = kLeastGuess * dead_end_cost_, doubt = 1.0f - optimism_;
+    const size_t size = node.first + count;
+    for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) values->resize(size);
+    child_.resize(2 * size);
+    entry_action_.resize(size);
+    for (int i = 0; i < count; ++i) {
+      const int k = list_.action[i], at = node.first + i;
+      const Action& action = actions_[k];
+      const float chance = list_.chance[i], success_cost = score_[i];
+      const float after_failure = std::max(without_[i], least);
+      const float after_success = action.accepts ? 0.0f : std::max(after[k], least);
+      float known = path_[i] + chance * success_cost;
+      known += (1.0f - chance) * action.failure_cost;
+      const float guessed = chance * after_success + (1.0f - chance) * after_failure;
+      q_[at] = known + guessed;
+      bound_[at] = known + doubt * guessed;
+      floor_[at] = known;
+      chance_[at] = chance;
+      success_cost_[at] = success_cost;
+      child_[2 * at] = as_guess(after_failure);
+      child_[2 * at + 1] = as_guess(after_success);
+      entry_action_[at] = k;
+    }
+    const auto least_of_kinds = [&](const std::vector<float>& values, float& leave, float& stay) {
+      const float* own = values.data() + node.first;
+      leave = least_leaving(node, own);
+      stay = least_of(own + node.stay_begin, node.stay_end - node.stay_begin);
+    };
+    least_of_kinds(q_, node.values.leave.value, node.values.stay.value);
+    least_of_kinds(bound_, node.values.leave.bound, node.values.stay.bound);
+    least_of_kinds(floor_, node.values.leave.floor, node.values.stay.floor);
+    return node;
+  }
+
+  static float least_leaving(const Node& node, const float* own) {
+    return lesser(least_of(own, node.stay_begin), least_of(own + node.stay_end, node.count - node.stay_end));
+  }
+
+  // history.terms_of_all: available actions of `history_` into `list_`, their path costs into `path_`, R_S into `score_`.
+  void list_available(Node& node) {
+    const int product_state = node.location * shape_.Z + node.state, S = shape_.S;
+    list_.clear();
+    path_.clear();
+    score_.clear();
+    if (coupled_) value_anew();
+    const std::vector<float>& after = coupled_ ? after_ : after_root_;
+    node.stay_begin = node.stay_end = 0;
+    if (state_accepts_[node.state]) return;
+    const float* costs = path_costs(product_state);
+    for (const int k : candidates(product_state)) {
+      const Action& action = actions_[k];
+      const int s = action.subgoal;
+      float chance = action.chance, success_cost = action.success_cost;
+      if (s < S && (history_.holds[s] | history_.fails[s]) != 0) {
+        const bool certain = knowledge_terms(k, history_.holds[s], history_.fails[s], chance, success_cost);
+        // A rollout that repeats what it knows, and ends where it has been, would go round in circles for ever.
+        if (certain && (history_.visited[s] & action.end)) continue;
+      }
+      if (!(chance > 0)) continue;
+      const bool inside = action.product_state == product_state;
+      if (inside && node.stay_begin == node.stay_end) node.stay_begin = list_.size();
+      add_candidate(list_, k, chance, success_cost, after);
+      path_.push_back(inside ? 0.0f : costs[k]);
+      score_.push_back(success_cost);
+      if (inside) node.stay_end = list_.size();
+    }
+    if (node.stay_begin == node.stay_end) node.stay_begin = node.stay_end = list_.size();
+  }
+
+  // guess.value_successes_anew: by what `history_` knows.
+  void value_anew() {
+    const int S = shape_.S;
+    for (size_t k = 0; k < actions_.size(); ++k) {
+      const int s = actions_[k].subgoal;
+      const bool somewhere = s < S;
+      knowledge_terms(k, somewhere ? history_.holds[s] : 0, somewhere ? history_.fails[s] : 0, all_chance_[k],
+                      all_cost_[k]);
+    }
+    value_successes(after_);
+  }
+
+  void plant() {
+    const int S = shape_.S;
+    history_.location = S;
+    history_.state = start_;
+    history_.pending_cost = 0;
+    history_.holds.assign(S, 0);
+    history_.fails.assign(S, 0);
+    history_.visited.assign(S + 1, 0);
+    history_.visited[S] = Set{1} << start_;
+    table_.assign((settings_.slots + kProbes) * 3, kNone);
+    root_visits_.assign(actions_.size(), 0);
+    simulations_ = steps_ = 0;
+    status_ = 0;
+    keep(new_node());
+  }
+
+  // Adds the node that `history_` has just been given.
+  void keep(const Node& node) {
+    nodes_.push_back(node);
+    holds_.insert(holds_.end(), history_.holds.begin(), history_.holds.end());
+    fails_.insert(fails_.end(), history_.fails.begin(), history_.fails.end());
+    visited_.insert(visited_.end(), history_.visited.begin(), history_.visited.end());
+  }
+
+  void recall(int node, float pending_cost) {
+    const int S = shape_.S;
+    history_.location = nodes_[node].location;
+    history_.state = nodes_[node].state;
+    history_.pending_cost = pending_cost;
+    history_.holds.assign(holds_.begin() + int64_t{node} * S, holds_.begin() + (int64_t{node} + 1) * S);
+    history_.fails.assign(fails_.begin() + int64_t{node} * S, fails_.begin() + (int64_t{node} + 1) * S);
+    history_.visited.assign(visited_.begin() + int64_t{node} * (S + 1), visited_.begin() + (int64_t{node} + 1) * (S + 1));
+  }
+
+  // graph._key of `history_`.
+  void make_key(uint32_t key[2]) const {
+    const int S = shape_.S;
+    const Set usable = relevant_[history_.state];
+    const uint32_t position = mix(static_cast<uint32_t>(history_.location * 64 + history_.state) + 0x2545F491u);
+    uint32_t visited = 0;
+    for (int u = 0; u <= S; ++u) visited += mix(history_.visited[u] ^ mix(static_cast<uint32_t>(u) + 0x51ED270Bu));
+    const uint32_t salts[2] = {0x9E3779B9u, 0xC2B2AE3Du};
+    for (int word = 0; word < 2; ++word) {
+      const uint32_t salt = salts[word];
+      uint32_t total = visited;
+      for (int s = 0; s < S; ++s) {
+        const uint32_t holds = mix((history_.holds[s] & usable) + static_cast<uint32_t>(s) * salt);
+        total += mix(holds ^ ((history_.fails[s] & usable) * 0x85EBCA77u + salt));
+      }
+      key[word] = mix((total ^ position) * (salt | 1) + position);
+    }
+  }
+
+  // ---- Simulations --------------------------------------------------------------------------------------------------
+
+  Costs root_costs() const { return nodes_[0].values.on_arrival(0, dead_end_cost_); }
+
+  bool is_open() const {
+    const Costs root = root_costs();
+    return root.value > root.floor;
+  }
+
+  // Where a descent is (best_first.Descent).
+  struct Descent {
+    int node = 0, entry = 0;
+    float pending_cost = 0;
+    bool active = true, success = false, expands = false, accepted = false;
+  };
+
+  void simulate() {
+    const Costs root = root_costs();
+    const bool certifies = root.value <= root.bound;
+    Descent descent;
+    levels_.clear();
+    for (int64_t level = 0; descent.active && level < settings_.max_depth; ++level) {
+      descend_once(descent, certifies, level + 1 >= settings_.max_depth);
+    }
+    int child = kNone;
+    const Costs leaf = expand(descent, child);
+    back_up(leaf);
+    // Linked last, to the node that the descent left the graph from.
+    if (child != kNone) child_[2 * (nodes_[descent.node].first + descent.entry) + descent.success] = child;
+    if (levels_.empty()) return;
+    root_visits_[entry_action_[nodes_[0].first + levels_[0].entry]] += 1;
+    simulations_ += 1;
+    steps_ += levels_.size();
+  }
+
+  void descend_once(Descent& descent, bool certifies, bool is_last) {
+    const Node& node = nodes_[descent.node];
+    const int entry = select(node, (certifies ? floor_ : bound_).data() + node.first, descent.pending_cost);
+    if (entry == kNone) {
+      // A dead end.
+      descent.active = false;
+      return;
+    }
+    const int at = node.first + entry;
+    const Action& action = actions_[entry_action_[at]];
+    Level level;
+    level.node = descent.node;
+    level.entry = entry;
+    level.inside = entry >= node.stay_begin && entry < node.stay_end;
+    level.before = node.values;
+    level.rival = {least_without(node, entry, level.inside, q_), least_without(node, entry, level.inside, bound_),
+                   least_without(node, entry, level.inside, floor_)};
+    level.pending_cost = descent.pending_cost;
+    const int product_state = node.location * shape_.Z + node.state;
+    const float path_cost = level.inside ? 0.0f : path_costs(product_state)[entry_action_[at]];
+    // Follow the outcome that contributes more to the gap.
+    const float chance = chance_[at], success_cost = success_cost_[at], failure_cost = action.failure_cost;
+    const Costs after_success = outcome_costs(child_[2 * at + 1], success_cost, is_last);
+    const Costs after_failure = outcome_costs(child_[2 * at], failure_cost, is_last);
+    const float success_gap = chance * (after_success.value - after_success.low(certifies));
+    const float failure_gap = (1.0f - chance) * (after_failure.value - after_failure.low(certifies));
+    // Nothing is to be learnt from satisfying the task, and a certain success cannot fail.
+    const bool success = (success_gap >= failure_gap && !action.accepts) || chance >= 1.0f;
+    float known = path_cost + chance * success_cost;
+    known += (1.0f - chance) * failure_cost;
+    level.weight = success ? chance : 1.0f - chance;
+    const float rest = success ? 1.0f - chance : chance;
+    const Costs& other = success ? after_failure : after_success;
+    level.base = {known + rest * other.value, known + rest * other.bound, known + rest * other.floor};
+    levels_.push_back(level);
+    const int child = child_[2 * at + success];
+    descent.entry = entry;
+    descent.success = success;
+    descent.accepted = success && action.accepts;
+    descent.expands = !descent.accepted && child < 0;
+    descent.active = !descent.accepted && child >= 0;
+    if (!descent.accepted) descent.pending_cost = success ? success_cost : failure_cost;
+    if (descent.active) descent.node = child;
+  }
+
+  // The entry of least bound or floor, ties by lowest index; only actions that leave pay the pending cost.
+  static int select(const Node& node, const float* low, float pending_cost) {
+    const int begin = node.stay_begin, end = node.stay_end;
+    const float least = lesser(least_leaving(node, low) + pending_cost, least_of(low + begin, end - begin));
+    if (std::isinf(least)) return kNone;
+    int i = 0;
+    for (; i < begin; ++i) {
+      if (low[i] + pending_cost <= least) return i;
+    }
+    for (; i < end; ++i) {
+      if (low[i] <= least) return i;
+    }
+    while (low[i] + pending_cost > least) ++i;
+    return i;
+  }
+
+  // Least of the other entries of the same kind.
+  static float least_without(const Node& node, int entry, bool inside, std::vector<float>& values) {
+    float* own = values.data() + node.first;
+    const float kept = own[entry];
+    own[entry] = kInf;
+    const float least =
+        inside ? least_of(own + node.stay_begin, node.stay_end - node.stay_begin) : least_leaving(node, own);
+    own[entry] = kept;
+    return least;
+  }
+
+  Costs outcome_costs(int child, float pending_cost, bool is_last) const {
+    if (child < 0) {
+      const float guess = guess_in(child);
+      return {guess, (1.0f - optimism_) * guess, 0.0f};
+    }
+    return closed_where(is_last, nodes_[child].values.on_arrival(pending_cost, dead_end_cost_));
+  }
+
+  static Costs closed_where(bool cut, const Costs& costs) {
+    return cut ? Costs{costs.value, costs.value, costs.value} : costs;
+  }
+
+  // Adds the node that the descent reached, or finds it; `child` is to be linked.
+  Costs expand(const Descent& descent, int& child) {
+    if (descent.accepted) return {0, 0, 0};
+    if (!descent.expands) {
+      if (descent.active) status_ |= kDepthOverflow;
+      return closed_where(descent.active, nodes_[descent.node].values.on_arrival(descent.pending_cost, dead_end_cost_));
+    }
+    recall(descent.node, descent.pending_cost);
+    step(actions_[entry_action_[nodes_[descent.node].first + descent.entry]], descent.success);
+    uint32_t key[2];
+    make_key(key);
+    const int64_t first = key[0] & (settings_.slots - 1);
+    int64_t slot = kNone;
+    for (int probe = kProbes - 1; probe >= 0; --probe) {
+      const int32_t* entry = table_.data() + 3 * (first + probe);
+      if (entry[2] == kNone) {
+        slot = first + probe;
+      } else if (static_cast<uint32_t>(entry[0]) == key[0] && static_cast<uint32_t>(entry[1]) == key[1]) {
+        child = std::max(child, entry[2]);
+      }
+    }
+    if (child != kNone) return nodes_[child].values.on_arrival(descent.pending_cost, dead_end_cost_);
+    const Node node = new_node();
+    if (static_cast<int64_t>(nodes_.size()) < settings_.capacity) {
+      child = nodes_.size();
+      keep(node);
+      // Where all slots are taken the node is not shared between orders.
+      if (slot != kNone) {
+        const int32_t entry[3] = {static_cast<int32_t>(key[0]), static_cast<int32_t>(key[1]), child};
+        std::copy(entry, entry + 3, table_.data() + 3 * slot);
+      }
+    } else {
+      status_ |= kTreeOverflow;
+      drop_entries(node.first);
+    }
+    return node.values.on_arrival(descent.pending_cost, dead_end_cost_);
+  }
+
+  void drop_entries(size_t size) {
+    for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) values->resize(size);
+    child_.resize(2 * size);
+    entry_action_.resize(size);
+  }
+
+  void back_up(Costs after) {
+    for (auto level = levels_.rbegin(); level != levels_.rend(); ++level) {
+      const auto action = [&](float base, float below) { return base + level->weight * below; };
+      const Costs costs{action(level->base.value, after.value), action(level->base.bound, after.bound),
+                        action(level->base.floor, after.floor)};
+      Node& node = nodes_[level->node];
+      NodeValues values = level->before;
+      (level->inside ? values.stay : values.leave) = {lesser(level->rival.value, costs.value),
+                                                      lesser(level->rival.bound, costs.bound),
+                                                      lesser(level->rival.floor, costs.floor)};
+      values.visits += 1;
+      const float pending = level->pending_cost;
+      after = {lesser(pending + values.leave.value, values.stay.value),
+               lesser(pending + values.leave.bound, values.stay.bound),
+               lesser(pending + values.leave.floor, values.stay.floor)};
+      const int at = node.first + level->entry;
+      q_[at] = costs.value;
+      bound_[at] = costs.bound;
+      floor_[at] = costs.floor;
+      node.values = values;
+    }
+  }
+
+  // ---- Results ------------------------------------------------------------------------------------------------------
+
+  void choose(const PlanArrays& plan) const {
+    const Node& root = nodes_[0];
+    const Costs costs = root_costs();
+    std::fill(plan.q_values, plan.q_values + shape_.A, kInf);
+    std::fill(plan.visits, plan.visits + shape_.A, 0);
+    for (int at = root.first; at < root.first + root.count; ++at) {
+      const int k = entry_action_[at];
+      plan.q_values[actions_[k].id] = q_[at];
+      plan.visits[actions_[k].id] = root_visits_[k];
+    }
+    const float* own = q_.data() + root.first;
+    const float least = least_of(own, root.count);
+    const bool available = !std::isinf(least), accepted = state_accepts_[start_];
+    float value = available ? least : dead_end_cost_;
+    if (accepted) value = 0;
+    *plan.action = *plan.subgoal = *plan.from_state = *plan.to_state = kNone;
+    if (available) {
+      const Action& action = actions_[entry_action_[root.first + first_at_most(own, root.count, least)]];
+      *plan.action = action.id;
+      if (action.subgoal < static_cast<int>(shape_.S)) {
+        *plan.subgoal = action.subgoal;
+        *plan.from_state = action.from_state;
+        *plan.to_state = action.to_state;
+      }
+    }
+    *plan.value = value;
+    *plan.optimism_gap = available ? (value - costs.bound) / (value > 0 ? value : 1.0f) : 0.0f;
+    *plan.lower_bound = available ? costs.floor : value;
+    *plan.status = status_ | (accepted ? kAcceptingRoot : available ? 0 : kDeadEnd);
+    if (invalid_) *plan.status = kInvalid;
+  }
+
+  // Nodes that are not in use are as `graph.plant_tree` leaves them, and so is what belongs to unavailable actions.
+  void write_tree(const TreeArrays& tree) const {
+    const int64_t rows = settings_.capacity + 1, S = shape_.S, A = shape_.A, nodes = nodes_.size();
+    for (float* costs : {tree.q_values, tree.bounds, tree.floors}) std::fill(costs, costs + rows * A, kInf);
+    for (float* terms : {tree.chances, tree.success_costs}) std::fill(terms, terms + rows * A, 0.0f);
+    std::fill(tree.children, tree.children + rows * A * 2, kNone);
+    std::fill(tree.values + nodes * 7, tree.values + rows * 7, 0.0f);
+    for (int32_t* place : {tree.location, tree.state}) std::fill(place + nodes, place + rows, 0);
+    for (uint32_t* known : {tree.holds, tree.fails}) std::fill(known + nodes * S, known + rows * S, 0);
+    std::fill(tree.visited + nodes * (S + 1), tree.visited + rows * (S + 1), 0);
+    std::copy(holds_.begin(), holds_.end(), tree.holds);
+    std::copy(fails_.begin(), fails_.end(), tree.fails);
+    std::copy(visited_.begin(), visited_.end(), tree.visited);
+    for (int64_t n = 0; n < nodes; ++n) {
+      const Node& node = nodes_[n];
+      for (int at = node.first; at < node.first + node.count; ++at) {
+        const int64_t entry = n * A + actions_[entry_action_[at]].id;
+        tree.q_values[entry] = q_[at];
+        tree.bounds[entry] = bound_[at];
+        tree.floors[entry] = floor_[at];
+        tree.chances[entry] = chance_[at];
+        tree.success_costs[entry] = success_cost_[at];
+        std::copy(child_.data() + 2 * at, child_.data() + 2 * at + 2, tree.children + 2 * entry);
+      }
+      const NodeValues& own = node.values;
+      const float values[7] = {own.leave.value, own.stay.value,  own.leave.bound, own.stay.bound,
+                               own.leave.floor, own.stay.floor, own.visits};
+      std::copy(values, values + 7, tree.values + n * 7);
+      tree.location[n] = node.location;
+      tree.state[n] = node.state;
+    }
+    std::copy(table_.begin(), table_.end(), tree.table);
+    std::fill(tree.root_visits, tree.root_visits + A, 0);
+    for (size_t k = 0; k < actions_.size(); ++k) tree.root_visits[actions_[k].id] = root_visits_[k];
+    *tree.size = nodes;
+    *tree.simulations = simulations_;
+    *tree.steps = steps_;
+    *tree.status = status_;
+  }
+
+  void read_tree(const TreeArrays& tree) {
+    const int64_t S = shape_.S, A = shape_.A, nodes = *tree.size;
+    history_.holds.resize(S);
+    history_.fails.resize(S);
+    history_.visited.resize(S + 1);
+    holds_.assign(tree.holds, tree.holds + nodes * S);
+    fails_.assign(tree.fails, tree.fails + nodes * S);
+    visited_.assign(tree.visited, tree.visited + nodes * (S + 1));
+    for (int64_t n = 0; n < nodes; ++n) {
+      Node node{};
+      node.first = q_.size();
+      node.location = tree.location[n];
+      node.state = tree.state[n];
+      const float* own = tree.values + n * 7;
+      node.values = {{own[0], own[2], own[4]}, {own[1], own[3], own[5]}, own[6]};
+      read_entries(tree, n * A, node);
+      nodes_.push_back(node);
+    }
+    table_.assign(tree.table, tree.table + (settings_.slots + kProbes) * 3);
+    root_visits_.resize(actions_.size());
+    for (size_t k = 0; k < actions_.size(); ++k) root_visits_[k] = tree.root_visits[actions_[k].id];
+    simulations_ = *tree.simulations;
+    steps_ = *tree.steps;
+    status_ = *tree.status;
+  }
+
+  void read_entries(const TreeArrays& tree, int64_t row, Node& node) {
+    const int product_state = node.location * shape_.Z + node.state;
+    for (size_t k = 0; k < actions_.size(); ++k) {
+      const int64_t entry = row + actions_[k].id;
+      if (std::isinf(tree.q_values[entry])) continue;
+      const bool inside = actions_[k].product_state == product_state;
+      if (inside && node.stay_begin == node.stay_end) node.stay_begin = node.count;
+      node.count += 1;
+      if (inside) node.stay_end = node.count;
+      q_.push_back(tree.q_values[entry]);
+      bound_.push_back(tree.bounds[entry]);
+      floor_.push_back(tree.floors[entry]);
+      chance_.push_back(tree.chances[entry]);
+      success_cost_.push_back(tree.success_costs[entry]);
+      child_.insert(child_.end(), tree.children + 2 * entry, tree.children + 2 * entry + 2);
+      entry_action_.push_back(k);
+    }
+    if (node.stay_begin == node.stay_end) node.stay_begin = node.stay_end = node.count;
+  }
+
+  // Empties the graph; a large one gives its memory back.
+  void forget() {
+    const bool large = q_.size() > kKeptEntries;
+    for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) empty(*values, large);
+    empty(child_, large);
+    empty(entry_action_, large);
+    empty(nodes_, large);
+    empty(table_, large);
+    for (auto* sets : {&holds_, &fails_, &visited_}) empty(*sets, large);
+  }
+
+  template <typename T>
+  static void empty(std::vector<T>& values, bool large) {
+    values.clear();
+    if (large) values.shrink_to_fit();
+  }
+
+  Shape shape_;
+  Settings settings_;
+  Arrays in_;
+
+  // What stays the same during a search.
+  bool invalid_, coupled_, cyclic_, compound_;
+  float dead_end_cost_, optimism_;
+  int start_;
+  std::vector<uint8_t> subgoal_real_, state_accepts_;
+  std::vector<Set> reach_;
+  std::vector<Action> actions_;
+  std::vector<float> cube_probability_, cube_cost_;
+  std::vector<Set> cube_bits_, forward_of_, backward_of_, cubes_of_, relevant_;
+  std::vector<int> edge_order_, action_at_;
+  std::vector<float> after_root_;
+  struct PathRow {
+    bool made, listed;
+    std::vector<int> candidates;
+  };
+  std::vector<PathRow> rows_;
+  std::vector<float> path_costs_;
+
+  // The graph.
+  std::vector<Node> nodes_;
+  std::vector<Set> holds_, fails_, visited_;
+  std::vector<float> q_, bound_, floor_, chance_, success_cost_;
+  std::vector<int32_t> child_;
+  std::vector<int> entry_action_;
+  std::vector<int32_t> table_, root_visits_;
+  int32_t simulations_, steps_;
+  uint32_t status_;
+
+  // Used anew by every simulation.
+  History history_;
+  std::vector<Level> levels_;
+  Candidates list_, valued_;
+  Chain chain_;
+  std::vector<float> ratio_, inverse_, path_, score_, after_, all_chance_, all_cost_, new_values_, without_;
+};
+
+// One array of a batch: the row of every array lies behind that of the row before.
+template <typename T>
+struct Batched {
+  T* first;
+  int64_t length;
+
+  T* row(int64_t index) const { return first + index * length; }
+};
+
+// Takes a call's arguments or results in order.
+class Reader {
+ public:
+  Reader(const ffi::RemainingArgs& arguments, int64_t batch) : arguments_(arguments), batch_(batch) {}
+
+  template <typename T>
+  Batched<const T> next() {
+    const ffi::AnyBuffer buffer = arguments_.get<ffi::AnyBuffer>(index_++).value();
+    return {static_cast<const T*>(buffer.untyped_data()), static_cast<int64_t>(buffer.element_count()) / batch_};
+  }
+
+ private:
+  const ffi::RemainingArgs& arguments_;
+  int64_t batch_;
+  size_t index_ = 0;
+};
+
+class Writer {
+ public:
+  Writer(const ffi::RemainingRets& results, int64_t batch) : results_(results), batch_(batch) {}
+
+  template <typename T>
+  Batched<T> next() {
+    ffi::Result<ffi::AnyBuffer> buffer = results_.get<ffi::AnyBuffer>(index_++).value();
+    return {static_cast<T*>(buffer->untyped_data()), static_cast<int64_t>(buffer->element_count()) / batch_};
+  }
+
+ private:
+  const ffi::RemainingRets& results_;
+  int64_t batch_;
+  size_t index_ = 0;
+};
+
+// In the order of `native.PROBLEM_FIELDS`.
+struct ProblemBatch {
+  Batched<const bool> accepting, state_mask;
+  Batched<const int32_t> edges;
+  Batched<const bool> edge_mask;
+  Batched<const int32_t> edge_condition;
+  Batched<const bool> class_mask;
+  Batched<const int32_t> condition_classes;
+  Batched<const bool> condition_mask, implies;
+  Batched<const float> travel, finish, success_probability, success_cost, failure_cost;
+  Batched<const int32_t> dfa_state;
+  Batched<const bool> subgoal_mask;
+  Batched<const float> dead_end_cost;
+
+  explicit ProblemBatch(Reader in)
+      : accepting(in.next<bool>()), state_mask(in.next<bool>()), edges(in.next<int32_t>()), edge_mask(in.next<bool>()),
+        edge_condition(in.next<int32_t>()), class_mask(in.next<bool>()), condition_classes(in.next<int32_t>()),
+        condition_mask(in.next<bool>()), implies(in.next<bool>()), travel(in.next<float>()), finish(in.next<float>()),
+        success_probability(in.next<float>()), success_cost(in.next<float>()), failure_cost(in.next<float>()),
+        dfa_state(in.next<int32_t>()), subgoal_mask(in.next<bool>()), dead_end_cost(in.next<float>()) {}
+
+  Shape shape() const {
+    Shape shape;
+    shape.S = subgoal_mask.length;
+    shape.Z = state_mask.length;
+    shape.E = edge_mask.length;
+    shape.C = class_mask.length;
+    shape.M = condition_mask.length;
+    shape.K = condition_classes.length / std::max<int64_t>(shape.M, 1);
+    shape.A = shape.S * shape.E + 1;
+    return shape;
+  }
+
+  Arrays row(int64_t i) const {
+    return {accepting.row(i),      state_mask.row(i),     edges.row(i),
+            edge_mask.row(i),      edge_condition.row(i), class_mask.row(i),
+            condition_classes.row(i), condition_mask.row(i), implies.row(i),
+            travel.row(i),         finish.row(i),         success_probability.row(i),
+            success_cost.row(i),   failure_cost.row(i),   *dfa_state.row(i),
+            subgoal_mask.row(i),   *dead_end_cost.row(i)};
+  }
+};
+
+// In the order of the fields of `search.plan.Plan`.
+struct PlanBatch {
+  Batched<int32_t> action, subgoal, from_state, to_state;
+  Batched<float> value, q_values;
+  Batched<int32_t> visits;
+  Batched<float> optimism_gap, lower_bound;
+  Batched<uint32_t> status;
+
+  explicit PlanBatch(Writer& out)
+      : action(out.next<int32_t>()), subgoal(out.next<int32_t>()), from_state(out.next<int32_t>()),
+        to_state(out.next<int32_t>()), value(out.next<float>()), q_values(out.next<float>()),
+        visits(out.next<int32_t>()), optimism_gap(out.next<float>()), lower_bound(out.next<float>()),
+        status(out.next<uint32_t>()) {}
+
+  PlanArrays row(int64_t i) const {
+    return {action.row(i),   subgoal.row(i), from_state.row(i),   to_state.row(i),    value.row(i),
+            q_values.row(i), visits.row(i),  optimism_gap.row(i), lower_bound.row(i), status.row(i)};
+  }
+};
+
+// In the order of the fields of `search.graph.Tree`.
+struct TreeBatch {
+  Batched<float> q_values, bounds, floors, chances, success_costs;
+  Batched<int32_t> children;
+  Batched<float> values;
+  Batched<int32_t> location, state;
+  Batched<uint32_t> holds, fails, visited;
+  Batched<int32_t> table, root_visits, size, simulations, steps;
+  Batched<uint32_t> status;
+
+  explicit TreeBatch(Writer& out)
+      : q_values(out.next<float>()), bounds(out.next<float>()), floors(out.next<float>()), chances(out.next<float>()),
+        success_costs(out.next<float>()), children(out.next<int32_t>()), values(out.next<float>()),
+        location(out.next<int32_t>()), state(out.next<int32_t>()), holds(out.next<uint32_t>()),
+        fails(out.next<uint32_t>()), visited(out.next<uint32_t>()), table(out.next<int32_t>()),
+        root_visits(out.next<int32_t>()), size(out.next<int32_t>()), simulations(out.next<int32_t>()),
+        steps(out.next<int32_t>()), status(out.next<uint32_t>()) {}
+
+  TreeArrays row(int64_t i) const {
+    return {q_values.row(i), bounds.row(i), floors.row(i), chances.row(i),     success_costs.row(i), children.row(i),
+            values.row(i),   location.row(i), state.row(i), holds.row(i),      fails.row(i),         visited.row(i),
+            table.row(i),    root_visits.row(i), size.row(i), simulations.row(i), steps.row(i),      status.row(i)};
+  }
+};
+
+Search& search_of_thread() {
+  static thread_local Search search;
+  return search;
+}
+
+// `tree`: 0 for plans alone, 1 for trees too, 2 where the results of the trees hold trees to go on with.
+ffi::Error search_rows(ffi::ThreadPool pool, int64_t tree, int64_t simulations, int64_t max_depth, int64_t capacity,
+                       int64_t slots, int64_t guess_failures, int64_t few_actions, float optimism,
+                       float optimism_of_few, float default_optimism, int64_t batch, ffi::RemainingArgs arguments,
+                       ffi::RemainingRets results) {
+  if (batch == 0) return ffi::Error::Success();
+  const Settings settings{simulations, max_depth,       capacity,        slots, guess_failures, few_actions, optimism,
+                          optimism_of_few, default_optimism};
+  const ProblemBatch problems(Reader(arguments, batch));
+  Writer writer(results, batch);
+  const PlanBatch plans(writer);
+  const Shape shape = problems.shape();
+  if (tree == 0) {
+    for_each_row(pool, batch, [&](int64_t row) {
+      search_of_thread().run(shape, settings, problems.row(row), nullptr, false, plans.row(row));
+    });
+    return ffi::Error::Success();
+  }
+  const TreeBatch trees(writer);
+  for_each_row(pool, batch, [&](int64_t row) {
+    const TreeArrays own = trees.row(row);
+    search_of_thread().run(shape, settings, problems.row(row), &own, tree == 2, plans.row(row));
+  });
+  return ffi::Error::Success();
+}
+
+}  // namespace
+
+XLA_FFI_DEFINE_HANDLER_SYMBOL(best_first, search_rows,
+                              ffi::Ffi::Bind()
+                                  .Ctx<ffi::ThreadPool>()
+                                  .Attr<int64_t>("tree")
+                                  .Attr<int64_t>("simulations")
+                                  .Attr<int64_t>("max_depth")
+                                  .Attr<int64_t>("capacity")
+                                  .Attr<int64_t>("slots")
+                                  .Attr<int64_t>("guess_failures")
+                                  .Attr<int64_t>("few_actions")
+                                  .Attr<float>("optimism")
+                                  .Attr<float>("optimism_of_few")
+                                  .Attr<float>("default_optimism")
+                                  .Attr<int64_t>("batch")
+                                  .RemainingArgs()
+                                  .RemainingRets());
