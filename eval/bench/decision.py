@@ -254,8 +254,8 @@ def asked_by(policy: Policy, trial: Start, config: TrialConfig) -> Any:
     if policy is not Policy.POTLP:
         return None
     here = Domain.of_world(trial.world, config.camera)
-    trained = rules.estimator_of(policy, trial.world.propositions, here, None)
-    return trained.start(*trial.world.shape, config.panoramas)
+    shipped = rules.estimator_of(policy, trial.world.propositions, here, None)
+    return rules.first_estimator(policy, shipped, trial.world.shape, config.panoramas, None)
 
 
 def table_of(found: dict[str, Any]) -> str:
