@@ -86,7 +86,9 @@ def product_distances(
     Returns:
         Costs by source, cell and state; ``inf`` where there is no path.
     """
-    return _product_distances(transitions, free, source_cells, source_states, jnp.asarray(resolution), wildcard)
+    # As plain arrays: vmap puts marks in their place, which are none.
+    letters = None if wildcard is None else (wildcard.cells, wildcard.successors)
+    return _product_distances(transitions, free, source_cells, source_states, jnp.asarray(resolution), letters)
 
 
 # Under vmap the maps are solved one after the other: a batched loop goes on until its slowest row is done, and works on
@@ -98,8 +100,9 @@ def _product_distances(
     source_cells: Int32[Array, "Q 2"],
     source_states: Int32[Array, " Q"],
     resolution: Float32[Array, ""],
-    wildcard: Wildcard | None,
+    letters: tuple[Bool[Array, "H W"], Bool[Array, "Z Z"]] | None,
 ) -> Float32[Array, "Q H W Z"]:
+    wildcard = None if letters is None else Wildcard(cells=letters[0], successors=letters[1])
     arrays = (transitions, free, source_cells, source_states, resolution, wildcard)
     return by_platform("distances", searched_distances, _swept_distances, *arrays)
 
