@@ -11,6 +11,7 @@ from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import BatchError, EstimatorError
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
+from potlp_jax.native import twin_only
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.situation import DecisionConfig
@@ -20,6 +21,7 @@ from potlp_jax.trials.batch import Start, run_batch
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import Outcome
+from potlp_jax.trials.slots import LOCKSTEP
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import pad_world
 from potlp_jax.world.sensing import SensorConfig
@@ -85,6 +87,17 @@ def test_every_trial_is_what_it_is_alone(ran):
     assert len({entry[3] for entry in alone.values()}) > 1
     # The way on is remembered from decision to decision, and not in vain.
     assert kept > 0 or not policy.searches
+
+
+@pytest.mark.parametrize("policy", [Policy.OPTIMISTIC, Policy.ORACLE, Policy.POTLP])
+def test_lockstep_without_native_kernels_is_slot_by_slot_with_them(policy, monkeypatch):
+    # What accelerators run, against what CPUs run.
+    expected = _figures(run_batch(_starts(5), policy, CONFIG, slots=3, estimator=UNTRAINED))
+    monkeypatch.setenv(LOCKSTEP, "1")
+    with twin_only():
+        found = _figures(run_batch(_starts(5), policy, CONFIG, slots=3, estimator=UNTRAINED))
+    assert found == expected
+    assert len({entry[3] for entry in found.values()}) > 1
 
 
 def test_neither_neighbours_nor_order_change_a_trial(ran):

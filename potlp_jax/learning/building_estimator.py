@@ -66,7 +66,7 @@ class BuildingEstimator:
         modulation = network.modulation(self.params, stay, go)
         places = network.places(self.params, encoded, subgoals.cells)
         imagined = jax.tree.map(jax.nn.sigmoid, encoded.squares)
-        beyond = _outlook_of_classes(scenery(belief, imagined), subgoals, stay, task.class_mask)
+        beyond = outlook_of_classes(scenery(belief, imagined), subgoals, stay, task.class_mask)
 
         def ask(subgoal: Int32[Array, ""], found: Float32[Array, "3 S C"]) -> Float32[Array, "3 S C"]:
             seen = prospects(jax.tree.map(lambda array: array[subgoal], beyond), go)
@@ -88,7 +88,7 @@ class BuildingEstimator:
         )
 
 
-def _outlook_of_classes(
+def outlook_of_classes(
     scene: Scenery, subgoals: Subgoals, stay: Int8[Array, "C P"], class_mask: Bool[Array, " C"]
 ) -> Outlook:
     """The outlook of every real (subgoal, class), leading dimensions ``S C``; classes that avoid the same share one."""

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 
+from potlp_jax.native import by_platform, target
 from potlp_jax.planning.distances.product import SOURCES_AT_ONCE, arrivals_per_source, distances_per_source
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.task.propositions import require_same_propositions
@@ -60,38 +61,16 @@ def true_labels(world: World, belief: BeliefMap, subgoals: Subgoals, task: TaskA
     """
     require_same_propositions(task.propositions, world.propositions, knower="the true map")
     require_same_propositions(task.propositions, belief.propositions, knower="the belief")
-    count, states = subgoals.mask.shape[0], task.transitions.shape[0]
-    lanes = max(min(SOURCES_AT_ONCE, count * states), 1)
+    states = task.transitions.shape[0]
     stays = task.transitions == jnp.arange(states, dtype=jnp.int32)[:, None]
     # One state for each class, of those whose staying letters are the class's.
     same_stay = jnp.all(task.class_stay[:, None, :] == stays[None, :, :], axis=2)
     state_of_class = jnp.argmax(same_stay, axis=1)
     used = jnp.any((state_of_class[:, None] == jnp.arange(states)[None, :]) & task.class_mask[:, None], axis=0)
-
     # Pairs of a subgoal and a state: the distances of a pair answer for all classes with these staying letters.
-    # Real pairs first, so that padding costs nothing.
-    real = (subgoals.mask[:, None] & used[None, :]).reshape(-1)
-    order = jnp.argsort(~real, stable=True).astype(jnp.int32)
-    chunks = -(-jnp.sum(real, dtype=jnp.int32) // lanes)
-    missing = -(count * states) % lanes
-    pairs, real = jnp.pad(order, (0, missing)), jnp.pad(real[order], (0, missing))
-
-    def label(chunk, found):
-        chosen, wanted = (jax.lax.dynamic_slice_in_dim(array, chunk * lanes, lanes) for array in (pairs, real))
-        labels = _labels_of_lanes(world, belief, subgoals, task, stays, chosen // states, chosen % states, wanted)
-        return jax.tree.map(
-            lambda into, rows: jax.lax.dynamic_update_slice_in_dim(into, rows, chunk * lanes, axis=0), found, labels
-        )
-
-    nothing = (
-        jnp.full((pairs.shape[0], task.class_mask.shape[0]), jnp.inf, jnp.float32),
-        jnp.zeros(pairs.shape[0], jnp.float32),
-    )
-    success_cost, failure_cost = jax.lax.fori_loop(0, chunks, label, nothing)
-    # From the order of work to that of the pairs.
-    back = jnp.argsort(order)
-    success_cost = success_cost[back].reshape(count, states, -1)
-    failure_cost = failure_cost[back].reshape(count, states)
+    asked = subgoals.mask[:, None] & used[None, :]
+    arrays = (world, belief, subgoals, asked, stays, task.class_go)
+    success_cost, failure_cost = by_platform("labels", _searched_labels, _swept_labels, *arrays)
     success_cost = jnp.take_along_axis(success_cost, state_of_class[None, None, :], axis=1)[:, 0]
     reached = jnp.isfinite(success_cost) & task.class_mask[None, :]
     return Estimates(
@@ -101,11 +80,69 @@ def true_labels(world: World, belief: BeliefMap, subgoals: Subgoals, task: TaskA
     )
 
 
+def _searched_labels(
+    world: World,
+    belief: BeliefMap,
+    subgoals: Subgoals,
+    asked: Bool[Array, "S Z"],
+    stays: Bool[Array, "Z L"],
+    class_go: Bool[Array, "C L"],
+) -> tuple[Float32[Array, "S Z C"], Float32[Array, "S Z"]]:
+    """R_S (``inf`` where it fails) and R_F of every pair that is asked, in native code: one search a pair."""
+    results = (
+        jax.ShapeDtypeStruct((*asked.shape, class_go.shape[0]), jnp.float32),
+        jax.ShapeDtypeStruct(asked.shape, jnp.float32),
+    )
+    call = jax.ffi.ffi_call(target("true_labels"), results, vmap_method="sequential")
+    free = ~world.occupied
+    way_back = frontier_cells(belief, jnp.ones_like(free))
+    places = (subgoals.component, subgoals.cells)
+    success_cost, failure_cost = call(
+        free, world.letters, belief.unknown, way_back, *places, asked, stays, class_go, world.resolution
+    )
+    return success_cost, failure_cost
+
+
+def _swept_labels(
+    world: World,
+    belief: BeliefMap,
+    subgoals: Subgoals,
+    asked: Bool[Array, "S Z"],
+    stays: Bool[Array, "Z L"],
+    class_go: Bool[Array, "C L"],
+) -> tuple[Float32[Array, "S Z C"], Float32[Array, "S Z"]]:
+    """As ``_searched_labels``, by sweeps: several pairs side by side."""
+    count, states = asked.shape
+    lanes = max(min(SOURCES_AT_ONCE, count * states), 1)
+    # Real pairs first, so that padding costs nothing.
+    real = asked.reshape(-1)
+    order = jnp.argsort(~real, stable=True).astype(jnp.int32)
+    chunks = -(-jnp.sum(real, dtype=jnp.int32) // lanes)
+    missing = -(count * states) % lanes
+    pairs, real = jnp.pad(order, (0, missing)), jnp.pad(real[order], (0, missing))
+
+    def label(chunk, found):
+        chosen, wanted = (jax.lax.dynamic_slice_in_dim(array, chunk * lanes, lanes) for array in (pairs, real))
+        labels = _labels_of_lanes(world, belief, subgoals, class_go, stays, chosen // states, chosen % states, wanted)
+        return jax.tree.map(
+            lambda into, rows: jax.lax.dynamic_update_slice_in_dim(into, rows, chunk * lanes, axis=0), found, labels
+        )
+
+    nothing = (
+        jnp.full((pairs.shape[0], class_go.shape[0]), jnp.inf, jnp.float32),
+        jnp.zeros(pairs.shape[0], jnp.float32),
+    )
+    success_cost, failure_cost = jax.lax.fori_loop(0, chunks, label, nothing)
+    # From the order of work to that of the pairs.
+    back = jnp.argsort(order)
+    return success_cost[back].reshape(count, states, -1), failure_cost[back].reshape(count, states)
+
+
 def _labels_of_lanes(
     world: World,
     belief: BeliefMap,
     subgoals: Subgoals,
-    task: TaskArrays,
+    class_go: Bool[Array, "C L"],
     stays: Bool[Array, "Z L"],
     subgoal: Int32[Array, " lanes"],
     state: Int32[Array, " lanes"],
@@ -149,4 +186,4 @@ def _labels_of_lanes(
 
     # What a robot explores in vain: all unobserved cells that it can reach beyond the subgoal while it keeps the state.
     failure_cost = jnp.max(jnp.where(jnp.isfinite(cost[HIDDEN]), cost[HIDDEN], 0.0), axis=(0, 1))
-    return jax.lax.map(cheapest, task.class_go).T, failure_cost
+    return jax.lax.map(cheapest, class_go).T, failure_cost

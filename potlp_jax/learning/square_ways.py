@@ -6,14 +6,16 @@ swept line by line, downwards, upwards and along columns, as in ``planning.dista
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float32
 
 from potlp_jax.learning.squares import EAST, NORTH, PASSAGES, SOUTH, WEST
+from potlp_jax.native import by_platform, target
 
 DETOUR: float = 600.0
 """A step that is surely closed counts as a detour of so many cells: more than there is to go round in most buildings.
@@ -104,8 +106,27 @@ def cheapest_ways(start: SideWays, closed: Sequence[Float32[Array, "rows columns
     Returns:
         Ways to all sides, none of which could be cheaper by more than a few cells.
     """
-    down = _Lines(closed)
-    across = _Lines([jnp.swapaxes(closed[number], 0, 1) for number in _TRANSPOSED])
+    return by_platform("square_ways", _ways_natively, _ways_by_lines, start, tuple(_steps(closed)))
+
+
+def _steps(closed: Sequence[Float32[Array, "rows columns L"]]) -> Iterator[Ways]:
+    """The way through each of ``PASSAGES``."""
+    for number, chance in enumerate(closed):
+        yield Ways(cost=(_STRAIGHT if number < 2 else _CORNER) + DETOUR * chance, obstacles=chance)
+
+
+def _ways_natively(start: SideWays, steps: Sequence[Ways]) -> SideWays:
+    """The same sweeps in native code (``native/kernels/square_ways.cc``)."""
+    sides, structure = jax.tree.flatten(start)
+    results = [jax.ShapeDtypeStruct(side.shape, side.dtype) for side in sides]
+    call = jax.ffi.ffi_call(target("cheapest_ways"), results, vmap_method="sequential")
+    stacked = (jnp.stack([step.cost for step in steps]), jnp.stack([step.obstacles for step in steps]))
+    return jax.tree.unflatten(structure, call(*sides, *stacked, gain=np.float32(_GAIN)))
+
+
+def _ways_by_lines(start: SideWays, steps: Sequence[Ways]) -> SideWays:
+    down = _Lines(steps)
+    across = _Lines([jax.tree.map(lambda array: jnp.swapaxes(array, 0, 1), steps[number]) for number in _TRANSPOSED])
 
     def swept(state: tuple[SideWays, Bool[Array, ""]]) -> tuple[SideWays, Bool[Array, ""]]:
         before, _ = state
@@ -131,11 +152,8 @@ _TRANSPOSED = tuple(
 class _Lines:
     """The rows of squares of a map, to be swept in both directions."""
 
-    def __init__(self, closed: Sequence[Float32[Array, "rows columns L"]]) -> None:
-        self.steps = tuple(
-            Ways(cost=(_STRAIGHT if number < 2 else _CORNER) + DETOUR * chance, obstacles=chance)
-            for number, chance in enumerate(closed)
-        )
+    def __init__(self, steps: Sequence[Ways]) -> None:
+        self.steps = tuple(steps)
 
     def swept(self, ways: SideWays) -> SideWays:
         """Once downwards, once upwards."""

@@ -21,7 +21,15 @@ from potlp_jax.native.build import BuildError, built_library
 SWITCH: str = "POTLP_NATIVE"
 """Environment variable that turns all native kernels off where it is 0; read once in a process."""
 
-LIBRARIES: dict[str, tuple[str, ...]] = {"search": ("best_first",)}
+LIBRARIES: dict[str, tuple[str, ...]] = {
+    "distances": ("product_distances", "distance_table"),
+    "frontiers": ("find_components",),
+    "labels": ("true_labels",),
+    "paths": ("shortest_path",),
+    "search": ("best_first",),
+    "sensing": ("visible",),
+    "square_ways": ("cheapest_ways",),
+}
 """Handlers by library: the name of the source in ``kernels`` without ``.cc``, and the symbols that it defines."""
 
 _Result = TypeVar("_Result")

@@ -4,7 +4,8 @@ The decisions are those of ``loop.run_trial`` (Bradley et al. 2021, Algorithm 1)
 keeps the slots filled.
 
 On a CPU the phases before and after the search work through the slots one by one: their loops end at different times,
-and in lockstep all would wait for the slowest. Elsewhere they run in lockstep. The search always does.
+and in lockstep all would wait for the slowest. Elsewhere, and with the environment variable ``POTLP_LOCKSTEP`` on a CPU
+too, they run in lockstep. The search always does.
 """
 
 import dataclasses
@@ -17,6 +18,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Int16, Int32, Key, PRNGKeyArray
 
+from potlp_jax.cache import is_switched_on
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.observing import (
     ObservingEstimator,
@@ -48,6 +50,10 @@ from potlp_jax.world.frontiers import Subgoals
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.moves import step_length
 from potlp_jax.world.sensing import observe
+
+LOCKSTEP: str = "POTLP_LOCKSTEP"
+"""Environment variable that makes all phases run in lockstep, unless it is empty or 0: what accelerators do, on a CPU.
+"""
 
 EMPTY: int = -2
 """``Tally.outcome`` of a slot without a trial; neither running nor ended."""
@@ -95,12 +101,23 @@ class Progress:
     tally: Tally
 
 
+def _takes_turns() -> bool:
+    return jax.default_backend() == "cpu" and not is_switched_on(LOCKSTEP)
+
+
 @dataclasses.dataclass(frozen=True)
 class Setup:
-    """What all trials of a batch share, static under jit."""
+    """What all trials of a batch share, static under jit.
+
+    Attributes:
+        policy: of all trials.
+        config: of all trials.
+        takes_turns: whether slots go through the phases one by one, or in lockstep.
+    """
 
     policy: Policy | PolicyFunction
     config: TrialConfig
+    takes_turns: bool = dataclasses.field(default_factory=_takes_turns)
 
     @property
     def searches(self) -> bool:
@@ -161,7 +178,7 @@ def step(scene: Scene, asked: Asked, setup: Setup, progress: Progress) -> Progre
     # The library's searches have a kernel that takes all slots at once; any other policy is asked slot by slot.
     if setup.searches:
         return _search_together(scene, asked, setup, progress)
-    return _each(partial(_decide_alone, setup, asked), progress, scene)
+    return _each(setup, partial(_decide_alone, setup, asked), progress, scene)
 
 
 def _search_together(scene: Scene, asked: Asked, setup: Setup, progress: Progress) -> Progress:
@@ -174,7 +191,7 @@ def _search_together(scene: Scene, asked: Asked, setup: Setup, progress: Progres
         problem = _phase(running, partial(planning_problem, config=decision), situation, estimates)
         return memory, situation, problem, key
 
-    memory, situation, problem, keys = _each(prepare, progress, scene)
+    memory, situation, problem, keys = _each(setup, prepare, progress, scene)
     # ``plan_actions`` turns this vmap into one kernel with a batch axis: its loop ends when the last slot is done.
     plans = jax.vmap(lambda problem, key: plan_actions(problem, key, decision.search))(problem, keys)
 
@@ -184,7 +201,7 @@ def _search_together(scene: Scene, asked: Asked, setup: Setup, progress: Progres
         return advance(setup, progress, scene, move)
 
     # Intentions come from the progress, not from the search: commitment is applied when the plan is carried out.
-    return _each(act, dataclasses.replace(progress, memory=memory), scene, situation, problem, plans)
+    return _each(setup, act, dataclasses.replace(progress, memory=memory), scene, situation, problem, plans)
 
 
 def _decide_alone(setup: Setup, asked: Asked, progress: Progress, scene: Scene) -> Progress:
@@ -199,9 +216,9 @@ def _decide_alone(setup: Setup, asked: Asked, progress: Progress, scene: Scene) 
     return advance(setup, dataclasses.replace(progress, memory=memory), scene, move)
 
 
-def _each(function: Any, *batches: Any) -> Any:
-    """Apply to every slot: one by one on a CPU, otherwise in lockstep."""
-    if jax.default_backend() == "cpu":
+def _each(setup: Setup, function: Any, *batches: Any) -> Any:
+    """Apply to every slot: one by one, or in lockstep."""
+    if setup.takes_turns:
         return jax.lax.map(lambda row: function(*row), batches)
     return jax.vmap(function)(*batches)
 

@@ -1,7 +1,9 @@
 """Frontiers: where known space ends, as connected components, one subgoal each (docs/model.md section 6).
 
-Components of any shape and number are found exactly: the cells of the frontier are listed, and every pass over them
-runs in blocks of the list, so that the cost follows the length of the frontier and not the size of the grid.
+Components of any shape and number are found exactly. On a CPU native code floods them one after the other
+(``native/kernels/frontiers.cc``). Elsewhere, and where there is no compiler, they grow at the same time: the cells of
+the frontier are listed, and every pass over them runs in blocks of the list, so that the cost follows the length of the
+frontier and not the size of the grid.
 
 References:
     Yamauchi, A frontier-based approach for autonomous exploration, CIRA 1997.
@@ -9,6 +11,7 @@ References:
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -18,6 +21,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
+from potlp_jax.native import by_platform, target
 from potlp_jax.precision import in_32_bits
 from potlp_jax.types import NO_SUBGOAL, UNREACHABLE, Status, status_if
 from potlp_jax.world.grid import BeliefMap
@@ -121,8 +125,31 @@ def find_subgoals(
     Returns:
         The nearest subgoals, padded to ``config.max_subgoals``; ``status`` tells whether there were more.
     """
-    height, width = reachable.shape
     frontier = frontier_cells(belief, reachable)
+    ways = (functools.partial(function, config=config) for function in (_found_natively, _found_by_rounds))
+    return by_platform("frontiers", *ways, frontier, distance)
+
+
+def _found_natively(frontier: Bool[Array, "H W"], distance: Float32[Array, "H W"], config: FrontierConfig) -> Subgoals:
+    """In native code (``native/kernels/frontiers.cc``), one component after the other."""
+    most = config.max_subgoals
+    results = {
+        "cells": jax.ShapeDtypeStruct((most, 2), jnp.int32),
+        "mask": jax.ShapeDtypeStruct((most,), jnp.bool_),
+        "size": jax.ShapeDtypeStruct((most,), jnp.int32),
+        "distance": jax.ShapeDtypeStruct((most,), jnp.float32),
+        "component": jax.ShapeDtypeStruct(frontier.shape, jnp.int32),
+        "overflow": jax.ShapeDtypeStruct((), jnp.bool_),
+    }
+    call = jax.ffi.ffi_call(target("find_components"), tuple(results.values()), vmap_method="sequential")
+    found = dict(zip(results, call(frontier, distance, min_size=np.int64(config.min_size)), strict=True))
+    status = status_if(found.pop("overflow"), Status.SUBGOAL_OVERFLOW)
+    return Subgoals(**found, frontier=frontier, status=status)
+
+
+def _found_by_rounds(frontier: Bool[Array, "H W"], distance: Float32[Array, "H W"], config: FrontierConfig) -> Subgoals:
+    """In JAX, all components at the same time."""
+    height, width = frontier.shape
     grid = _label(_listed(frontier), width)
     size, subgoal = _summarise(grid, width)
     is_root = grid.parent[:-1] == jnp.arange(grid.parent.shape[0] - 1, dtype=jnp.int32)

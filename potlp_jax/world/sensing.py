@@ -6,11 +6,13 @@ does not pass between two obstacles that touch at their corners. The free cells 
 and its eight neighbours always. An obstacle is seen where it touches, also at a corner, a free cell that is seen: lines
 alone would leave slivers in walls that are grazed. Letters do not block sight.
 
-Method. Which cells a line passes does not depend on the map, so the lines are static tables, and the first step is to
-find how far each line gets. The second is the inverse: which cells lie on a line that gets that far. The lines of one
-side of the square do not cross, so those through a given cell are a contiguous range of them, and the cell is seen
-where any line of the range gets far enough. A maximum over a range is two look-ups in a table of maxima over blocks of
-``2 ** level`` lines (one block from the range's beginning, one up to its end), instead of a scatter of all cells.
+Method. On a CPU native code follows the lines one by one (``native/kernels/sensing.cc``). Elsewhere, and where there is
+no compiler, it is the other way round. Which cells a line passes does not depend on the map, so the lines are static
+tables, and the first step is to find how far each line gets. The second is the inverse: which cells lie on a line that
+gets that far. The lines of one side of the square do not cross, so those through a given cell are a contiguous range of
+them, and the cell is seen where any line of the range gets far enough. A maximum over a range is two look-ups in a
+table of maxima over blocks of ``2 ** level`` lines (one block from the range's beginning, one up to its end), instead
+of a scatter of all cells.
 
 References:
     Bresenham, Algorithm for computer control of a digital plotter, IBM Systems Journal 1965.
@@ -26,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, Int32, UInt8
 
+from potlp_jax.native import by_platform, target
 from potlp_jax.precision import in_32_bits
 from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.world.grid import BeliefMap, World
@@ -116,6 +119,32 @@ def visible(occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], config: Senso
     Returns:
         True on the cells that are seen. Outside of the array nothing is.
     """
+    return by_platform(
+        "sensing",
+        functools.partial(_followed, config=config),
+        functools.partial(_tabled, config=config),
+        occupied,
+        cell,
+    )
+
+
+def _followed(occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], config: SensorConfig) -> Bool[Array, "H W"]:
+    """In native code: the definition, line by line."""
+    result = jax.ShapeDtypeStruct(occupied.shape, jnp.bool_)
+    call = jax.ffi.ffi_call(target("visible"), result, vmap_method="sequential")
+    half, height, width = _half_width(config.range_cells), *occupied.shape
+    # No line is longer on the grid than its longer side, but where it leads the range says.
+    return call(
+        occupied,
+        cell,
+        range=np.float64(config.range_cells),
+        half=np.int64(half),
+        steps=np.int64(min(half, max(height, width) - 1)),
+    )
+
+
+def _tabled(occupied: Bool[Array, "H W"], cell: Int32[Array, "2"], config: SensorConfig) -> Bool[Array, "H W"]:
+    """By tables of which lines pass which cells."""
     height, width = occupied.shape
     lines = _lines(config.range_cells, height, width)
     # Tables over offsets from the robot become tables over cells by cutting out the window that begins here.
@@ -195,10 +224,15 @@ def _at_offsets(
     return jax.lax.dynamic_slice(jnp.asarray(table), corner, (height, width))
 
 
+def _half_width(range_cells: float) -> int:
+    """Half the width of the square to whose perimeter lines lead."""
+    return max(1, math.ceil(range_cells))
+
+
 @functools.lru_cache(maxsize=32)
 def _lines(range_cells: float, height: int, width: int) -> _Lines:
     """The tables. The lines depend on the range alone, so that a padded grid shows the same; the grid bounds steps."""
-    half = max(1, math.ceil(range_cells))
+    half = _half_width(range_cells)
     # On a grid smaller than the range no step beyond the grid's longer side can matter.
     margin = (min(half, height - 1), min(half, width - 1))
     steps = max(margin)

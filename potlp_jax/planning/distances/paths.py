@@ -1,10 +1,14 @@
 """Shortest paths through the product automaton, walked back from their targets along known distances."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 
+from potlp_jax.native import by_platform, target
+from potlp_jax.planning.distances.bucket_search import wildcard_arrays
 from potlp_jax.planning.distances.sweeping import Wildcard
 from potlp_jax.world.moves import LENGTHS, NEIGHBOURS, sides_free
 
@@ -56,9 +60,55 @@ def shortest_path(
     Returns:
         The path, padded to ``horizon + 1`` product states.
     """
+    # Not within the walk: a product that is added at once may be rounded only after the sum.
+    steps = jnp.asarray(LENGTHS, jnp.float32) * resolution
+    ends = (source_cell, source_state, target_cell, target_state)
+    walks = (functools.partial(function, horizon=horizon) for function in (_walked_natively, _walked))
+    return by_platform("paths", *walks, distances, transitions, free, *ends, steps, wildcard)
+
+
+def _walked_natively(
+    distances: Float32[Array, "H W Z"],
+    transitions: Int32[Array, "H W Z"],
+    free: Bool[Array, "H W"],
+    source_cell: Int32[Array, "2"],
+    source_state: Int32[Array, ""],
+    target_cell: Int32[Array, "2"],
+    target_state: Int32[Array, ""],
+    steps: Float32[Array, "8"],
+    wildcard: Wildcard | None,
+    *,
+    horizon: int,
+) -> KnownPath:
+    """In native code (``native/kernels/paths.cc``); ``steps`` are the lengths of moves in the unit of cost."""
+    results = (
+        jax.ShapeDtypeStruct((horizon + 1, 2), jnp.int32),
+        jax.ShapeDtypeStruct((horizon + 1,), jnp.int32),
+        jax.ShapeDtypeStruct((), jnp.int32),
+        jax.ShapeDtypeStruct((), jnp.float32),
+    )
+    call = jax.ffi.ffi_call(target("shortest_path"), results, vmap_method="sequential")
+    ends = (source_cell, source_state, target_cell, target_state)
+    cells, states, length, cost = call(distances, transitions, free, *ends, steps, *wildcard_arrays(wildcard))
+    return KnownPath(cells=cells, states=states, length=length, cost=cost)
+
+
+def _walked(
+    distances: Float32[Array, "H W Z"],
+    transitions: Int32[Array, "H W Z"],
+    free: Bool[Array, "H W"],
+    source_cell: Int32[Array, "2"],
+    source_state: Int32[Array, ""],
+    target_cell: Int32[Array, "2"],
+    target_state: Int32[Array, ""],
+    steps: Float32[Array, "8"],
+    wildcard: Wildcard | None,
+    *,
+    horizon: int,
+) -> KnownPath:
     cost = distances[target_cell[0], target_cell[1], target_state]
     reachable = jnp.isfinite(cost)
-    predecessor = _Predecessor(distances, transitions, free, resolution, wildcard)
+    predecessor = _Predecessor(distances, transitions, free, steps, wildcard)
     ring = horizon + 1
 
     # Walking back begins at the far end, and how long the path is shows only at the source. A ring buffer of ``horizon
@@ -96,7 +146,7 @@ class _Predecessor:
         distances: Float32[Array, "H W Z"],
         transitions: Int32[Array, "H W Z"],
         free: Bool[Array, "H W"],
-        resolution: Float32[Array, ""],
+        steps: Float32[Array, "8"],
         wildcard: Wildcard | None,
     ) -> None:
         margin = ((1, 1), (1, 1))
@@ -105,7 +155,7 @@ class _Predecessor:
         self.transitions = transitions
         self.wildcard = wildcard
         self.offsets = jnp.asarray(NEIGHBOURS, jnp.int32)
-        self.steps = jnp.asarray(LENGTHS, jnp.float32) * resolution
+        self.steps = steps
 
     def __call__(self, cell: Int32[Array, "2"], state: Int32[Array, ""]) -> tuple[Int32[Array, "2"], Int32[Array, ""]]:
         states = self.transitions.shape[2]

@@ -3,9 +3,10 @@
 Product states are ``(cell, z)``. Grid moves are 8-connected, cost 1 and √2 times the resolution and never cut a corner:
 a diagonal move needs both cells beside it free. Entering a cell in state ``z`` leads to ``transitions[cell, z]``.
 
-Whole grids of distances are solved by frontal sweeps (``sweeping``). A table of costs between a few cells needs no
-sweep per state where few cells carry letters that matter (``portals``). What both cost beside Dijkstra's algorithm is
-in docs/results/planner.md.
+On a CPU whole grids of distances are solved by a search in native code (``bucket_search``), elsewhere, and where there
+is no compiler, by frontal sweeps (``sweeping``); both give the same bits. A table of costs between a few cells needs no
+grid per state where few cells carry letters that matter (``portals``). What all this costs beside Dijkstra's algorithm
+is in docs/results/planner.md.
 """
 
 import functools
@@ -16,6 +17,8 @@ import jax.numpy as jnp
 from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Bool, Float32, Int32
 
+from potlp_jax.native import by_platform
+from potlp_jax.planning.distances.bucket_search import searched_distances, searched_table
 from potlp_jax.planning.distances.portals import find_active_cells, portals_pay, table_by_portals
 from potlp_jax.planning.distances.sweeping import Links, Sweeper, Wildcard
 from potlp_jax.precision import in_32_bits
@@ -83,13 +86,28 @@ def product_distances(
     Returns:
         Costs by source, cell and state; ``inf`` where there is no path.
     """
-    return _product_distances(transitions, free, source_cells, source_states, jnp.asarray(resolution), wildcard)
+    # As plain arrays: vmap puts marks in their place, which are none.
+    letters = None if wildcard is None else (wildcard.cells, wildcard.successors)
+    return _product_distances(transitions, free, source_cells, source_states, jnp.asarray(resolution), letters)
 
 
 # Under vmap the maps are solved one after the other: a batched loop goes on until its slowest row is done, and works on
 # arrays that no cache holds.
 @sequential_vmap
 def _product_distances(
+    transitions: Int32[Array, "H W Z"],
+    free: Bool[Array, "H W"],
+    source_cells: Int32[Array, "Q 2"],
+    source_states: Int32[Array, " Q"],
+    resolution: Float32[Array, ""],
+    letters: tuple[Bool[Array, "H W"], Bool[Array, "Z Z"]] | None,
+) -> Float32[Array, "Q H W Z"]:
+    wildcard = None if letters is None else Wildcard(cells=letters[0], successors=letters[1])
+    arrays = (transitions, free, source_cells, source_states, resolution, wildcard)
+    return by_platform("distances", searched_distances, _swept_distances, *arrays)
+
+
+def _swept_distances(
     transitions: Int32[Array, "H W Z"],
     free: Bool[Array, "H W"],
     source_cells: Int32[Array, "Q 2"],
@@ -136,6 +154,19 @@ def distance_table(
 
 @sequential_vmap
 def _distance_table(
+    transitions: Int32[Array, "H W Z"],
+    free: Bool[Array, "H W"],
+    accepting: Bool[Array, " Z"],
+    source_cells: Int32[Array, "Q 2"],
+    source_states: Int32[Array, " Q"],
+    target_cells: Int32[Array, "T 2"],
+    resolution: Float32[Array, ""],
+) -> tuple[Float32[Array, "Q T Z"], Float32[Array, " Q"]]:
+    arrays = (transitions, free, accepting, source_cells, source_states, target_cells, resolution)
+    return by_platform("distances", searched_table, _swept_table, *arrays)
+
+
+def _swept_table(
     transitions: Int32[Array, "H W Z"],
     free: Bool[Array, "H W"],
     accepting: Bool[Array, " Z"],
