@@ -13,6 +13,9 @@ Planners: ``best-first`` is the library's default search, ``po-uct`` its PO-UCT;
 ``po-uct-pomdp-py`` are the same algorithm compiled by Numba and in pomdp-py; ``mctx`` is mctx's stochastic MuZero
 search.
 
+Mean regrets have a bootstrap interval of 95 % over instances. Of best-first search, which may end by itself, it is
+counted how many searches had ended, and how many of these were wrong where the truth is exact: none should be.
+
 Rows of earlier runs into the same folder are kept where the new run does not repeat them.
 
 CPU time is that of the whole process per decision, compilation and the preparation on the host apart: batched
@@ -35,6 +38,7 @@ import matplotlib as mpl
 import numpy as np
 
 from eval.bench.opponents import installed
+from potlp_jax.bench.memory import tree_memory
 from potlp_jax.bench.problems import FAMILIES, SUBGOAL_COUNTS, Split, family_problem
 from potlp_jax.errors import ProblemTooLargeError
 from potlp_jax.planning.exact.api import bound_exact, solve_exact
@@ -51,6 +55,14 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 
 GOAL_PERCENT = 1.0
+
+WRONG_PERCENT = 0.05
+"""Regret from which on an ended search is wrong: 32 bits cost less."""
+
+RESAMPLES = 10_000
+
+TREE_BYTES = 1_000_000_000
+"""Memory for trees: as many of our searches as fit run in one batch."""
 
 BEST_KNOWN = 10_000
 """Simulations that stand in for the exact solution where that is out of reach."""
@@ -86,7 +98,8 @@ class Truth:
 @dataclass(frozen=True)
 class Row:
     """One planner at one budget on one family and S. ``percent`` and ``absolute`` are per instance; ``exact`` tells
-    where the truth is exact, ``interval_percent`` how wide the certified interval of V* is where not."""
+    where the truth is exact, ``interval_percent`` how wide the certified interval of V* is where not, ``ended`` where
+    the search ended by itself."""
 
     split: str
     family: str
@@ -99,15 +112,28 @@ class Row:
     absolute: list[float]
     exact: list[bool]
     interval_percent: list[float]
+    ended: list[bool]
 
     @property
     def mean_percent(self) -> float:
         """Mean regret in %."""
         return float(np.mean(self.percent))
 
+    @property
+    def mean_interval(self) -> tuple[float, float]:
+        """Bootstrap interval of the mean regret, 95 %."""
+        chosen = np.random.default_rng(0).integers(0, len(self.percent), (RESAMPLES, len(self.percent)))
+        low, high = np.percentile(np.asarray(self.percent)[chosen].mean(axis=1), [2.5, 97.5])
+        return float(low), float(high)
 
-Answer = tuple[str, int, float, list[int]]
-"""Planner, budget, CPU seconds per decision, chosen action of each instance."""
+    @property
+    def ended_wrong(self) -> int:
+        """Searches that ended by themselves at a wrong choice."""
+        return sum(e and x and p > WRONG_PERCENT for e, x, p in zip(self.ended, self.exact, self.percent, strict=True))
+
+
+Answer = tuple[str, int, float, list[int], list[bool]]
+"""Planner, budget, CPU seconds per decision, chosen action of each instance, and whether its search ended by itself."""
 
 
 def truth_of(problem: PlanningProblem, cache: Path, seconds: float) -> Truth:
@@ -151,11 +177,14 @@ def ours(
     kind: type[BestFirstConfig | UctConfig] = BestFirstConfig,
     **settings: Any,
 ) -> Callable[..., Iterator[Answer]]:
-    """One of our searches on all instances in one batch; every budget goes on from the one before."""
+    """One of our searches on all instances, in batches whose trees fit ``TREE_BYTES``; every budget goes on from the
+    one before."""
 
     def run(problems: Sequence[PlanningProblem], budgets: Sequence[int]) -> Iterator[Answer]:
         config = kind(simulations=max(budgets), **settings)
-        stacked = _stack(problems)
+        rows = min(len(problems), max(1, TREE_BYTES // tree_memory(problems[0], config).total))
+        # The last rows are filled up from the front, so that every batch has the compiled shape.
+        firsts = [min(first, len(problems) - rows) for first in range(0, len(problems), rows)]
         seeds = jax.vmap(lambda key: jax.random.bits(key, (2,), jnp.uint32))(
             jax.random.split(jax.random.key(0), len(problems))
         )
@@ -174,17 +203,26 @@ def ours(
                 return carry[0] - 1, search.simulate(context, carry[1], config)
 
             tree = jax.lax.while_loop(functools.partial(unfinished, context), step, (count, tree))[1]
-            return tree, search.choose(context, tree).action
+            return tree, (search.choose(context, tree).action, ~search.is_open(context, tree))
 
-        jax.block_until_ready(advance(*begin(stacked, seeds), jnp.int32(1)))
-        start = time.process_time()
-        context, tree = jax.block_until_ready(begin(stacked, seeds))
-        spent, before = time.process_time() - start, 0
-        for budget in budgets:
+        jax.block_until_ready(advance(*begin(_stack(problems[:rows]), seeds[:rows]), jnp.int32(1)))
+        seconds = np.zeros(len(budgets))
+        actions, ended = (np.zeros((len(budgets), len(problems)), dtype) for dtype in (np.int64, np.bool_))
+        for first in firsts:
+            own = slice(first, first + rows)
+            stacked = _stack(problems[own])
             start = time.process_time()
-            tree, action = jax.block_until_ready(advance(context, tree, jnp.int32(budget - before)))
-            spent, before = spent + time.process_time() - start, budget
-            yield name, budget, spent / len(problems), np.asarray(action).tolist()
+            context, tree = jax.block_until_ready(begin(stacked, seeds[own]))
+            spent, before = time.process_time() - start, 0
+            for level, budget in enumerate(budgets):
+                start = time.process_time()
+                tree, answer = jax.block_until_ready(advance(context, tree, jnp.int32(budget - before)))
+                spent, before = spent + time.process_time() - start, budget
+                seconds[level] += spent
+                actions[level, own], ended[level, own] = answer
+        for level, budget in enumerate(budgets):
+            time_of_one = float(seconds[level]) / (len(firsts) * rows)
+            yield name, budget, time_of_one, actions[level].tolist(), ended[level].tolist()
 
     return run
 
@@ -214,16 +252,10 @@ def mctx(problems: Sequence[PlanningProblem], budgets: Sequence[int]) -> Iterato
     rows, key = min(16, len(problems)), jax.random.key(0)
     for budget in budgets:
         compiled = mctx_plan.lower(_stack(problems[:rows]), key, simulations=2 * budget).compile()
-        yield (
-            "mctx",
-            budget,
-            *_in_batches(
-                lambda batch, _, compiled=compiled: compiled(batch, key).action,
-                problems,
-                np.arange(len(problems)),
-                rows,
-            ),
+        seconds, actions = _in_batches(
+            lambda batch, _, compiled=compiled: compiled(batch, key).action, problems, np.arange(len(problems)), rows
         )
+        yield "mctx", budget, seconds, actions, [False] * len(problems)
 
 
 def _in_batches(
@@ -251,7 +283,7 @@ PLANNERS: dict[str, Callable[..., Iterator[Answer]]] = {
 }
 FEW = {"po-uct-pomdp-py": 6}
 """Instances of a planner too slow for all."""
-LARGEST = {"best-first": 1000, "po-uct": 1000, "po-uct-pomdp-py": 1000, "mctx": 1000}
+LARGEST = {"po-uct": 1000, "po-uct-pomdp-py": 1000, "mctx": 1000}
 """Budgets beyond which a planner is not asked: it gains no more, or takes too long."""
 
 
@@ -273,7 +305,7 @@ def _one_by_one(
                 found[suffix][level].append(getattr(statistics, choice))
     for suffix, levels in found.items():
         for level, budget in enumerate(budgets):
-            yield name + suffix, budget, float(seconds[level].mean()), levels[level]
+            yield name + suffix, budget, float(seconds[level].mean()), levels[level], [False] * len(problems)
 
 
 def _stack(problems: Sequence[PlanningProblem]) -> PlanningProblem:
@@ -326,7 +358,7 @@ def _rows(
     budgets: list[int],
 ) -> Iterator[Row]:
     truths = [truth for _, _, truth in chosen]
-    for name, budget, seconds, actions in planner([problem for _, problem, _ in chosen], budgets):
+    for name, budget, seconds, actions, ended in planner([problem for _, problem, _ in chosen], budgets):
         absolute = [truth.regret(action) for truth, action in zip(truths, actions, strict=True)]
         yield Row(
             split=split,
@@ -340,6 +372,7 @@ def _rows(
             absolute=absolute,
             exact=[truth.exact for truth in truths],
             interval_percent=[100.0 * (truth.upper - truth.lower) / truth.scale for truth in truths],
+            ended=ended,
         )
 
 
@@ -366,15 +399,18 @@ def table(rows: Sequence[Row]) -> str:
         lines.append(f"| {family} | {subgoals} | {len(own[0].instances)} | " + " | ".join(shown) + " |")
     lines += [
         "",
-        "| family | S | planner | budget | CPU ms | mean % | worst % | mean | worst | not exact |",
-        "|---" * 10 + "|",
+        "| family | S | planner | budget | CPU ms | mean % (95 %) | worst % | mean | worst | not exact | ended, wrong"
+        " |",
+        "|---" * 11 + "|",
     ]
     for row in rows:
-        figures = (row.cpu_ms, row.mean_percent, max(row.percent), float(np.mean(row.absolute)), max(row.absolute))
+        low, high = row.mean_interval
+        figures = (max(row.percent), float(np.mean(row.absolute)), max(row.absolute))
         lines.append(
-            f"| {row.family} | {row.subgoals} | {row.planner} | {row.budget} | "
+            f"| {row.family} | {row.subgoals} | {row.planner} | {row.budget} | {row.cpu_ms:.3g} | "
+            f"{row.mean_percent:.3g} ({low:.3g} to {high:.3g}) | "
             + " | ".join(f"{figure:.3g}" for figure in figures)
-            + f" | {len(row.exact) - sum(row.exact)} of {len(row.exact)} |"
+            + f" | {len(row.exact) - sum(row.exact)} of {len(row.exact)} | {sum(row.ended)}, {row.ended_wrong} |"
         )
     return "\n".join(lines) + "\n"
 
@@ -458,6 +494,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         (out / "regret.json").write_text(json.dumps(content, indent=1))
     ordered = sorted(rows.values(), key=lambda row: (list(FAMILIES).index(row.family), row.subgoals))
     report(ordered, out)
+    print(f"ended searches that were wrong: {sum(row.ended_wrong for row in ordered)}")
 
 
 def report(rows: Sequence[Row], out: Path) -> None:

@@ -155,7 +155,7 @@ class Family:
         return own[index % len(own)]
 
 
-_DEAR = {"dead_end_cost": 5000.0}
+_DEAR: float = 5000.0
 
 
 def _shared(name: str, max_positive_literals: int | None, **options: Any) -> Family:
@@ -185,13 +185,20 @@ FAMILIES: Mapping[str, Family] = MappingProxyType(
             Family("cubes", _SEVERAL_CUBES, ("a", "b", "c"), TaskSizes(4, 3, 5, 8, 3, 3)),
             _shared("shared", 1),
             _shared("shared-joint", None),
-            _shared("shared-dear", 1, dead_end_cost=5000.0),
+            _shared("shared-dear", 1, dead_end_cost=_DEAR),
             _shared("shared-rare", 1, chances="rare"),
             _shared("shared-extreme", 1, chances="extreme"),
-            Family("rare", ("F(a & F(b & F a))",), ("a", "b"), TaskSizes(4, 2, 5, 5, 0, 1), chances="rare", **_DEAR),
+            Family(
+                "rare",
+                ("F(a & F(b & F a))",),
+                ("a", "b"),
+                TaskSizes(4, 2, 5, 5, 0, 1),
+                chances="rare",
+                dead_end_cost=_DEAR,
+            ),
             Family("extreme", ("F a & F b",), ("a", "b"), TaskSizes(4, 2, 5, 5, 0, 1), chances="extreme"),
             Family("cheap", ("F a & F b",), ("a", "b"), TaskSizes(4, 2, 5, 5, 0, 1), dead_end_cost=50.0),
-            Family("dear", ("F a & F b",), ("a", "b"), TaskSizes(4, 2, 5, 5, 0, 1), **_DEAR),
+            Family("dear", ("F a & F b",), ("a", "b"), TaskSizes(4, 2, 5, 5, 0, 1), dead_end_cost=_DEAR),
             Family("clustered", ("F a & F b",), ("a", "b"), TaskSizes(4, 2, 5, 5, 0, 1), clustered=True),
             Family("four", ("F a & F b & F c & F d",), ("a", "b", "c", "d"), TaskSizes(16, 4, 32, 32, 0, 1), 1),
         )
@@ -289,7 +296,8 @@ def _with_shared_conditions(arrays: TaskArrays) -> TaskArrays:
     first = np.array([np.flatnonzero((needs == own).all(axis=1))[0] for own in needs])
     kept = np.arange(len(first)) == first
     implies = (needs[:, None] >= needs[None]).all(axis=2) & kept[:, None] & kept[None]
-    return arrays.replace(
+    return dataclasses.replace(
+        arrays,
         edge_condition=jnp.asarray(first[np.asarray(arrays.edge_condition)], jnp.int32),
         class_mask=jnp.asarray(kept),
         condition_mask=jnp.asarray(kept),

@@ -45,7 +45,8 @@ def plan_actions(
       key: consumed under ``UctConfig``. Under ``BestFirstConfig`` nothing is drawn and any key gives the same plan; the
         argument is there so that one call serves both.
       config: which search, and its settings. Best-first search ends by itself on a small problem, on a large one after
-        ``config.simulations``; ``Plan.optimism_gap`` is 0 in the first case. PO-UCT always runs all simulations.
+        ``config.simulations``; ``Plan.lower_bound`` is ``Plan.value`` in the first case. PO-UCT always runs all
+        simulations.
 
     Returns:
       The plan.

@@ -12,12 +12,12 @@ class BestFirstConfig:
     """Settings of best-first search on bounds (``search.best_first``), the default; deterministic.
 
     Attributes:
-      simulations: descents per search; each adds at most one node. The search ends earlier once no gap between value
-        and bound is left at the root.
+      simulations: descents per search; each adds at most one node. The search ends earlier once it has proven its value
+        to be the optimum.
       optimism: fraction by which guessed values are assumed to be too high: the descent takes the action that would be
-        best if they all were. With 1 the search examines all that the guesses cannot rule out, so that a search that
-        ends by itself is exact. None: 0.7 in problems of up to 41 actions, where one wrong guess weighs more and there
-        is less to examine, otherwise 0.3 (docs/results/planner.md, "How optimistic?").
+        best if they all were. Once nothing is left to examine under this assumption, the search goes on as if it
+        were 1, so that one that ends by itself is exact. None: 0.7 in problems of up to 41 actions, where one wrong
+        guess weighs more and there is less to examine, otherwise 0.3 (docs/results/planner.md, "How optimistic?").
       max_depth: actions per descent. A descent that gets there is cut, valued by what is known of its last node, and
         flagged.
       tree_capacity: nodes per tree, at least 1; None for one more than simulations. A full tree is flagged.

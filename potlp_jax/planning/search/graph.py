@@ -48,7 +48,7 @@ class Costs:
     bound: Float32[Array, "*B"]
     floor: Float32[Array, "*B"]
 
-    def low(self, certifies: Bool[Array, "*B"]) -> Float32[Array, "*B"]:
+    def low(self, certifies: Bool[Array, "..."]) -> Float32[Array, "..."]:
         """What a descent minimises: the floor where the row certifies, elsewhere the bound."""
         return jnp.where(certifies, self.floor, self.bound)
 

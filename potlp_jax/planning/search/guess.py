@@ -5,9 +5,11 @@ another and no branch opens, so the expected cost of the rule is a sum along a s
 knowledge of what has failed, exact path costs, and a dead end where no action remains. Each success along the chain is
 worth what the rule costs from there on with nothing known (``make_rule``). Where a failure closes conditions of later
 states of the automaton too, the problem is **coupled**, and that would forget what matters: there every node values its
-successes anew, with its own chances (``value_successes_anew``). Ordering by cost per chance is optimal for independent tests
-without path costs between them (Mitten 1960). With path costs the rule is a policy like any other, so that a guess is
-seldom too low.
+successes anew, with its own chances (``value_successes_anew``). What fails within a chain is still forgotten after its
+successes, so that guesses are too low where dead ends are expensive and conditions shared.
+
+Ordering by cost per chance is optimal for independent tests without path costs between them (Mitten 1960). With path
+costs the rule is a policy like any other, so that a guess is seldom too low in problems that are not coupled.
 
 Everything here has a leading batch axis, written out by hand: a chain is a loop of a few operations on all rows.
 
