@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import jax
 import jax.ffi
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
@@ -78,14 +79,21 @@ def by_platform(library: str, native: Callable[..., _Result], twin: Callable[...
     leaves, structure = jax.tree.flatten(arguments)
     if any(jax.typeof(leaf).manual_axis_type.varying for leaf in leaves):
         return jax.lax.platform_dependent(*arguments, cpu=native, default=twin)
-    results, kinds = jax.tree.flatten(jax.eval_shape(native, *arguments))
+    structures = []
 
     def of_leaves(function: Callable[..., _Result]) -> Callable[..., list[jax.Array]]:
-        return lambda *leaves: jax.tree.leaves(function(*jax.tree.unflatten(structure, leaves)))
+        def flat(*leaves: jax.Array) -> list[jax.Array]:
+            results, kinds = jax.tree.flatten(function(*jax.tree.unflatten(structure, leaves)))
+            structures.append(kinds)
+            return results
 
+        return flat
+
+    # On leaves, because classes of arrays refuse shapes in their place.
+    results = jax.eval_shape(of_leaves(native), *leaves)
     shapes = tuple((result.shape, result.dtype) for result in results)
     found = _choice.bind(*leaves, native=of_leaves(native), twin=of_leaves(twin), shapes=shapes)
-    return jax.tree.unflatten(kinds, found)
+    return jax.tree.unflatten(structures[0], found)
 
 
 # A primitive and not `platform_dependent`, which traces both: the twins take seconds, and a program for CPU alone never
@@ -101,7 +109,7 @@ def _run(*leaves: jax.Array, **choice: Any) -> list[jax.Array]:
 
 @_choice.def_abstract_eval
 def _shapes_of_results(*_leaves: Any, shapes: tuple[tuple[tuple[int, ...], Any], ...], **_choice: Any) -> list[Any]:
-    return [jax.core.ShapedArray(shape, dtype) for shape, dtype in shapes]
+    return [ShapedArray(shape, dtype) for shape, dtype in shapes]
 
 
 def _vectorise(leaves: list[jax.Array], axes: list[Any], *, native: Any, twin: Any, shapes: Any) -> tuple[Any, Any]:

@@ -110,19 +110,19 @@ def _plan_shapes(problems: PlanningProblem) -> list[jax.ShapeDtypeStruct]:
     """Of the fields of ``Plan``, in order."""
     batch, actions = problems.dfa_state.shape, problems.action_count
     integers, floats = jax.ShapeDtypeStruct(batch, jnp.int32), jax.ShapeDtypeStruct(batch, jnp.float32)
-    shapes = Plan(
-        action=integers,
-        subgoal=integers,
-        from_state=integers,
-        to_state=integers,
-        value=floats,
-        q_values=jax.ShapeDtypeStruct((*batch, actions), jnp.float32),
-        visits=jax.ShapeDtypeStruct((*batch, actions), jnp.int32),
-        optimism_gap=floats,
-        lower_bound=floats,
-        status=jax.ShapeDtypeStruct(batch, jnp.uint32),
-    )
-    return [getattr(shapes, field.name) for field in dataclasses.fields(Plan)]
+    shapes = {
+        "action": integers,
+        "subgoal": integers,
+        "from_state": integers,
+        "to_state": integers,
+        "value": floats,
+        "q_values": jax.ShapeDtypeStruct((*batch, actions), jnp.float32),
+        "visits": jax.ShapeDtypeStruct((*batch, actions), jnp.int32),
+        "optimism_gap": floats,
+        "lower_bound": floats,
+        "status": jax.ShapeDtypeStruct(batch, jnp.uint32),
+    }
+    return [shapes[field.name] for field in dataclasses.fields(Plan)]
 
 
 def _tree_shapes(problems: PlanningProblem, config: BestFirstConfig) -> list[jax.ShapeDtypeStruct]:
@@ -134,24 +134,24 @@ def _tree_shapes(problems: PlanningProblem, config: BestFirstConfig) -> list[jax
         return jax.ShapeDtypeStruct((*batch, *shape), kind)
 
     costs, words, count = of(jnp.float32, nodes, actions), of(jnp.uint32, nodes, subgoals, 1), of(jnp.int32)
-    shapes = Tree(
-        q_values=costs,
-        bounds=costs,
-        floors=costs,
-        chances=costs,
-        success_costs=costs,
-        children=of(jnp.int32, nodes, actions, 2),
-        values=of(jnp.float32, nodes, VALUE_COLUMNS),
-        location=of(jnp.int32, nodes),
-        state=of(jnp.int32, nodes),
-        holds=words,
-        fails=words,
-        visited=of(jnp.uint32, nodes, subgoals + 1, 1),
-        table=of(jnp.int32, config.slots + PROBES, KEY_WORDS + 1),
-        root_visits=of(jnp.int32, actions),
-        size=count,
-        simulations=count,
-        steps=count,
-        status=of(jnp.uint32),
-    )
-    return [getattr(shapes, field.name) for field in dataclasses.fields(Tree)]
+    shapes = {
+        "q_values": costs,
+        "bounds": costs,
+        "floors": costs,
+        "chances": costs,
+        "success_costs": costs,
+        "children": of(jnp.int32, nodes, actions, 2),
+        "values": of(jnp.float32, nodes, VALUE_COLUMNS),
+        "location": of(jnp.int32, nodes),
+        "state": of(jnp.int32, nodes),
+        "holds": words,
+        "fails": words,
+        "visited": of(jnp.uint32, nodes, subgoals + 1, 1),
+        "table": of(jnp.int32, config.slots + PROBES, KEY_WORDS + 1),
+        "root_visits": of(jnp.int32, actions),
+        "size": count,
+        "simulations": count,
+        "steps": count,
+        "status": of(jnp.uint32),
+    }
+    return [shapes[field.name] for field in dataclasses.fields(Tree)]
