@@ -46,9 +46,9 @@ first, and is then final; in a cycle each pass adds one round. No experiment on 
 
 NESTED: int = 2
 """Successes in a row along a chain that are valued by what has failed in it; those after them forget it. With three
-things to find, 2 forget nothing. Chosen on the split ``tuning`` of the families ``shared``, ``shared-dear`` and
-``shared-rare``: 1 leaves a mean regret of 1.5 to 1.9 % in ``shared-dear``, at 300 and at 10,000 simulations. Each one
-more multiplies the time of a guess by the length of a chain."""
+things to find, 2 forget nothing. Chosen on the split ``tuning`` of ``shared-dear``, S = 4, 12 problems: with 1 the mean
+regret is 1.2 % after 300 simulations and 0.6 % after 10,000, with 2 it is 0.03 %. Each one more multiplies the time of
+a guess by the length of a chain."""
 
 
 @struct.dataclass(kw_only=True)
