@@ -13,10 +13,12 @@ from jaxtyping import Array, Int32
 
 from potlp_jax.bench.problems import family_problem
 from potlp_jax.planning.exact.api import solve_exact
+from potlp_jax.planning.history import terms_of_all
 from potlp_jax.planning.search import best_first
 from potlp_jax.planning.search.api import plan_actions, plan_within, search, search_tree
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
 from potlp_jax.planning.search.graph import NodeValues
+from potlp_jax.planning.search.guess import NEGLIGIBLE, NESTED, guess_outcomes
 from potlp_jax.planning.search.inspect import tree_top
 from potlp_jax.planning.search.lockstep import SearchMethod, run_search
 from potlp_jax.planning.search.plan import Plan
@@ -185,8 +187,69 @@ def test_successes_are_valued_by_what_has_failed():
 
 
 def make_rule_of(problem):
+    return prepared(problem).rule
+
+
+def prepared(problem):
     batch = jax.tree.map(lambda leaf: leaf[None], problem)
-    return best_first.prepare(batch, jnp.zeros((1, 2), jnp.uint32), BestFirstConfig()).rule
+    return best_first.prepare(batch, jnp.zeros((1, 2), jnp.uint32), BestFirstConfig())
+
+
+@pytest.mark.parametrize("family", ["shared", "shared-dear"])
+def test_guesses_of_coupled_problems_are_what_the_rule_costs(family):
+    context = prepared(family_problem(family, 2, "tuning", 1))
+    terms = jax.vmap(terms_of_all)(context.model.tables, context.model.root)
+    root = context.model.product_state(context.model.root.location, context.model.root.state)
+    chance, success_cost, available = terms.success_probability, terms.success_cost, terms.available
+    guesses = guess_outcomes(context.rule, root, jnp.zeros(1), available, chance, success_cost, 24)
+    after_failure, after_success = (np.asarray(guess[0]) for guess in guesses)
+    rule = jax.tree.map(lambda leaf: leaf[0], context.rule)
+    chance, success_cost = (np.asarray(array[0], np.float64) for array in (chance, success_cost))
+    tried = chance > 0
+    chosen = np.flatnonzero(np.asarray(available[0] & (rule.product_states >= 0)))
+    assert len(chosen) > 2
+    for action in chosen:
+        at, remaining = int(rule.product_states[action]), tried & ~np.asarray(rule.closes[action])
+        expected = rest_of_chain(rule, chance, success_cost, at, rule.failure_cost[action], remaining, NESTED)
+        np.testing.assert_allclose(after_failure[action], expected, rtol=1e-4)
+        at = int(rule.success_states[action])
+        if at >= 0:
+            expected = rest_of_chain(rule, chance, success_cost, at, success_cost[action], tried, NESTED)
+            np.testing.assert_allclose(after_success[action], expected, rtol=1e-4)
+
+
+def rest_of_chain(rule, chance, success_cost, at, pending_cost, remaining, nested, reached=1.0):
+    """What the rule costs from a product state on, where only ``remaining`` actions can succeed, by plain recursion."""
+    distance = np.where(rule.product_states == at, 0.0, np.asarray(rule.path_costs)[at] + pending_cost)
+    after = np.asarray(rule.after_success, np.float64)
+    attempt = distance + chance * (success_cost + after) + (1 - chance) * np.asarray(rule.failure_cost)
+    ratio = np.where(remaining, attempt / np.where(remaining, chance, 1.0), np.inf)
+    best = int(np.argmin(ratio))
+    if reached <= NEGLIGIBLE or np.isinf(ratio[best]):
+        return float(rule.dead_end_cost)
+    succeeds, success_state = after[best], int(rule.success_states[best])
+    if nested > 0 and success_state >= 0:
+        pending = success_cost[best]
+        succeeds = rest_of_chain(rule, chance, success_cost, success_state, pending, remaining, nested - 1)
+    rest, at = remaining & ~np.asarray(rule.closes[best]), int(rule.product_states[best])
+    pending = float(rule.failure_cost[best])
+    fails = 0.0
+    if chance[best] < 1:
+        reached *= 1 - chance[best]
+        fails = rest_of_chain(rule, chance, success_cost, at, pending, rest, nested, reached)
+    success = chance[best] * (success_cost[best] + succeeds)
+    return distance[best] + success + (1 - chance[best]) * (pending + fails)
+
+
+def test_more_simulations_do_not_mislead_where_dead_ends_are_dear():
+    """Guesses that forgot failures within a chain chose worse the more was examined."""
+    problems = [family_problem("shared-dear", 3, "tuning", index) for index in range(6)]
+    solutions = [solve_exact(problem) for problem in problems]
+    for simulations in (100, 600):
+        plans = plan_many(problems, keys(len(problems)), BestFirstConfig(simulations=simulations))
+        actions = np.asarray(plans.action)
+        regret = [own.q_values[actions[i]] / own.value - 1 for i, own in enumerate(solutions)]
+        assert np.mean(regret) < 0.01
 
 
 def test_the_optimism_gap_says_what_its_description_says(rare_successes, rare_solutions):

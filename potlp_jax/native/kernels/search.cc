@@ -24,6 +24,7 @@ constexpr float kInf = INFINITY;
 constexpr float kCostLimit = 1e30f;
 constexpr float kNegligible = 1e-3f;   // guess.NEGLIGIBLE
 constexpr int kPasses = 4;             // guess.PASSES
+constexpr int kNested = 2;             // guess.NESTED
 constexpr float kLeastGuess = 1e-4f;   // best_first.LEAST_GUESS
 constexpr int kProbes = 8;             // graph.PROBES
 constexpr int kNone = -1;              // NO_STATE, NO_SUBGOAL, NO_ACTION, NO_CLASS, NOWHERE, UNVISITED
@@ -185,6 +186,9 @@ struct Chain {
   std::vector<int> position;
   std::vector<float> cost, chance, rest;
   int length;
+  // While it is followed: of the candidates, and what has failed at each subgoal.
+  std::vector<float> ratio, inverse;
+  std::vector<Set> failed;
 };
 
 struct Level {
@@ -569,10 +573,7 @@ class Search {
       for (const int edge : edge_order_) {
         const int to = in_.edges[2 * edge + 1];
         valued_.clear();
-        for (int k = 0; k < count; ++k) {
-          const bool counts = k == count - 1 || leads(to, actions_[k].from_state);
-          if (counts && all_chance_[k] > 0) add_candidate(valued_, k, all_chance_[k], all_cost_[k], after);
-        }
+        list_tried(valued_, to, after);
         for (int s = 0; s < S; ++s) {
           if (!subgoal_real_[s]) continue;
           follow(valued_, s * Z + to, all_cost_[action_at_[s * E + edge]]);
@@ -586,51 +587,117 @@ class Search {
     }
   }
 
-  // guess._follow_chain: the action of least cost per chance, as long as all fail.
   void follow(const Candidates& list, int product_state, float pending_cost) {
+    chain_.inverse = list.inverse_chance;
+    follow(chain_, list, product_state, pending_cost, 0);
+  }
+
+  // guess._follow_chain: the action of least cost per chance, as long as all fail; `nested` of its successes in a row are
+  // valued by what has failed before.
+  void follow(Chain& chain, const Candidates& list, int product_state, float pending_cost, int nested) {
     const int count = list.size(), most = settings_.guess_failures;
-    inverse_ = list.inverse_chance;
-    ratio_.resize(count);
-    chain_.position.clear();
-    chain_.cost.clear();
-    chain_.chance.clear();
+    chain.ratio.resize(count);
+    chain.position.clear();
+    chain.cost.clear();
+    chain.chance.clear();
     float reached = 1;
     bool active = true;
-    for (chain_.length = 0; active && chain_.length < most; ++chain_.length) {
+    for (chain.length = 0; active && chain.length < most; ++chain.length) {
       const float* costs = path_costs(product_state);
       for (int i = 0; i < count; ++i) {
         const float away = costs[list.action[i]] + pending_cost;
         const float distance = list.product_state[i] == product_state ? 0.0f : away;
-        const float ratio = (distance + list.attempt_cost[i]) * inverse_[i];
-        ratio_[i] = inverse_[i] == kInf ? kInf : ratio;
+        const float ratio = (distance + list.attempt_cost[i]) * chain.inverse[i];
+        chain.ratio[i] = chain.inverse[i] == kInf ? kInf : ratio;
       }
-      const float least = least_of(ratio_.data(), count);
+      const float least = least_of(chain.ratio.data(), count);
       if (std::isinf(least)) break;
-      const int taken = first_at_most(ratio_.data(), count, least);
+      const int taken = first_at_most(chain.ratio.data(), count, least);
       const Action& action = actions_[list.action[taken]];
       const float chance = list.chance[taken];
-      chain_.position.push_back(taken);
-      chain_.cost.push_back(least * chance);
-      chain_.chance.push_back(chance);
+      float cost = least * chance;
+      if (nested > 0) {
+        if (leads_on(action)) {
+          const int k = list.action[taken];
+          cost += chance * rest_after(nested - 1, success_state(action), all_cost_[k], chain.failed);
+          cost -= chance * after_[k];
+        }
+        chain.failed[action.subgoal] |= action.backward;
+      }
+      chain.position.push_back(taken);
+      chain.cost.push_back(cost);
+      chain.chance.push_back(chance);
       reached *= 1.0f - chance;
       active = reached > kNegligible;
-      close_failed(list, taken, action);
+      close_failed(chain, list, taken, action);
       product_state = action.product_state;
       pending_cost = action.failure_cost;
     }
-    chain_.rest.resize(chain_.length + 1);
-    chain_.rest[chain_.length] = dead_end_cost_;
-    for (int level = chain_.length - 1; level >= 0; --level) {
-      chain_.rest[level] = chain_.cost[level] + (1.0f - chain_.chance[level]) * chain_.rest[level + 1];
+    chain.rest.resize(chain.length + 1);
+    chain.rest[chain.length] = dead_end_cost_;
+    for (int level = chain.length - 1; level >= 0; --level) {
+      chain.rest[level] = chain.cost[level] + (1.0f - chain.chance[level]) * chain.rest[level + 1];
     }
   }
 
+  bool leads_on(const Action& action) const { return !action.accepts && action.subgoal < static_cast<int>(shape_.S); }
+
+  int success_state(const Action& action) const { return action.subgoal * shape_.Z + action.to_state; }
+
+  // What the rule costs from a product state on, by what `history_` knows and what else has failed.
+  float rest_after(int nested, int product_state, float pending_cost, const std::vector<Set>& failed) {
+    Chain& chain = nested_[nested];
+    const Candidates& list = tried_from(product_state % shape_.Z);
+    chain.inverse = list.inverse_chance;
+    chain.failed = failed;
+    for (int i = 0; i < list.size(); ++i) {
+      const Action& action = actions_[list.action[i]];
+      if (failed[action.subgoal] & action.condition) chain.inverse[i] = kInf;
+    }
+    follow(chain, list, product_state, pending_cost, nested);
+    return chain.rest[0];
+  }
+
+  // What chains from a state of the automaton may take, by what `history_` knows.
+  const Candidates& tried_from(int state) {
+    Candidates& list = tried_[state];
+    // Finish is in every list that has been made.
+    if (list.size() == 0) list_tried(list, state, after_);
+    return list;
+  }
+
+  void list_tried(Candidates& list, int state, const std::vector<float>& after) const {
+    const int count = actions_.size();
+    for (int k = 0; k < count; ++k) {
+      const bool counts = k == count - 1 || leads(state, actions_[k].from_state);
+      if (counts && all_chance_[k] > 0) add_candidate(list, k, all_chance_[k], all_cost_[k], after);
+    }
+  }
+
+  // guess._guess_each: the guess after each candidate's failure into `without_`, after its success into `after_`.
+  void guess_each(const Candidates& list) {
+    const int count = list.size();
+    const std::vector<Set> none(shape_.S + 1, 0);
+    without_.assign(count, dead_end_cost_);
+    anew_.assign(count, 0);
+    for (int i = 0; i < count; ++i) {
+      const Action& action = actions_[list.action[i]];
+      if (action.subgoal == static_cast<int>(shape_.S)) continue;
+      std::vector<Set> failed = none;
+      failed[action.subgoal] = action.backward;
+      without_[i] = rest_after(kNested, action.product_state, action.failure_cost, failed);
+      if (leads_on(action)) anew_[i] = rest_after(kNested, success_state(action), all_cost_[list.action[i]], none);
+    }
+    // Only now: the chains need what the successes are worth to the rule.
+    for (int i = 0; i < count; ++i) after_[list.action[i]] = anew_[i];
+  }
+
   // Takes out what fails with an action; actions of one subgoal lie side by side.
-  void close_failed(const Candidates& list, int taken, const Action& action) {
+  void close_failed(Chain& chain, const Candidates& list, int taken, const Action& action) {
     const auto closes = [&](int i) {
       const Action& other = actions_[list.action[i]];
       if (other.subgoal != action.subgoal) return false;
-      if (action.backward & other.condition) inverse_[i] = kInf;
+      if (action.backward & other.condition) chain.inverse[i] = kInf;
       return true;
     };
     for (int i = taken; i >= 0 && closes(i); --i) continue;
@@ -671,8 +738,12 @@ class Search {
     list_available(node);
     const int count = node.count = list_.size();
     const std::vector<float>& after = coupled_ ? after_ : after_root_;
-    follow(list_, node.location * shape_.Z + node.state, history_.pending_cost);
-    guess_failures(list_);
+    if (coupled_) {
+      guess_each(list_);
+    } else {
+      follow(list_, node.location * shape_.Z + node.state, history_.pending_cost);
+      guess_failures(list_);
+    }
     const float least = kLeastGuess * dead_end_cost_, doubt = 1.0f - optimism_;
     const size_t size = node.first + count;
     for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) values->resize(size);
@@ -752,6 +823,8 @@ class Search {
                       all_cost_[k]);
     }
     value_successes(after_);
+    tried_.resize(shape_.Z);
+    for (Candidates& list : tried_) list.clear();
   }
 
   void plant() {
@@ -1166,8 +1239,9 @@ class Search {
   History history_;
   std::vector<Level> levels_;
   Candidates list_, valued_;
-  Chain chain_;
-  std::vector<float> ratio_, inverse_, path_, score_, after_, all_chance_, all_cost_, new_values_, without_;
+  std::vector<Candidates> tried_;
+  Chain chain_, nested_[kNested + 1];
+  std::vector<float> anew_, path_, score_, after_, all_chance_, all_cost_, new_values_, without_;
 };
 
 // One array of a batch: the row of every array lies behind that of the row before.
