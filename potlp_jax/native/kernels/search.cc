@@ -134,11 +134,11 @@ inline uint32_t mix(uint32_t bits) {
   return bits ^ (bits >> 16);
 }
 
-inline int32_t as_guess(float value) {
-  const float negative = -std::fabs(value);
-  int32_t bits;
-  std::memcpy(&bits, &negative, sizeof bits);
-  return bits;
+// Costs that are not negative, as bits that are.
+inline Marks as_guesses(const Lanes& values) {
+  Marks bits;
+  std::memcpy(&bits, &values, sizeof bits);
+  return bits | INT32_MIN;
 }
 
 inline float guess_in(int32_t child) {
@@ -179,6 +179,7 @@ struct Node {
   int first, width;             // its entries: those of `StateActions` of its state; none where nothing is left to do
   int stay_begin, stay_end;     // those that stay inside, counted from `first`
   int location, state, product_state;
+  bool whole;                   // Entries of what is not available have chances and costs too.
   NodeValues values;
 };
 
@@ -557,8 +558,8 @@ class Search {
 
   // ---- What a history knows -----------------------------------------------------------------------------------------
 
-  // history.knowledge_terms; gives whether the action's condition is known to hold.
-  bool knowledge_terms(int k, Set holds, Set fails, float& chance_out, float& cost_out) const {
+  // history.knowledge_terms.
+  void knowledge_terms(int k, Set holds, Set fails, float& chance_out, float& cost_out) const {
     const int K = shape_.K;
     const bool certain = holds & actions_[k].condition;
     float probability = 0, cost = kInf;
@@ -579,7 +580,6 @@ class Search {
     }
     chance_out = certain ? 1.0f : probability;
     cost_out = std::isinf(cost) ? 0.0f : cost;
-    return certain;
   }
 
   Set propagate_failures(Set fails) const {
@@ -811,24 +811,23 @@ class Search {
 
   // ---- Nodes --------------------------------------------------------------------------------------------------------
 
-  // best_first._new_node: the entries of `history_` behind all others.
-  Node new_node() {
+  // best_first._new_node: the entries of `history_` behind all others; `parent` is where it comes from, or kNone.
+  Node new_node(int parent) {
     Node node{};
-    node.first = q_.size();
+    node.first = entries_;
     node.location = history_.location;
     node.state = history_.state;
     node.product_state = node.location * shape_.Z + node.state;
     StateActions& own = actions_from(node.state);
     node.width = state_accepts_[node.state] || invalid_ ? 0 : own.width;
-    const size_t size = node.first + node.width;
-    for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) values->resize(size);
-    child_.resize(2 * size);
+    keep_entries(node.first + node.width);
     node.values = {{kInf, kInf, kInf}, {kInf, kInf, kInf}, 0};
     if (node.width == 0) return node;
+    node.whole = true;
     find_stay(node, own);
     if (coupled_) value_anew();
     value_entries(own, coupled_ ? after_ : after_root_);
-    list_available(node, own);
+    list_available(node, own, parent);
     if (coupled_) {
       guess_each(list_);
       own.valued = false;
@@ -841,6 +840,14 @@ class Search {
     fill_entries(node, own);
     node.values = {least_leaving(node, kNone), least_staying(node, kNone), 0};
     return node;
+  }
+
+  // Makes room, for more than that, and lets it hold what it held: entries are written before they are read.
+  void keep_entries(size_t size) {
+    entries_ = size;
+    if (size <= q_.size()) return;
+    for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) values->resize(2 * size);
+    for (auto& children : child_) children.resize(2 * size);
   }
 
   // Those of a subgoal and a state lie side by side.
@@ -883,9 +890,9 @@ class Search {
       store(floor_, at, known);
       store(chance_, at, chance);
       store(success_cost_, at, success_cost);
-      for (int lane = 0; lane < kLanes; ++lane) {
-        child_[2 * (at + lane)] = as_guess(after_failure[lane]);
-        child_[2 * (at + lane) + 1] = as_guess(after_success[lane]);
+      const Marks guesses[2] = {as_guesses(after_failure), as_guesses(after_success)};
+      for (int success = 0; success < 2; ++success) {
+        std::memcpy(child_[success].data() + at, &guesses[success], sizeof guesses[success]);
       }
     }
   }
@@ -922,26 +929,45 @@ class Search {
   }
 
   // history.terms_of_all: chances and costs of `history_` into `list_`, path costs into `path_`, inf where not available.
-  void list_available(const Node& node, StateActions& own) {
+  void list_available(const Node& node, StateActions& own, int parent) {
     list_.actions = &own;
-    list_.chance = own.chance;
-    list_.success_cost = own.success_cost;
     const float* costs = path_costs(own, node.product_state);
     path_.assign(costs, costs + own.width);
-    for (int s = 0; s < static_cast<int>(shape_.S); ++s) {
-      const Set holds = history_.holds[s], fails = history_.fails[s];
-      if ((holds | fails) == 0) continue;
-      for (int i = own.first_of[s]; i < own.first_of[s + 1]; ++i) {
-        const int k = own.action[i];
-        const bool certain = knowledge_terms(k, holds, fails, list_.chance[i], list_.success_cost[i]);
-        // A rollout that repeats what it knows, and ends where it has been, would go round in circles for ever.
-        if (certain && (history_.visited[s] & actions_[k].end)) path_[i] = kInf;
-      }
+    if (parent != kNone && nodes_[parent].whole && nodes_[parent].state == node.state) {
+      const int first = nodes_[parent].first;
+      list_.chance.assign(chance_.data() + first, chance_.data() + first + own.width);
+      list_.success_cost.assign(success_cost_.data() + first, success_cost_.data() + first + own.width);
+      // The parent knew the same of all other subgoals.
+      know(own, node.location);
+    } else {
+      list_.chance = own.chance;
+      list_.success_cost = own.success_cost;
+      for (int s = 0; s < static_cast<int>(shape_.S); ++s) know(own, s);
     }
+    for (int s = 0; s < static_cast<int>(shape_.S); ++s) close_circles(own, s);
     value_attempts(list_);
     for (int i = 0; i < own.width; ++i) {
       path_[i] = list_.chance[i] > 0 ? path_[i] : kInf;
       list_.attempt_cost[i] = path_[i] < kInf ? list_.attempt_cost[i] : kInf;
+    }
+  }
+
+  // Chances and costs at a subgoal that something is known of.
+  void know(const StateActions& own, int s) {
+    if (s == static_cast<int>(shape_.S)) return;
+    const Set holds = history_.holds[s], fails = history_.fails[s];
+    if ((holds | fails) == 0) return;
+    for (int i = own.first_of[s]; i < own.first_of[s + 1]; ++i) {
+      knowledge_terms(own.action[i], holds, fails, list_.chance[i], list_.success_cost[i]);
+    }
+  }
+
+  // A rollout that repeats what it knows, and ends where it has been, would go round in circles for ever.
+  void close_circles(const StateActions& own, int s) {
+    const Set holds = history_.holds[s], visited = history_.visited[s];
+    if (holds == 0 || visited == 0) return;
+    for (int i = own.first_of[s]; i < own.first_of[s + 1]; ++i) {
+      if ((holds & own.condition[i]) && (visited & actions_[own.action[i]].end)) path_[i] = kInf;
     }
   }
 
@@ -972,7 +998,7 @@ class Search {
     root_visits_.assign(actions_.size(), 0);
     simulations_ = steps_ = 0;
     status_ = 0;
-    keep(new_node());
+    keep(new_node(kNone));
   }
 
   // Adds the node that `history_` has just been given.
@@ -1040,7 +1066,7 @@ class Search {
     const Costs leaf = expand(descent, child);
     back_up(leaf);
     // Linked last, to the node that the descent left the graph from.
-    if (child != kNone) child_[2 * (nodes_[descent.node].first + descent.entry) + descent.success] = child;
+    if (child != kNone) child_[descent.success][nodes_[descent.node].first + descent.entry] = child;
     if (levels_.empty()) return;
     root_visits_[action_of(nodes_[0], levels_[0].entry)] += 1;
     simulations_ += 1;
@@ -1072,8 +1098,8 @@ class Search {
     const float path_cost = path_costs(state_actions_[node.state], node.product_state)[entry];
     // Follow the outcome that contributes more to the gap.
     const float chance = chance_[at], success_cost = success_cost_[at], failure_cost = action.failure_cost;
-    const Costs after_success = outcome_costs(child_[2 * at + 1], success_cost, is_last);
-    const Costs after_failure = outcome_costs(child_[2 * at], failure_cost, is_last);
+    const Costs after_success = outcome_costs(child_[1][at], success_cost, is_last);
+    const Costs after_failure = outcome_costs(child_[0][at], failure_cost, is_last);
     const float success_gap = chance * (after_success.value - after_success.low(certifies));
     const float failure_gap = (1.0f - chance) * (after_failure.value - after_failure.low(certifies));
     // Nothing is to be learnt from satisfying the task, and a certain success cannot fail.
@@ -1085,7 +1111,7 @@ class Search {
     const Costs& other = success ? after_failure : after_success;
     level.base = {known + rest * other.value, known + rest * other.bound, known + rest * other.floor};
     levels_.push_back(level);
-    const int child = child_[2 * at + success];
+    const int child = child_[success][at];
     descent.entry = entry;
     descent.success = success;
     descent.accepted = success && action.accepts;
@@ -1141,7 +1167,7 @@ class Search {
       }
     }
     if (child != kNone) return nodes_[child].values.on_arrival(descent.pending_cost, dead_end_cost_);
-    const Node node = new_node();
+    const Node node = new_node(descent.node);
     if (static_cast<int64_t>(nodes_.size()) < settings_.capacity) {
       child = nodes_.size();
       keep(node);
@@ -1152,14 +1178,9 @@ class Search {
       }
     } else {
       status_ |= kTreeOverflow;
-      drop_entries(node.first);
+      entries_ = node.first;
     }
     return node.values.on_arrival(descent.pending_cost, dead_end_cost_);
-  }
-
-  void drop_entries(size_t size) {
-    for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) values->resize(size);
-    child_.resize(2 * size);
   }
 
   void back_up(Costs after) {
@@ -1242,7 +1263,7 @@ class Search {
         tree.floors[entry] = floor_[at];
         tree.chances[entry] = chance_[at];
         tree.success_costs[entry] = success_cost_[at];
-        std::copy(child_.data() + 2 * at, child_.data() + 2 * at + 2, tree.children + 2 * entry);
+        for (int success = 0; success < 2; ++success) tree.children[2 * entry + success] = child_[success][at];
       }
       const NodeValues& own = node.values;
       const float values[7] = {own.leave.value, own.stay.value,  own.leave.bound, own.stay.bound,
@@ -1270,7 +1291,7 @@ class Search {
     visited_.assign(tree.visited, tree.visited + nodes * (S + 1));
     for (int64_t n = 0; n < nodes; ++n) {
       Node node{};
-      node.first = q_.size();
+      node.first = entries_;
       node.location = tree.location[n];
       node.state = tree.state[n];
       const float* own = tree.values + n * 7;
@@ -1291,10 +1312,8 @@ class Search {
     const StateActions& own = actions_from(node.state);
     find_stay(node, own);
     node.width = own.width;
-    const size_t size = node.first + own.width;
-    for (auto* costs : {&q_, &bound_, &floor_}) costs->resize(size, kInf);
-    for (auto* terms : {&chance_, &success_cost_}) terms->resize(size);
-    child_.resize(2 * size, kNone);
+    keep_entries(node.first + own.width);
+    for (auto* costs : {&q_, &bound_, &floor_}) std::fill_n(costs->begin() + node.first, own.width, kInf);
     for (int i = 0; i < own.count; ++i) {
       const int64_t entry = row + actions_[own.action[i]].id;
       if (std::isinf(tree.q_values[entry])) continue;
@@ -1304,15 +1323,18 @@ class Search {
       floor_[at] = tree.floors[entry];
       chance_[at] = tree.chances[entry];
       success_cost_[at] = tree.success_costs[entry];
-      std::copy(tree.children + 2 * entry, tree.children + 2 * entry + 2, child_.data() + 2 * at);
+      for (int success = 0; success < 2; ++success) child_[success][at] = tree.children[2 * entry + success];
     }
   }
 
   // Empties the graph; a large one gives its memory back.
   void forget() {
     const bool large = q_.size() > kKeptEntries;
-    for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) empty(*values, large);
-    empty(child_, large);
+    entries_ = 0;
+    if (large) {
+      for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) empty(*values, large);
+      for (auto& children : child_) empty(children, large);
+    }
     empty(nodes_, large);
     empty(table_, large);
     for (auto* sets : {&holds_, &fails_, &visited_}) empty(*sets, large);
@@ -1345,7 +1367,8 @@ class Search {
   std::vector<Node> nodes_;
   std::vector<Set> holds_, fails_, visited_;
   std::vector<float> q_, bound_, floor_, chance_, success_cost_;
-  std::vector<int32_t> child_;
+  std::vector<int32_t> child_[2];  // after a failure, after a success
+  int entries_ = 0;
   std::vector<int32_t> table_, root_visits_;
   int32_t simulations_, steps_;
   uint32_t status_;
