@@ -12,6 +12,10 @@
 #include <cstring>
 #include <vector>
 
+#ifdef __AVX__
+#include <immintrin.h>
+#endif
+
 #include "rows.h"
 #include "xla/ffi/api/ffi.h"
 
@@ -99,6 +103,15 @@ inline Marks all_lanes(int32_t value) { return Marks{} + value; }
 
 inline float lesser(float first, float second) { return first < second ? first : second; }
 
+// The same choice either way; compilers do not find the one instruction for it by themselves.
+inline Lanes lesser(const Lanes& first, const Lanes& second) {
+#ifdef __AVX__
+  return _mm256_min_ps(first, second);
+#else
+  return first < second ? first : second;
+#endif
+}
+
 // The least lane.
 template <typename Value, typename Vector>
 inline Value least_lane(const Vector& lanes) {
@@ -118,7 +131,7 @@ struct Least {
 
   void take(const Lanes& lanes) {
     const Marks lower = lanes < values;
-    values = lower ? lanes : values;
+    values = lesser(lanes, values);
     places = lower ? next : places;
     next += kLanes;
   }
@@ -778,8 +791,11 @@ class Search {
 
   // Takes out what fails with an action.
   static void close_failed(Chain& chain, const StateActions& own, const Action& action) {
+    float* open_cost = chain.open_cost.data();
+    const Set* condition = own.condition.data();
     for (int i = own.first_of[action.subgoal]; i < own.first_of[action.subgoal + 1]; ++i) {
-      if (action.backward & own.condition[i]) chain.open_cost[i] = kInf;
+      // Without a branch, which would often be foreseen wrongly.
+      open_cost[i] = action.backward & condition[i] ? kInf : open_cost[i];
     }
   }
 
@@ -908,7 +924,7 @@ class Search {
       const Marks out = (load(at + i) == node.product_state) | (place == without);
       const auto take = [&](Lanes& least, const float* own) {
         const Lanes next = out ? never : load(own + i);
-        least = next < least ? next : least;
+        least = lesser(next, least);
       };
       take(values, q);
       take(bounds, bound);
