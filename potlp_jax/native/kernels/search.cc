@@ -211,9 +211,10 @@ struct StateActions {
   std::vector<Set> condition;
   std::vector<float> failure_cost, chance, success_cost;  // with nothing known
   std::vector<float> after, after_success;  // what a success is worth, to the rule and to an entry
-  // Path costs to each action from a product state, and to an action from where each one fails; 0 inside.
+  // Path costs to each action from a product state, and to a product state from where each action fails; 0 inside. Made
+  // when they are wanted: where they begin is kNone before.
   std::vector<float> rows, columns;
-  std::vector<uint8_t> row_made, column_made;
+  std::vector<int> row_at, column_at;
 };
 
 // What a chain of failures needs of the actions from a state; attempts of what is not available cost inf.
@@ -525,11 +526,10 @@ class Search {
       own.chance[i] = action.chance;
       own.success_cost[i] = action.success_cost;
     }
-    const int product_states = (S + 1) * shape_.Z;
-    own.rows.resize(product_states * width);
-    own.row_made.assign(product_states, 0);
-    own.columns.resize(own.count * width);
-    own.column_made.assign(own.count, 0);
+    own.rows.clear();
+    own.columns.clear();
+    own.row_at.assign((S + 1) * shape_.Z, kNone);
+    own.column_at.assign((S + 1) * shape_.Z + 1, kNone);
   }
 
   float path_cost(int product_state, const Action& action) const {
@@ -543,10 +543,11 @@ class Search {
 
   // To each action from a product state.
   const float* path_costs(StateActions& own, int product_state) const {
-    float* costs = own.rows.data() + product_state * own.width;
-    if (own.row_made[product_state]) return costs;
-    own.row_made[product_state] = true;
-    std::fill(costs + own.count, costs + own.width, kInf);
+    int& at = own.row_at[product_state];
+    if (at != kNone) return own.rows.data() + at;
+    at = own.rows.size();
+    own.rows.resize(at + own.width, kInf);
+    float* costs = own.rows.data() + at;
     for (int i = 0; i < own.count; ++i) {
       const Action& action = actions_[own.action[i]];
       costs[i] = action.product_state == product_state ? 0.0f : path_cost(product_state, action);
@@ -556,11 +557,13 @@ class Search {
 
   // To one action from where each one has failed, with R_F.
   const float* costs_to_begin(StateActions& own, int start) const {
-    float* costs = own.columns.data() + start * own.width;
-    if (own.column_made[start]) return costs;
-    own.column_made[start] = true;
-    std::fill(costs + own.count, costs + own.width, 0.0f);
     const Action& first = actions_[own.action[start]];
+    // Finish, which lies nowhere, has the first column.
+    int& at = own.column_at[first.product_state + 1];
+    if (at != kNone) return own.columns.data() + at;
+    at = own.columns.size();
+    own.columns.resize(at + own.width, 0.0f);
+    float* costs = own.columns.data() + at;
     for (int i = 0; i < own.count; ++i) {
       const int from = own.product_state[i];
       const bool inside = from == first.product_state;
@@ -944,7 +947,8 @@ class Search {
     return least;
   }
 
-  // history.terms_of_all: chances and costs of `history_` into `list_`, path costs into `path_`, inf where not available.
+  // history.terms_of_all: chances and costs of `history_` into `list_`, path costs into `path_`: inf of what is not
+  // available.
   void list_available(const Node& node, StateActions& own, int parent) {
     list_.actions = &own;
     const float* costs = path_costs(own, node.product_state);
