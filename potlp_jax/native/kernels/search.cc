@@ -2,7 +2,8 @@
 //
 // The whole search of a row of a batch in one call, with the same operations in the same order, so that plans are equal
 // bit for bit; the Python modules say why things are as they are. What differs is what is left out: actions that are
-// padding or that no rollout can reach have no entries, and a node has entries for its available actions alone.
+// padding or that no rollout can reach have no entries, and a node has entries only for actions that its state of the
+// automaton leads to. Entries of actions that are not available cost inf, as does the padding to whole lanes.
 //
 // Names are those of the twin: R_S success_cost, R_F failure_cost, a product state is location * Z + state.
 
@@ -10,6 +11,10 @@
 #include <cstdint>
 #include <cstring>
 #include <vector>
+
+#ifdef __AVX__
+#include <immintrin.h>
+#endif
 
 #include "rows.h"
 #include "xla/ffi/api/ffi.h"
@@ -76,7 +81,10 @@ struct PlanArrays {
 };
 
 // Eight lanes at a time: compilers do not vectorise a minimum of floats by themselves, because of NaN.
+constexpr int kLanes = 8;
 typedef float Lanes __attribute__((vector_size(32)));
+typedef int32_t Marks __attribute__((vector_size(32)));
+constexpr Marks kCounting = {0, 1, 2, 3, 4, 5, 6, 7};
 
 inline Lanes load(const float* values) {
   Lanes lanes;
@@ -84,28 +92,54 @@ inline Lanes load(const float* values) {
   return lanes;
 }
 
+inline Marks load(const int32_t* values) {
+  Marks lanes;
+  std::memcpy(&lanes, values, sizeof lanes);
+  return lanes;
+}
+
+inline Lanes all_lanes(float value) { return Lanes{} + value; }
+inline Marks all_lanes(int32_t value) { return Marks{} + value; }
+
 inline float lesser(float first, float second) { return first < second ? first : second; }
 
-inline float least_of(const float* values, int count) {
-  float least = kInf;
-  int i = 0;
-  if (count >= 8) {
-    Lanes lanes = load(values);
-    for (i = 8; i + 8 <= count; i += 8) {
-      const Lanes next = load(values + i);
-      lanes = next < lanes ? next : lanes;
-    }
-    for (int lane = 0; lane < 8; ++lane) least = lesser(lanes[lane], least);
-  }
-  for (; i < count; ++i) least = lesser(values[i], least);
-  return least;
+// The same choice either way; compilers do not find the one instruction for it by themselves.
+inline Lanes lesser(const Lanes& first, const Lanes& second) {
+#ifdef __AVX__
+  return _mm256_min_ps(first, second);
+#else
+  return first < second ? first : second;
+#endif
 }
 
-inline int first_at_most(const float* values, int count, float least) {
-  int i = 0;
-  while (i < count && !(values[i] <= least)) ++i;
-  return i;
+// The least lane.
+template <typename Value, typename Vector>
+inline Value least_lane(const Vector& lanes) {
+  typedef Value Half __attribute__((vector_size(16)));
+  Half low, high;
+  std::memcpy(&low, &lanes, sizeof low);
+  std::memcpy(&high, reinterpret_cast<const char*>(&lanes) + sizeof low, sizeof high);
+  low = high < low ? high : low;
+  const Value first = low[1] < low[0] ? low[1] : low[0], second = low[3] < low[2] ? low[3] : low[2];
+  return second < first ? second : first;
 }
+
+// The least of values that come eight at a time, and the first place that holds it.
+struct Least {
+  Lanes values = all_lanes(kInf);
+  Marks places = {}, next = kCounting;
+
+  void take(const Lanes& lanes) {
+    const Marks lower = lanes < values;
+    values = lesser(lanes, values);
+    places = lower ? next : places;
+    next += kLanes;
+  }
+  float value() const { return least_lane<float>(values); }
+  int place(float least) const {
+    return least_lane<int32_t, Marks>(values == least ? places : all_lanes(int32_t{INT32_MAX}));
+  }
+};
 
 inline uint32_t mix(uint32_t bits) {
   bits = (bits ^ (bits >> 16)) * 0x85EBCA6Bu;
@@ -113,11 +147,11 @@ inline uint32_t mix(uint32_t bits) {
   return bits ^ (bits >> 16);
 }
 
-inline int32_t as_guess(float value) {
-  const float negative = -std::fabs(value);
-  int32_t bits;
-  std::memcpy(&bits, &negative, sizeof bits);
-  return bits;
+// Costs that are not negative, as bits that are.
+inline Marks as_guesses(const Lanes& values) {
+  Marks bits;
+  std::memcpy(&bits, &values, sizeof bits);
+  return bits | INT32_MIN;
 }
 
 inline float guess_in(int32_t child) {
@@ -155,9 +189,10 @@ struct Action {
 };
 
 struct Node {
-  int first, count;             // its entries
+  int first, width;             // its entries: those of `StateActions` of its state; none where nothing is left to do
   int stay_begin, stay_end;     // those that stay inside, counted from `first`
-  int location, state;
+  int location, state, product_state;
+  bool whole;                   // Entries of what is not available have chances and costs too.
   NodeValues values;
 };
 
@@ -167,28 +202,32 @@ struct History {
   std::vector<Set> holds, fails, visited;
 };
 
-// Actions with what a chain of failures needs of them; `chain` takes them in the order of the problem.
-struct Candidates {
-  std::vector<int> action, product_state;
-  std::vector<float> attempt_cost, inverse_chance, chance;
+// Actions that a rollout can get to from a state of the automaton, in the order of the problem, padded to whole lanes.
+struct StateActions {
+  bool made, valued;
+  int count, width;
+  std::vector<int> action, first_of;  // first_of: where the actions of each subgoal begin
+  std::vector<int32_t> product_state;
+  std::vector<Set> condition;
+  std::vector<float> failure_cost, chance, success_cost;  // with nothing known
+  std::vector<float> after, after_success;  // what a success is worth, to the rule and to an entry
+  // Path costs to each action from a product state, and to a product state from where each action fails; 0 inside. Made
+  // when they are wanted: where they begin is kNone before.
+  std::vector<float> rows, columns;
+  std::vector<int> row_at, column_at;
+};
 
-  void clear() {
-    action.clear();
-    product_state.clear();
-    attempt_cost.clear();
-    inverse_chance.clear();
-    chance.clear();
-  }
-  int size() const { return static_cast<int>(action.size()); }
+// What a chain of failures needs of the actions from a state; attempts of what is not available cost inf.
+struct Candidates {
+  StateActions* actions = nullptr;
+  std::vector<float> chance, success_cost, inverse_chance, attempt_cost;
 };
 
 struct Chain {
   std::vector<int> position;
-  std::vector<float> cost, chance, rest;
+  std::vector<float> open_cost, cost, chance, rest;  // open_cost: of attempts, inf after they were taken or closed
   int length;
-  // While it is followed: of the candidates, and what has failed at each subgoal.
-  std::vector<float> ratio, inverse;
-  std::vector<Set> failed;
+  std::vector<Set> failed;  // while it is followed: at each subgoal
 };
 
 struct Level {
@@ -222,7 +261,7 @@ class Search {
   // ---- What stays the same during a search --------------------------------------------------------------------------
 
   void prepare() {
-    const int S = shape_.S, Z = shape_.Z, E = shape_.E;
+    const int Z = shape_.Z, E = shape_.E, S = shape_.S;
     screen();
     dead_end_cost_ = invalid_ ? kInf : in_.dead_end_cost;
     start_ = invalid_ ? 0 : in_.dfa_state;
@@ -239,8 +278,6 @@ class Search {
     list_actions();
     coupled_ = is_coupled();
     order_edges();
-    rows_.assign((S + 1) * Z, PathRow{});
-    path_costs_.resize((S + 1) * Z * actions_.size());
     // The rule values successes with the chances of the root, where nothing is known.
     const int count = actions_.size();
     all_chance_.resize(count);
@@ -249,6 +286,8 @@ class Search {
       all_chance_[k] = actions_[k].chance;
       all_cost_[k] = actions_[k].success_cost;
     }
+    if (static_cast<int>(state_actions_.size()) < Z) state_actions_.resize(Z);
+    for (StateActions& own : state_actions_) own.made = false;
     value_successes(after_root_);
   }
 
@@ -454,40 +493,89 @@ class Search {
     }
   }
 
-  const float* path_costs(int product_state) {
-    const int count = actions_.size(), Z = shape_.Z;
-    float* costs = path_costs_.data() + int64_t{product_state} * count;
-    if (rows_[product_state].made) return costs;
-    rows_[product_state].made = true;
-    const int u = product_state / Z, z = product_state % Z;
-    const bool real = (u == shape_.S || subgoal_real_[u] != 0) && in_.state_mask[z] && !invalid_;
-    const float* travel = in_.travel + int64_t{product_state} * shape_.S * Z;
-    for (int k = 0; k + 1 < count; ++k) {
-      const Action& action = actions_[k];
-      const bool counts = real && in_.state_mask[action.from_state];
-      costs[k] = counts ? travel[action.subgoal * Z + action.from_state] : kInf;
+  StateActions& actions_from(int state) {
+    StateActions& own = state_actions_[state];
+    if (!own.made) list_from(state, own);
+    return own;
+  }
+
+  void list_from(int state, StateActions& own) const {
+    const int S = shape_.S, last = actions_.size() - 1;
+    own.made = true;
+    own.valued = false;
+    own.action.clear();
+    own.first_of.assign(S + 2, 0);
+    for (int k = 0; k <= last; ++k) {
+      if (k < last && !leads(state, actions_[k].from_state)) continue;
+      own.action.push_back(k);
+      own.first_of[actions_[k].subgoal + 1] += 1;
     }
-    costs[count - 1] = real ? in_.finish[product_state] : kInf;
+    for (int s = 0; s <= S; ++s) own.first_of[s + 1] += own.first_of[s];
+    own.count = own.action.size();
+    const int width = own.width = (own.count + kLanes - 1) / kLanes * kLanes;
+    own.product_state.assign(width, kNone - 1);
+    own.condition.assign(width, 0);
+    for (auto* values : {&own.failure_cost, &own.chance, &own.success_cost, &own.after, &own.after_success}) {
+      values->assign(width, 0);
+    }
+    for (int i = 0; i < own.count; ++i) {
+      const Action& action = actions_[own.action[i]];
+      own.product_state[i] = action.product_state;
+      own.condition[i] = action.condition;
+      own.failure_cost[i] = action.failure_cost;
+      own.chance[i] = action.chance;
+      own.success_cost[i] = action.success_cost;
+    }
+    own.rows.clear();
+    own.columns.clear();
+    own.row_at.assign((S + 1) * shape_.Z, kNone);
+    own.column_at.assign((S + 1) * shape_.Z + 1, kNone);
+  }
+
+  float path_cost(int product_state, const Action& action) const {
+    const int S = shape_.S, Z = shape_.Z, u = product_state / Z;
+    const bool real = (u == S || subgoal_real_[u] != 0) && in_.state_mask[product_state % Z] && !invalid_;
+    if (!real) return kInf;
+    if (action.subgoal == S) return in_.finish[product_state];
+    if (!in_.state_mask[action.from_state]) return kInf;
+    return in_.travel[(int64_t{product_state} * S + action.subgoal) * Z + action.from_state];
+  }
+
+  // To each action from a product state.
+  const float* path_costs(StateActions& own, int product_state) const {
+    int& at = own.row_at[product_state];
+    if (at != kNone) return own.rows.data() + at;
+    at = own.rows.size();
+    own.rows.resize(at + own.width, kInf);
+    float* costs = own.rows.data() + at;
+    for (int i = 0; i < own.count; ++i) {
+      const Action& action = actions_[own.action[i]];
+      costs[i] = action.product_state == product_state ? 0.0f : path_cost(product_state, action);
+    }
     return costs;
   }
 
-  // Actions that a path leads to from a product state, and those that go on inside.
-  const std::vector<int>& candidates(int product_state) {
-    PathRow& row = rows_[product_state];
-    if (!row.listed) {
-      const float* costs = path_costs(product_state);
-      row.listed = true;
-      for (int k = 0; k < static_cast<int>(actions_.size()); ++k) {
-        if (actions_[k].product_state == product_state || costs[k] < kInf) row.candidates.push_back(k);
-      }
+  // To one action from where each one has failed, with R_F.
+  const float* costs_to_begin(StateActions& own, int start) const {
+    const Action& first = actions_[own.action[start]];
+    // Finish, which lies nowhere, has the first column.
+    int& at = own.column_at[first.product_state + 1];
+    if (at != kNone) return own.columns.data() + at;
+    at = own.columns.size();
+    own.columns.resize(at + own.width, 0.0f);
+    float* costs = own.columns.data() + at;
+    for (int i = 0; i < own.count; ++i) {
+      const int from = own.product_state[i];
+      const bool inside = from == first.product_state;
+      costs[i] = inside ? 0.0f : path_cost(std::max(from, 0), first) + own.failure_cost[i];
     }
-    return row.candidates;
+    return costs;
   }
 
   // ---- What a history knows -----------------------------------------------------------------------------------------
 
-  // history.knowledge_terms; gives whether the action's condition is known to hold.
-  bool knowledge_terms(int k, Set holds, Set fails, float& chance_out, float& cost_out) const {
+  // history.knowledge_terms.
+  void knowledge_terms(int k, Set holds, Set fails, float& chance_out, float& cost_out) const {
     const int K = shape_.K;
     const bool certain = holds & actions_[k].condition;
     float probability = 0, cost = kInf;
@@ -508,7 +596,6 @@ class Search {
     }
     chance_out = certain ? 1.0f : probability;
     cost_out = std::isinf(cost) ? 0.0f : cost;
-    return certain;
   }
 
   Set propagate_failures(Set fails) const {
@@ -553,13 +640,21 @@ class Search {
 
   // ---- Guesses ------------------------------------------------------------------------------------------------------
 
-  void add_candidate(Candidates& list, int k, float chance, float success_cost, const std::vector<float>& after) const {
-    list.action.push_back(k);
-    list.product_state.push_back(actions_[k].product_state);
-    list.chance.push_back(chance);
-    list.inverse_chance.push_back(1.0f / chance);
-    const float succeeds = chance * (success_cost + after[k]);
-    list.attempt_cost.push_back(succeeds + (1.0f - chance) * actions_[k].failure_cost);
+  // Fills in what follows from the chances and costs of a list; what has no chance is closed.
+  static void value_attempts(Candidates& list) {
+    const StateActions& own = *list.actions;
+    const int width = own.width;
+    list.inverse_chance.resize(width);
+    list.attempt_cost.resize(width);
+    const Lanes one = all_lanes(1.0f), never = all_lanes(kInf);
+    for (int i = 0; i < width; i += kLanes) {
+      const Lanes chance = load(list.chance.data() + i), inverse = one / chance;
+      const Lanes succeeds = chance * (load(list.success_cost.data() + i) + load(own.after.data() + i));
+      Lanes cost = succeeds + (one - chance) * load(own.failure_cost.data() + i);
+      cost = inverse < never ? cost : never;
+      std::memcpy(list.inverse_chance.data() + i, &inverse, sizeof inverse);
+      std::memcpy(list.attempt_cost.data() + i, &cost, sizeof cost);
+    }
   }
 
   // guess._value_successes, with the chances and costs of all actions in `all_chance_` and `all_cost_`.
@@ -572,11 +667,11 @@ class Search {
     for (int pass = 0; pass < (cyclic_ ? kPasses : 1); ++pass) {
       for (const int edge : edge_order_) {
         const int to = in_.edges[2 * edge + 1];
-        valued_.clear();
         list_tried(valued_, to, after);
         for (int s = 0; s < S; ++s) {
           if (!subgoal_real_[s]) continue;
-          follow(valued_, s * Z + to, all_cost_[action_at_[s * E + edge]]);
+          chain_.open_cost = valued_.attempt_cost;
+          follow(chain_, valued_, s * Z + to, all_cost_[action_at_[s * E + edge]], 0);
           new_values_[s] = chain_.rest[0];
         }
         // All at once: no value of this edge enters another one of it.
@@ -587,38 +682,34 @@ class Search {
     }
   }
 
-  void follow(const Candidates& list, int product_state, float pending_cost) {
-    chain_.inverse = list.inverse_chance;
-    follow(chain_, list, product_state, pending_cost, 0);
-  }
-
   // guess._follow_chain: the action of least cost per chance, as long as all fail; `nested` of its successes in a row are
   // valued by what has failed before.
   void follow(Chain& chain, const Candidates& list, int product_state, float pending_cost, int nested) {
-    const int count = list.size(), most = settings_.guess_failures;
-    chain.ratio.resize(count);
+    StateActions& own = *list.actions;
+    const int width = own.width, most = settings_.guess_failures;
     chain.position.clear();
     chain.cost.clear();
     chain.chance.clear();
     float reached = 1;
     bool active = true;
     for (chain.length = 0; active && chain.length < most; ++chain.length) {
-      const float* costs = path_costs(product_state);
-      for (int i = 0; i < count; ++i) {
-        const float away = costs[list.action[i]] + pending_cost;
-        const float distance = list.product_state[i] == product_state ? 0.0f : away;
-        const float ratio = (distance + list.attempt_cost[i]) * chain.inverse[i];
-        chain.ratio[i] = chain.inverse[i] == kInf ? kInf : ratio;
+      const float* costs = path_costs(own, product_state);
+      const float *open_cost = chain.open_cost.data(), *inverse = list.inverse_chance.data();
+      const Lanes inside = all_lanes(0.0f), pending = all_lanes(pending_cost);
+      Least ratio;
+      for (int i = 0; i < width; i += kLanes) {
+        const Marks stays = load(own.product_state.data() + i) == product_state;
+        const Lanes distance = load(costs + i) + (stays ? inside : pending);
+        ratio.take((distance + load(open_cost + i)) * load(inverse + i));
       }
-      const float least = least_of(chain.ratio.data(), count);
+      const float least = ratio.value();
       if (std::isinf(least)) break;
-      const int taken = first_at_most(chain.ratio.data(), count, least);
-      const Action& action = actions_[list.action[taken]];
+      const int taken = ratio.place(least), k = own.action[taken];
+      const Action& action = actions_[k];
       const float chance = list.chance[taken];
       float cost = least * chance;
       if (nested > 0) {
         if (leads_on(action)) {
-          const int k = list.action[taken];
           cost += chance * rest_after(nested - 1, success_state(action), all_cost_[k], chain.failed);
           cost -= chance * after_[k];
         }
@@ -629,7 +720,7 @@ class Search {
       chain.chance.push_back(chance);
       reached *= 1.0f - chance;
       active = reached > kNegligible;
-      close_failed(chain, list, taken, action);
+      close_failed(chain, own, action);
       product_state = action.product_state;
       pending_cost = action.failure_cost;
     }
@@ -648,11 +739,11 @@ class Search {
   float rest_after(int nested, int product_state, float pending_cost, const std::vector<Set>& failed) {
     Chain& chain = nested_[nested];
     const Candidates& list = tried_from(product_state % shape_.Z);
-    chain.inverse = list.inverse_chance;
+    const StateActions& own = *list.actions;
+    chain.open_cost = list.attempt_cost;
     chain.failed = failed;
-    for (int i = 0; i < list.size(); ++i) {
-      const Action& action = actions_[list.action[i]];
-      if (failed[action.subgoal] & action.condition) chain.inverse[i] = kInf;
+    for (int i = 0; i < own.count; ++i) {
+      if (failed[actions_[own.action[i]].subgoal] & own.condition[i]) chain.open_cost[i] = kInf;
     }
     follow(chain, list, product_state, pending_cost, nested);
     return chain.rest[0];
@@ -661,53 +752,61 @@ class Search {
   // What chains from a state of the automaton may take, by what `history_` knows.
   const Candidates& tried_from(int state) {
     Candidates& list = tried_[state];
-    // Finish is in every list that has been made.
-    if (list.size() == 0) list_tried(list, state, after_);
+    if (list.actions == nullptr) list_tried(list, state, after_);
     return list;
   }
 
-  void list_tried(Candidates& list, int state, const std::vector<float>& after) const {
-    const int count = actions_.size();
-    for (int k = 0; k < count; ++k) {
-      const bool counts = k == count - 1 || leads(state, actions_[k].from_state);
-      if (counts && all_chance_[k] > 0) add_candidate(list, k, all_chance_[k], all_cost_[k], after);
+  // Actions that lead on from a state by `all_chance_` and `all_cost_`, wherever paths lead.
+  void list_tried(Candidates& list, int state, const std::vector<float>& after) {
+    StateActions& own = actions_from(state);
+    list.actions = &own;
+    list.chance.assign(own.width, 0);
+    list.success_cost.assign(own.width, 0);
+    for (int i = 0; i < own.count; ++i) {
+      list.chance[i] = all_chance_[own.action[i]];
+      list.success_cost[i] = all_cost_[own.action[i]];
+      own.after[i] = after[own.action[i]];
     }
+    own.valued = false;
+    value_attempts(list);
   }
 
   // guess._guess_each: the guess after each candidate's failure into `without_`, after its success into `after_`.
   void guess_each(const Candidates& list) {
-    const int count = list.size();
+    const StateActions& own = *list.actions;
+    const int count = own.count;
     const std::vector<Set> none(shape_.S + 1, 0);
-    without_.assign(count, dead_end_cost_);
+    without_.assign(own.width, dead_end_cost_);
     anew_.assign(count, 0);
     for (int i = 0; i < count; ++i) {
-      const Action& action = actions_[list.action[i]];
-      if (action.subgoal == static_cast<int>(shape_.S)) continue;
+      const Action& action = actions_[own.action[i]];
+      if (action.subgoal == static_cast<int>(shape_.S) || path_[i] == kInf) continue;
       std::vector<Set> failed = none;
       failed[action.subgoal] = action.backward;
       without_[i] = rest_after(kNested, action.product_state, action.failure_cost, failed);
-      if (leads_on(action)) anew_[i] = rest_after(kNested, success_state(action), all_cost_[list.action[i]], none);
+      if (leads_on(action)) anew_[i] = rest_after(kNested, success_state(action), all_cost_[own.action[i]], none);
     }
     // Only now: the chains need what the successes are worth to the rule.
-    for (int i = 0; i < count; ++i) after_[list.action[i]] = anew_[i];
+    for (int i = 0; i < count; ++i) {
+      if (path_[i] < kInf) after_[own.action[i]] = anew_[i];
+    }
   }
 
-  // Takes out what fails with an action; actions of one subgoal lie side by side.
-  void close_failed(Chain& chain, const Candidates& list, int taken, const Action& action) {
-    const auto closes = [&](int i) {
-      const Action& other = actions_[list.action[i]];
-      if (other.subgoal != action.subgoal) return false;
-      if (action.backward & other.condition) chain.inverse[i] = kInf;
-      return true;
-    };
-    for (int i = taken; i >= 0 && closes(i); --i) continue;
-    for (int i = taken + 1; i < list.size() && closes(i); ++i) continue;
+  // Takes out what fails with an action.
+  static void close_failed(Chain& chain, const StateActions& own, const Action& action) {
+    float* open_cost = chain.open_cost.data();
+    const Set* condition = own.condition.data();
+    for (int i = own.first_of[action.subgoal]; i < own.first_of[action.subgoal + 1]; ++i) {
+      // Without a branch, which would often be foreseen wrongly.
+      open_cost[i] = action.backward & condition[i] ? kInf : open_cost[i];
+    }
   }
 
   // guess._costs_without and _cost_to_begin_elsewhere: the guess after each candidate's failure, into `without_`.
   void guess_failures(const Candidates& list) {
-    const int count = list.size();
-    without_.assign(count, chain_.rest[0]);
+    StateActions& own = *list.actions;
+    const int width = own.width;
+    without_.assign(width, chain_.rest[0]);
     float spent = 0, reached = 1;
     for (int level = 0; level < chain_.length; ++level) {
       without_[chain_.position[level]] = spent + reached * chain_.rest[level + 1];
@@ -715,102 +814,181 @@ class Search {
       reached *= 1.0f - chain_.chance[level];
     }
     if (chain_.length == 0) return;
-    const int first = chain_.position[0], start = list.action[first];
+    const int first = chain_.position[0];
     const float cost_here = chain_.cost[0] - list.attempt_cost[first];
-    for (int i = 0; i < count; ++i) {
-      if (i == first) continue;
-      const Action& action = actions_[list.action[i]];
-      float cost_there = path_costs(std::max(action.product_state, 0))[start] + action.failure_cost;
-      if (action.product_state == actions_[start].product_state) cost_there = 0;
-      if (std::isinf(cost_there)) cost_there = cost_here;
-      without_[i] += cost_there - cost_here;
+    const float kept = without_[first];
+    const Lanes here = all_lanes(cost_here), never = all_lanes(kInf);
+    const float* costs = costs_to_begin(own, first);
+    for (int i = 0; i < width; i += kLanes) {
+      Lanes there = load(costs + i);
+      there = there < never ? there : here;
+      const Lanes guess = load(without_.data() + i) + (there - here);
+      std::memcpy(without_.data() + i, &guess, sizeof guess);
     }
+    without_[first] = kept;
   }
 
   // ---- Nodes --------------------------------------------------------------------------------------------------------
 
-  // best_first._new_node: the entries of `history_` behind all others.
-  Node new_node() {
+  // best_first._new_node: the entries of `history_` behind all others; `parent` is where it comes from, or kNone.
+  Node new_node(int parent) {
     Node node{};
-    node.first = q_.size();
+    node.first = entries_;
     node.location = history_.location;
     node.state = history_.state;
-    list_available(node);
-    const int count = node.count = list_.size();
-    const std::vector<float>& after = coupled_ ? after_ : after_root_;
+    node.product_state = node.location * shape_.Z + node.state;
+    StateActions& own = actions_from(node.state);
+    node.width = state_accepts_[node.state] || invalid_ ? 0 : own.width;
+    keep_entries(node.first + node.width);
+    node.values = {{kInf, kInf, kInf}, {kInf, kInf, kInf}, 0};
+    if (node.width == 0) return node;
+    node.whole = true;
+    find_stay(node, own);
+    if (coupled_) value_anew();
+    value_entries(own, coupled_ ? after_ : after_root_);
+    list_available(node, own, parent);
     if (coupled_) {
       guess_each(list_);
+      own.valued = false;
+      value_entries(own, after_);
     } else {
-      follow(list_, node.location * shape_.Z + node.state, history_.pending_cost);
+      chain_.open_cost = list_.attempt_cost;
+      follow(chain_, list_, node.product_state, history_.pending_cost, 0);
       guess_failures(list_);
     }
-    const float least = kLeastGuess * dead_end_cost_, doubt = 1.0f - optimism_;
-    const size_t size = node.first + count;
-    for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) values->resize(size);
-    child_.resize(2 * size);
-    entry_action_.resize(size);
-    for (int i = 0; i < count; ++i) {
-      const int k = list_.action[i], at = node.first + i;
-      const Action& action = actions_[k];
-      const float chance = list_.chance[i], success_cost = score_[i];
-      const float after_failure = std::max(without_[i], least);
-      const float after_success = action.accepts ? 0.0f : std::max(after[k], least);
-      float known = path_[i] + chance * success_cost;
-      known += (1.0f - chance) * action.failure_cost;
-      const float guessed = chance * after_success + (1.0f - chance) * after_failure;
-      q_[at] = known + guessed;
-      bound_[at] = known + doubt * guessed;
-      floor_[at] = known;
-      chance_[at] = chance;
-      success_cost_[at] = success_cost;
-      child_[2 * at] = as_guess(after_failure);
-      child_[2 * at + 1] = as_guess(after_success);
-      entry_action_[at] = k;
-    }
-    const auto least_of_kinds = [&](const std::vector<float>& values, float& leave, float& stay) {
-      const float* own = values.data() + node.first;
-      leave = least_leaving(node, own);
-      stay = least_of(own + node.stay_begin, node.stay_end - node.stay_begin);
-    };
-    least_of_kinds(q_, node.values.leave.value, node.values.stay.value);
-    least_of_kinds(bound_, node.values.leave.bound, node.values.stay.bound);
-    least_of_kinds(floor_, node.values.leave.floor, node.values.stay.floor);
+    fill_entries(node, own);
+    node.values = {least_leaving(node, kNone), least_staying(node, kNone), 0};
     return node;
   }
 
-  static float least_leaving(const Node& node, const float* own) {
-    return lesser(least_of(own, node.stay_begin), least_of(own + node.stay_end, node.count - node.stay_end));
+  // Makes room, for more than that, and lets it hold what it held: entries are written before they are read.
+  void keep_entries(size_t size) {
+    entries_ = size;
+    if (size <= q_.size()) return;
+    for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) values->resize(2 * size);
+    for (auto& children : child_) children.resize(2 * size);
   }
 
-  // history.terms_of_all: available actions of `history_` into `list_`, their path costs into `path_`, R_S into `score_`.
-  void list_available(Node& node) {
-    const int product_state = node.location * shape_.Z + node.state, S = shape_.S;
-    list_.clear();
-    path_.clear();
-    score_.clear();
-    if (coupled_) value_anew();
-    const std::vector<float>& after = coupled_ ? after_ : after_root_;
-    node.stay_begin = node.stay_end = 0;
-    if (state_accepts_[node.state]) return;
-    const float* costs = path_costs(product_state);
-    for (const int k : candidates(product_state)) {
-      const Action& action = actions_[k];
-      const int s = action.subgoal;
-      float chance = action.chance, success_cost = action.success_cost;
-      if (s < S && (history_.holds[s] | history_.fails[s]) != 0) {
-        const bool certain = knowledge_terms(k, history_.holds[s], history_.fails[s], chance, success_cost);
-        // A rollout that repeats what it knows, and ends where it has been, would go round in circles for ever.
-        if (certain && (history_.visited[s] & action.end)) continue;
-      }
-      if (!(chance > 0)) continue;
-      const bool inside = action.product_state == product_state;
-      if (inside && node.stay_begin == node.stay_end) node.stay_begin = list_.size();
-      add_candidate(list_, k, chance, success_cost, after);
-      path_.push_back(inside ? 0.0f : costs[k]);
-      score_.push_back(success_cost);
-      if (inside) node.stay_end = list_.size();
+  // Those of a subgoal and a state lie side by side.
+  static void find_stay(Node& node, const StateActions& own) {
+    const auto begin = own.product_state.begin(), end = begin + own.count;
+    const auto inside = std::find(begin, end, node.product_state);
+    node.stay_begin = node.stay_end = inside - begin;
+    while (node.stay_end < own.count && own.product_state[node.stay_end] == node.product_state) ++node.stay_end;
+  }
+
+  // What successes are worth, to the actions from a state.
+  void value_entries(StateActions& own, const std::vector<float>& after) const {
+    if (own.valued) return;
+    const float least = kLeastGuess * dead_end_cost_;
+    // What a coupled problem's guesses are made of changes from node to node.
+    own.valued = !coupled_;
+    for (int i = 0; i < own.count; ++i) {
+      const int k = own.action[i];
+      own.after[i] = after[k];
+      own.after_success[i] = actions_[k].accepts ? 0.0f : std::max(after[k], least);
     }
-    if (node.stay_begin == node.stay_end) node.stay_begin = node.stay_end = list_.size();
+  }
+
+  void fill_entries(const Node& node, const StateActions& own) {
+    const Lanes one = all_lanes(1.0f), least = all_lanes(kLeastGuess * dead_end_cost_), doubt = one - optimism_;
+    const auto store = [](std::vector<float>& values, int at, const Lanes& lanes) {
+      std::memcpy(values.data() + at, &lanes, sizeof lanes);
+    };
+    for (int i = 0; i < own.width; i += kLanes) {
+      const int at = node.first + i;
+      const Lanes chance = load(list_.chance.data() + i), success_cost = load(list_.success_cost.data() + i);
+      Lanes after_failure = load(without_.data() + i);
+      after_failure = after_failure < least ? least : after_failure;
+      const Lanes after_success = load(own.after_success.data() + i);
+      Lanes known = load(path_.data() + i) + chance * success_cost;
+      known += (one - chance) * load(own.failure_cost.data() + i);
+      const Lanes guessed = chance * after_success + (one - chance) * after_failure;
+      store(q_, at, known + guessed);
+      store(bound_, at, known + doubt * guessed);
+      store(floor_, at, known);
+      store(chance_, at, chance);
+      store(success_cost_, at, success_cost);
+      const Marks guesses[2] = {as_guesses(after_failure), as_guesses(after_success)};
+      for (int success = 0; success < 2; ++success) {
+        std::memcpy(child_[success].data() + at, &guesses[success], sizeof guesses[success]);
+      }
+    }
+  }
+
+  // Least costs of the entries that leave, but for one.
+  Costs least_leaving(const Node& node, int without) const {
+    const int32_t* at = state_actions_[node.state].product_state.data();
+    const float *q = q_.data() + node.first, *bound = bound_.data() + node.first, *floor = floor_.data() + node.first;
+    const Lanes never = all_lanes(kInf);
+    Lanes values = never, bounds = never, floors = never;
+    Marks place = kCounting;
+    for (int i = 0; i < node.width; i += kLanes, place += kLanes) {
+      const Marks out = (load(at + i) == node.product_state) | (place == without);
+      const auto take = [&](Lanes& least, const float* own) {
+        const Lanes next = out ? never : load(own + i);
+        least = lesser(next, least);
+      };
+      take(values, q);
+      take(bounds, bound);
+      take(floors, floor);
+    }
+    return {least_lane<float>(values), least_lane<float>(bounds), least_lane<float>(floors)};
+  }
+
+  // Likewise of those that stay.
+  Costs least_staying(const Node& node, int without) const {
+    Costs least{kInf, kInf, kInf};
+    for (int i = node.stay_begin; i < node.stay_end; ++i) {
+      if (i == without) continue;
+      const int at = node.first + i;
+      least = {lesser(q_[at], least.value), lesser(bound_[at], least.bound), lesser(floor_[at], least.floor)};
+    }
+    return least;
+  }
+
+  // history.terms_of_all: chances and costs of `history_` into `list_`, path costs into `path_`: inf of what is not
+  // available.
+  void list_available(const Node& node, StateActions& own, int parent) {
+    list_.actions = &own;
+    const float* costs = path_costs(own, node.product_state);
+    path_.assign(costs, costs + own.width);
+    if (parent != kNone && nodes_[parent].whole && nodes_[parent].state == node.state) {
+      const int first = nodes_[parent].first;
+      list_.chance.assign(chance_.data() + first, chance_.data() + first + own.width);
+      list_.success_cost.assign(success_cost_.data() + first, success_cost_.data() + first + own.width);
+      // The parent knew the same of all other subgoals.
+      know(own, node.location);
+    } else {
+      list_.chance = own.chance;
+      list_.success_cost = own.success_cost;
+      for (int s = 0; s < static_cast<int>(shape_.S); ++s) know(own, s);
+    }
+    for (int s = 0; s < static_cast<int>(shape_.S); ++s) close_circles(own, s);
+    value_attempts(list_);
+    for (int i = 0; i < own.width; ++i) {
+      path_[i] = list_.chance[i] > 0 ? path_[i] : kInf;
+      list_.attempt_cost[i] = path_[i] < kInf ? list_.attempt_cost[i] : kInf;
+    }
+  }
+
+  // Chances and costs at a subgoal that something is known of.
+  void know(const StateActions& own, int s) {
+    if (s == static_cast<int>(shape_.S)) return;
+    const Set holds = history_.holds[s], fails = history_.fails[s];
+    if ((holds | fails) == 0) return;
+    for (int i = own.first_of[s]; i < own.first_of[s + 1]; ++i) {
+      knowledge_terms(own.action[i], holds, fails, list_.chance[i], list_.success_cost[i]);
+    }
+  }
+
+  // A rollout that repeats what it knows, and ends where it has been, would go round in circles for ever.
+  void close_circles(const StateActions& own, int s) {
+    const Set holds = history_.holds[s], visited = history_.visited[s];
+    if (holds == 0 || visited == 0) return;
+    for (int i = own.first_of[s]; i < own.first_of[s + 1]; ++i) {
+      if ((holds & own.condition[i]) && (visited & actions_[own.action[i]].end)) path_[i] = kInf;
+    }
   }
 
   // guess.value_successes_anew: by what `history_` knows.
@@ -824,7 +1002,7 @@ class Search {
     }
     value_successes(after_);
     tried_.resize(shape_.Z);
-    for (Candidates& list : tried_) list.clear();
+    for (Candidates& list : tried_) list.actions = nullptr;
   }
 
   void plant() {
@@ -840,7 +1018,7 @@ class Search {
     root_visits_.assign(actions_.size(), 0);
     simulations_ = steps_ = 0;
     status_ = 0;
-    keep(new_node());
+    keep(new_node(kNone));
   }
 
   // Adds the node that `history_` has just been given.
@@ -908,12 +1086,17 @@ class Search {
     const Costs leaf = expand(descent, child);
     back_up(leaf);
     // Linked last, to the node that the descent left the graph from.
-    if (child != kNone) child_[2 * (nodes_[descent.node].first + descent.entry) + descent.success] = child;
+    if (child != kNone) child_[descent.success][nodes_[descent.node].first + descent.entry] = child;
     if (levels_.empty()) return;
-    root_visits_[entry_action_[nodes_[0].first + levels_[0].entry]] += 1;
+    root_visits_[action_of(nodes_[0], levels_[0].entry)] += 1;
     simulations_ += 1;
     steps_ += levels_.size();
   }
+
+  // Without padding.
+  int entry_count(const Node& node) const { return node.width == 0 ? 0 : state_actions_[node.state].count; }
+
+  int action_of(const Node& node, int entry) const { return state_actions_[node.state].action[entry]; }
 
   void descend_once(Descent& descent, bool certifies, bool is_last) {
     const Node& node = nodes_[descent.node];
@@ -924,21 +1107,19 @@ class Search {
       return;
     }
     const int at = node.first + entry;
-    const Action& action = actions_[entry_action_[at]];
+    const Action& action = actions_[action_of(node, entry)];
     Level level;
     level.node = descent.node;
     level.entry = entry;
     level.inside = entry >= node.stay_begin && entry < node.stay_end;
     level.before = node.values;
-    level.rival = {least_without(node, entry, level.inside, q_), least_without(node, entry, level.inside, bound_),
-                   least_without(node, entry, level.inside, floor_)};
+    level.rival = level.inside ? least_staying(node, entry) : least_leaving(node, entry);
     level.pending_cost = descent.pending_cost;
-    const int product_state = node.location * shape_.Z + node.state;
-    const float path_cost = level.inside ? 0.0f : path_costs(product_state)[entry_action_[at]];
+    const float path_cost = path_costs(state_actions_[node.state], node.product_state)[entry];
     // Follow the outcome that contributes more to the gap.
     const float chance = chance_[at], success_cost = success_cost_[at], failure_cost = action.failure_cost;
-    const Costs after_success = outcome_costs(child_[2 * at + 1], success_cost, is_last);
-    const Costs after_failure = outcome_costs(child_[2 * at], failure_cost, is_last);
+    const Costs after_success = outcome_costs(child_[1][at], success_cost, is_last);
+    const Costs after_failure = outcome_costs(child_[0][at], failure_cost, is_last);
     const float success_gap = chance * (after_success.value - after_success.low(certifies));
     const float failure_gap = (1.0f - chance) * (after_failure.value - after_failure.low(certifies));
     // Nothing is to be learnt from satisfying the task, and a certain success cannot fail.
@@ -950,7 +1131,7 @@ class Search {
     const Costs& other = success ? after_failure : after_success;
     level.base = {known + rest * other.value, known + rest * other.bound, known + rest * other.floor};
     levels_.push_back(level);
-    const int child = child_[2 * at + success];
+    const int child = child_[success][at];
     descent.entry = entry;
     descent.success = success;
     descent.accepted = success && action.accepts;
@@ -961,30 +1142,15 @@ class Search {
   }
 
   // The entry of least bound or floor, ties by lowest index; only actions that leave pay the pending cost.
-  static int select(const Node& node, const float* low, float pending_cost) {
-    const int begin = node.stay_begin, end = node.stay_end;
-    const float least = lesser(least_leaving(node, low) + pending_cost, least_of(low + begin, end - begin));
-    if (std::isinf(least)) return kNone;
-    int i = 0;
-    for (; i < begin; ++i) {
-      if (low[i] + pending_cost <= least) return i;
+  int select(const Node& node, const float* low, float pending_cost) const {
+    const int32_t* at = state_actions_[node.state].product_state.data();
+    const Lanes inside = all_lanes(0.0f), pending = all_lanes(pending_cost);
+    Least cost;
+    for (int i = 0; i < node.width; i += kLanes) {
+      cost.take(load(low + i) + (load(at + i) == node.product_state ? inside : pending));
     }
-    for (; i < end; ++i) {
-      if (low[i] <= least) return i;
-    }
-    while (low[i] + pending_cost > least) ++i;
-    return i;
-  }
-
-  // Least of the other entries of the same kind.
-  static float least_without(const Node& node, int entry, bool inside, std::vector<float>& values) {
-    float* own = values.data() + node.first;
-    const float kept = own[entry];
-    own[entry] = kInf;
-    const float least =
-        inside ? least_of(own + node.stay_begin, node.stay_end - node.stay_begin) : least_leaving(node, own);
-    own[entry] = kept;
-    return least;
+    const float least = cost.value();
+    return std::isinf(least) ? kNone : cost.place(least);
   }
 
   Costs outcome_costs(int child, float pending_cost, bool is_last) const {
@@ -1007,7 +1173,7 @@ class Search {
       return closed_where(descent.active, nodes_[descent.node].values.on_arrival(descent.pending_cost, dead_end_cost_));
     }
     recall(descent.node, descent.pending_cost);
-    step(actions_[entry_action_[nodes_[descent.node].first + descent.entry]], descent.success);
+    step(actions_[action_of(nodes_[descent.node], descent.entry)], descent.success);
     uint32_t key[2];
     make_key(key);
     const int64_t first = key[0] & (settings_.slots - 1);
@@ -1021,7 +1187,7 @@ class Search {
       }
     }
     if (child != kNone) return nodes_[child].values.on_arrival(descent.pending_cost, dead_end_cost_);
-    const Node node = new_node();
+    const Node node = new_node(descent.node);
     if (static_cast<int64_t>(nodes_.size()) < settings_.capacity) {
       child = nodes_.size();
       keep(node);
@@ -1032,15 +1198,9 @@ class Search {
       }
     } else {
       status_ |= kTreeOverflow;
-      drop_entries(node.first);
+      entries_ = node.first;
     }
     return node.values.on_arrival(descent.pending_cost, dead_end_cost_);
-  }
-
-  void drop_entries(size_t size) {
-    for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) values->resize(size);
-    child_.resize(2 * size);
-    entry_action_.resize(size);
   }
 
   void back_up(Costs after) {
@@ -1073,19 +1233,18 @@ class Search {
     const Costs costs = root_costs();
     std::fill(plan.q_values, plan.q_values + shape_.A, kInf);
     std::fill(plan.visits, plan.visits + shape_.A, 0);
-    for (int at = root.first; at < root.first + root.count; ++at) {
-      const int k = entry_action_[at];
-      plan.q_values[actions_[k].id] = q_[at];
+    const int best = select(root, q_.data() + root.first, 0);
+    const bool available = best != kNone, accepted = state_accepts_[start_];
+    for (int i = 0; i < entry_count(root); ++i) {
+      const int k = action_of(root, i);
+      plan.q_values[actions_[k].id] = q_[root.first + i];
       plan.visits[actions_[k].id] = root_visits_[k];
     }
-    const float* own = q_.data() + root.first;
-    const float least = least_of(own, root.count);
-    const bool available = !std::isinf(least), accepted = state_accepts_[start_];
-    float value = available ? least : dead_end_cost_;
+    float value = available ? q_[root.first + best] : dead_end_cost_;
     if (accepted) value = 0;
     *plan.action = *plan.subgoal = *plan.from_state = *plan.to_state = kNone;
     if (available) {
-      const Action& action = actions_[entry_action_[root.first + first_at_most(own, root.count, least)]];
+      const Action& action = actions_[action_of(root, best)];
       *plan.action = action.id;
       if (action.subgoal < static_cast<int>(shape_.S)) {
         *plan.subgoal = action.subgoal;
@@ -1115,14 +1274,16 @@ class Search {
     std::copy(visited_.begin(), visited_.end(), tree.visited);
     for (int64_t n = 0; n < nodes; ++n) {
       const Node& node = nodes_[n];
-      for (int at = node.first; at < node.first + node.count; ++at) {
-        const int64_t entry = n * A + actions_[entry_action_[at]].id;
+      for (int i = 0; i < entry_count(node); ++i) {
+        const int at = node.first + i;
+        if (std::isinf(q_[at])) continue;
+        const int64_t entry = n * A + actions_[action_of(node, i)].id;
         tree.q_values[entry] = q_[at];
         tree.bounds[entry] = bound_[at];
         tree.floors[entry] = floor_[at];
         tree.chances[entry] = chance_[at];
         tree.success_costs[entry] = success_cost_[at];
-        std::copy(child_.data() + 2 * at, child_.data() + 2 * at + 2, tree.children + 2 * entry);
+        for (int success = 0; success < 2; ++success) tree.children[2 * entry + success] = child_[success][at];
       }
       const NodeValues& own = node.values;
       const float values[7] = {own.leave.value, own.stay.value,  own.leave.bound, own.stay.bound,
@@ -1150,7 +1311,7 @@ class Search {
     visited_.assign(tree.visited, tree.visited + nodes * (S + 1));
     for (int64_t n = 0; n < nodes; ++n) {
       Node node{};
-      node.first = q_.size();
+      node.first = entries_;
       node.location = tree.location[n];
       node.state = tree.state[n];
       const float* own = tree.values + n * 7;
@@ -1167,31 +1328,33 @@ class Search {
   }
 
   void read_entries(const TreeArrays& tree, int64_t row, Node& node) {
-    const int product_state = node.location * shape_.Z + node.state;
-    for (size_t k = 0; k < actions_.size(); ++k) {
-      const int64_t entry = row + actions_[k].id;
+    node.product_state = node.location * shape_.Z + node.state;
+    const StateActions& own = actions_from(node.state);
+    find_stay(node, own);
+    node.width = own.width;
+    keep_entries(node.first + own.width);
+    for (auto* costs : {&q_, &bound_, &floor_}) std::fill_n(costs->begin() + node.first, own.width, kInf);
+    for (int i = 0; i < own.count; ++i) {
+      const int64_t entry = row + actions_[own.action[i]].id;
       if (std::isinf(tree.q_values[entry])) continue;
-      const bool inside = actions_[k].product_state == product_state;
-      if (inside && node.stay_begin == node.stay_end) node.stay_begin = node.count;
-      node.count += 1;
-      if (inside) node.stay_end = node.count;
-      q_.push_back(tree.q_values[entry]);
-      bound_.push_back(tree.bounds[entry]);
-      floor_.push_back(tree.floors[entry]);
-      chance_.push_back(tree.chances[entry]);
-      success_cost_.push_back(tree.success_costs[entry]);
-      child_.insert(child_.end(), tree.children + 2 * entry, tree.children + 2 * entry + 2);
-      entry_action_.push_back(k);
+      const int at = node.first + i;
+      q_[at] = tree.q_values[entry];
+      bound_[at] = tree.bounds[entry];
+      floor_[at] = tree.floors[entry];
+      chance_[at] = tree.chances[entry];
+      success_cost_[at] = tree.success_costs[entry];
+      for (int success = 0; success < 2; ++success) child_[success][at] = tree.children[2 * entry + success];
     }
-    if (node.stay_begin == node.stay_end) node.stay_begin = node.stay_end = node.count;
   }
 
   // Empties the graph; a large one gives its memory back.
   void forget() {
     const bool large = q_.size() > kKeptEntries;
-    for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) empty(*values, large);
-    empty(child_, large);
-    empty(entry_action_, large);
+    entries_ = 0;
+    if (large) {
+      for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) empty(*values, large);
+      for (auto& children : child_) empty(children, large);
+    }
     empty(nodes_, large);
     empty(table_, large);
     for (auto* sets : {&holds_, &fails_, &visited_}) empty(*sets, large);
@@ -1218,19 +1381,14 @@ class Search {
   std::vector<Set> cube_bits_, forward_of_, backward_of_, cubes_of_, relevant_;
   std::vector<int> edge_order_, action_at_;
   std::vector<float> after_root_;
-  struct PathRow {
-    bool made, listed;
-    std::vector<int> candidates;
-  };
-  std::vector<PathRow> rows_;
-  std::vector<float> path_costs_;
+  std::vector<StateActions> state_actions_;
 
   // The graph.
   std::vector<Node> nodes_;
   std::vector<Set> holds_, fails_, visited_;
   std::vector<float> q_, bound_, floor_, chance_, success_cost_;
-  std::vector<int32_t> child_;
-  std::vector<int> entry_action_;
+  std::vector<int32_t> child_[2];  // after a failure, after a success
+  int entries_ = 0;
   std::vector<int32_t> table_, root_visits_;
   int32_t simulations_, steps_;
   uint32_t status_;
@@ -1241,7 +1399,7 @@ class Search {
   Candidates list_, valued_;
   std::vector<Candidates> tried_;
   Chain chain_, nested_[kNested + 1];
-  std::vector<float> anew_, path_, score_, after_, all_chance_, all_cost_, new_values_, without_;
+  std::vector<float> anew_, path_, after_, all_chance_, all_cost_, new_values_, without_;
 };
 
 // One array of a batch: the row of every array lies behind that of the row before.
