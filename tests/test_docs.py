@@ -44,6 +44,7 @@ KNOWN_PROGRAMS = {
     "apt-get",
     "export",
     "local_slurm.sh",
+    "srun",
     ".",
 }
 FOLDERS = ("docs", "eval", "tests", "notebooks", "examples", "potlp_jax")
