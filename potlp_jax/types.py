@@ -44,7 +44,7 @@ horizon1                       product states of a path: its moves and the sourc
 
 Pictures and estimators
 rows, columns                  of a panorama; a column is a bearing
-G, views                       views of a training batch; of a data set
+G, views, worlds               views of a training batch; views and worlds of a data set
 F                              features of a position in a panorama
 feature_rows, feature_columns  rows and columns of a panorama's features
 bands, columns_out             bands of rows of a panorama; columns of a result where they are fewer

@@ -23,6 +23,7 @@ from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.replay import estimator_at
 from potlp_jax.trials.robot import SimulatedRobot
+from potlp_jax.trials.setbacks import SetbackConfig, Setbacks
 from potlp_jax.world.camera import CameraConfig, Disturbance
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import make_world
@@ -105,6 +106,14 @@ def _counts(trial, steps):
     return expected
 
 
+def _loop(robot, config):
+    """The loop of a policy that asks a counter, whatever the shape of the map."""
+    key, setbacks = jax.random.key(0), Setbacks(SetbackConfig())
+    return trial_module._Loop(
+        robot, TASK, TASK.arrays, Policy.POTLP, lambda shape: _counter(), key, config, setbacks, None
+    )
+
+
 @pytest.mark.parametrize(("every", "on_the_way"), [(1, True), (2, True), (0, True), (1, False)])
 def test_the_camera_looks_as_often_as_is_said_and_a_batch_and_a_replay_do_the_same(every, on_the_way):
     config = dataclasses.replace(CONFIG, look_every=every)
@@ -132,8 +141,8 @@ def test_a_robot_that_keeps_no_pictures_of_its_way_is_asked_at_decisions_alone()
     class Forgetful:
         observe, panorama, advance = robot.observe, robot.panorama, robot.advance
 
-    loop = trial_module._Loop(Forgetful(), TASK, TASK.arrays, Policy.POTLP, _counter(), jax.random.key(0), CONFIG)
-    run = loop.run()
+    loop = _loop(Forgetful(), CONFIG)
+    run = loop.run(*robot.observe())
     assert isinstance(loop._estimator, Counter)
     assert int(jnp.sum(loop._estimator.memory)) == len(run.decisions)
 
@@ -155,8 +164,7 @@ def test_pictures_of_the_way_are_those_of_its_cells():
             seen_before.append(np.asarray(robot.panorama_before(back)))
             return robot.panorama_before(back)
 
-    loop = trial_module._Loop(Watching(), TASK, TASK.arrays, Policy.POTLP, _counter(), jax.random.key(0), config)
-    run = loop.run()
+    run = _loop(Watching(), config).run(*robot.observe())
     between = [step for step in _looks(run, 1) if step not in {decision.step for decision in run.decisions}]
     assert len(between) == len(seen_before)
     for step, image in zip(between, seen_before, strict=True):

@@ -26,8 +26,9 @@ OTHERS = {
     "pip": {"--no-deps"},
     "git": {"--porcelain"},
     "CSS": {"--faint"},
+    "XLA": {"--xla"},
     "dask": {"--nthreads", "--host", "--port", "--no-dashboard", "--no-nanny", "--death-timeout"},
-    "Slurm": {"--noheader", "--format", "--full", "--signal", "--user"},
+    "Slurm": {"--noheader", "--format", "--full", "--signal", "--user", "--ntasks"},
 }
 """Options in our texts that are of others; those of the browser that draws pictures stand in one file of their own."""
 MADE = {

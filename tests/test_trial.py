@@ -31,6 +31,7 @@ from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import Outcome, load_trial, record_checksum
 from potlp_jax.trials.replay import replay_decision
 from potlp_jax.trials.robot import Leg, SimulatedRobot
+from potlp_jax.trials.setbacks import SetbackConfig, Setbacks
 from potlp_jax.types import NO_STATE, Status
 from potlp_jax.verify.audit import problems_of, satisfaction_is_promised
 from potlp_jax.world.frontiers import FrontierConfig
@@ -361,11 +362,22 @@ def test_a_robot_that_goes_elsewhere_is_on_its_way_to_nothing():
     for follower, stays in ((StayingRobot(), True), (robot, False)):
         estimator = TrueMapEstimator(world=world)
         loop = trial_module._Loop(
-            follower, task, task.padded(SIZES), Policy.ORACLE, estimator, jax.random.key(0), CONFIG
+            follower,
+            task,
+            task.padded(SIZES),
+            Policy.ORACLE,
+            lambda shape, asked=estimator: asked,
+            jax.random.key(0),
+            CONFIG,
+            Setbacks(SetbackConfig()),
+            None,
         )
-        move = loop._decide(*robot.observe())
+        belief, cell = robot.observe()
+        loop._begin(belief, cell)
+        move = loop._decide(belief, cell)
         assert int(move.intention.state) == int(loop._tally.state)
-        loop._advance(robot.observe()[0], move)
+        leg = follower.advance(move.path, trial_module._stop_of(move, loop._tally, belief, config=CONFIG))
+        loop._after(leg, leg.cells, move, robot.observe()[0])
         expected = NO_STATE if stays else int(move.intention.state)
         assert int(loop._tally.intention.state) == expected
 

@@ -1,6 +1,6 @@
 """Drive a simulated robot through perturbed streams of messages, and count how that ends.
 
-    python -m eval.live --streams 1000 --out docs/results/live.json
+    python -m eval.live --streams 1000 --out out/live.json
     python -m eval.live --streams 20 --first 300 --verbose       # some of them, one line each
 
 Each stream has its own network (delay, loss, duplicates, another order, jumps of the pose, damaged messages, a clock
@@ -56,6 +56,9 @@ class _Inbox(SteppedInbox):
         if self._link.time > LONGEST:
             raise HungError(f"not ended after {LONGEST:g} s")
         super().wait(seconds)
+
+
+COMMAND = "python -m eval.live"
 
 
 def behaviour_of(random: np.random.Generator) -> Behaviour:
@@ -168,7 +171,7 @@ def main() -> int:
     found = summary_of(rows, len(known), time.monotonic() - begun)
     print(json.dumps({name: value for name, value in found.items() if name != "bad"}, indent=1))
     if arguments.out is not None:
-        command = f"python -m eval.live --streams {arguments.streams}"
+        command = f"{COMMAND} --streams {arguments.streams}"
         data = {"provenance": provenance() | {"command": command}, **found}
         arguments.out.write_text(json.dumps(data, indent=1, default=str) + "\n", "utf-8")
     return int(bool(found["crashes"] or found["hung"] or found["disagreements"]))

@@ -3,7 +3,7 @@
 python -m eval.scale overhead --report docs/results/scale/overhead
 python -m eval.scale store --report docs/results/scale/store
 python -m eval.scale kills --out out/scale --report docs/results/scale/kills
-python -m eval.scale fits --out out/scale-fits --report docs/results/scale/fits
+python -m eval.scale fits --out out/scale-fits --report out/fits
 """
 
 import argparse

@@ -1,7 +1,7 @@
 """A connection by rosbridge: JSON over a websocket, so that no ROS is needed here. The only module that knows roslibpy.
 
 References:
-    rosbridge v2.0 protocol specification (RobotWebTools/rosbridge_suite, ROSBRIDGE_PROTOCOL.md).
+    rosbridge v2.0 protocol specification (RobotWebTools/rosbridge_suite).
 """
 
 from collections.abc import Callable

@@ -5,7 +5,7 @@ import dataclasses
 import functools
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -120,7 +120,7 @@ def _shapes_of_results(*_leaves: Any, shapes: tuple[tuple[tuple[int, ...], Any],
     return [ShapedArray(shape, dtype) for shape, dtype in shapes]
 
 
-def _vectorise(leaves: list[jax.Array], axes: list[Any], *, native: Any, twin: Any, shapes: Any) -> tuple[Any, Any]:
+def _vectorise(leaves: Sequence[Any], axes: Sequence[Any], *, native: Any, twin: Any, shapes: Any) -> tuple[Any, Any]:
     size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
     wider = tuple(((size, *shape), dtype) for shape, dtype in shapes)
     of_rows = [jax.vmap(function, in_axes=tuple(axes)) for function in (native, twin)]

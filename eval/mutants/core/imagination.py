@@ -47,9 +47,9 @@ MUTANTS = (
         PART,
         "imagined: columns are swept with the rows' passages",
         _WAYS,
-        "_Lines([jnp.swapaxes(closed[number], 0, 1) for number in _TRANSPOSED])",
-        "_Lines([jnp.swapaxes(chance, 0, 1) for chance in closed])",
-        ("tests/test_imagined_paths.py",),
+        "for number in _TRANSPOSED])",
+        "for number in range(len(steps))])",
+        ("tests/test_native_twins.py",),
     ),
     Mutant(
         PART,
