@@ -188,7 +188,7 @@ def test_the_truth_is_kept_for_the_same_problem_only(tmp_path):
 
 
 def test_the_goal_counts_from_where_it_is_kept():
-    from eval.bench.regret import Row, time_to_goal
+    from eval.bench.regret_report import Row, time_to_goal
 
     def row(budget, percent):
         return Row("test", "find", 1, "best-first", budget, float(budget), [0], [percent], [percent], [True], [0.0])
