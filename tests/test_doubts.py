@@ -4,9 +4,10 @@ import jax
 import numpy as np
 import pytest
 
-from potlp_jax.cli.doubts import of_worlds, surroundings_of
+from potlp_jax.cli.doubts import of_worlds, surroundings_of, warn_of_sweep
 from potlp_jax.environments.registry import make
 from potlp_jax.errors import TaskWarning
+from potlp_jax.sweep.specification import specification_from_dict
 from potlp_jax.task.doubts import Surroundings, find_doubts, structure_of
 from potlp_jax.task.shipped import shipped_tasks
 from potlp_jax.task.task import Task
@@ -89,3 +90,10 @@ def test_surroundings_are_what_free_cells_of_the_worlds_hold():
     assert set(found.letters) == expected
     assert found.starts == tuple(int(jax.numpy.asarray(world.letters)[tuple(world.start.tolist())]) for world in worlds)
     assert of_worlds("one", worlds[:1]).starts == found.starts[:1]
+
+
+def test_a_sweep_says_the_doubts_of_each_task_and_environment(caplog):
+    entries = {"environments": ["toy"], "tasks": ["F (goal & hazard)", 1], "policies": ["baseline"], "worlds": 1}
+    warn_of_sweep(specification_from_dict(entries, "test"))
+    (said,) = caplog.messages
+    assert said.startswith("task 'F (goal & hazard)':")

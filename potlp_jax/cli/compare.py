@@ -78,7 +78,7 @@ def compare_policies(
     json: Json = False,
 ) -> None:
     """Compare policies in the same worlds, with the share of attainable savings and its uncertainty."""
-    from potlp_jax.cli.doubts import surroundings_of, warn_of_doubts
+    from potlp_jax.cli.doubts import warn_of_sweep
     from potlp_jax.cli.inputs import read_names, read_split, setting_changes
     from potlp_jax.environments.registry import make
     from potlp_jax.sweep.specification import specification_from_dict
@@ -102,7 +102,7 @@ def compare_policies(
     if estimator is not None:
         entries["estimator"] = estimator
     specification = specification_from_dict(entries, "compare")
-    warn_of_doubts(generator.task(task), surroundings_of(generator, chosen_split, world))
+    warn_of_sweep(specification)
     if out is not None:
         results = _run(specification, make_folder(out), processes)
         files = _write(results, out)

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from potlp_jax.environments.base import Generator
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, default_split, world_key
+from potlp_jax.sweep.specification import Specification
 from potlp_jax.task.doubts import NOTHING_TO_DO, Surroundings, find_doubts
 from potlp_jax.task.task import Task
 from potlp_jax.world.grid import World
@@ -52,3 +54,13 @@ def warn_of_doubts(task: Task, surroundings: Surroundings) -> None:
     if doubts:
         more = f" (and {len(doubts) - 1} more: potlp task)" if len(doubts) > 1 else ""
         logger.warning(f"task '{task.text}': {doubts[0].message}{more}")
+
+
+def warn_of_sweep(specification: Specification) -> None:
+    """Say the first doubt about each task of a sweep, before it costs hours."""
+    for name in dict.fromkeys(cell.environment for cell in specification.cells):
+        generator = make(name)
+        surroundings = surroundings_of(generator, specification.split, specification.first_world)
+        for cell in specification.cells:
+            if cell.environment == name:
+                warn_of_doubts(generator.task(cell.task), surroundings)

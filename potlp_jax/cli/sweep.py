@@ -81,6 +81,7 @@ def run(
     json: Json = False,
 ) -> None:
     """Run environments × tasks × policies × worlds, or what is missing of it."""
+    from potlp_jax.cli.doubts import warn_of_sweep
     from potlp_jax.cli.inputs import warn_of_test_worlds
     from potlp_jax.environments.splits import Split
     from potlp_jax.sweep.specification import read_specification
@@ -89,6 +90,7 @@ def run(
     # `potlp run` and `potlp compare` say so where they read the split; here the file names it.
     if specification.split is Split.TEST:
         warn_of_test_worlds()
+    warn_of_sweep(specification)
     if retry_broken:
         forget_broken(out)
     run_reported(specification, make_folder(out), processes, cluster)
