@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from flax import struct
 
-from eval.limit.__main__ import read_rows, run
+from eval.limit.__main__ import run
 from eval.limit.arms import Arm, key_of, missing_rows
 from eval.limit.buildings import (
     SIGNS,
@@ -24,6 +25,8 @@ from eval.limit.buildings import (
 )
 from eval.limit.observer import ideal_observer, mean_labels, mixed
 from eval.limit.report import page, results_of
+from eval.limit.rows import read_rows
+from eval.limit.worst import Loss, cause_of, worst_of
 from eval.provenance import lines_of
 from potlp_jax.environments.firefighting import (
     Firefighting,
@@ -447,3 +450,36 @@ def test_a_trial_that_does_not_end_is_in_no_gain():
     table = results_of(rows, {"1": "F a"})["tables"]["1"]
     assert table["satisfied"]["pairs"] == 3
     assert np.isclose(table["gains"]["true-chances"]["gain"], 0.6)
+
+
+def test_the_worst_trials_are_those_that_lose_most():
+    def row(task, world, policy, cost, outcome="satisfied"):
+        return SimpleNamespace(
+            item=SimpleNamespace(task=task, world=world, policy=policy), cost=cost, outcome=outcome, status=0
+        )
+
+    rows = [
+        row(task, world, policy, cost)
+        for task, world, costs in (("F a", 0, (10, 30, 12)), ("F a", 1, (10, 30, 25)), ("F b", 0, (5, 45, 15)))
+        for policy, cost in zip(("known-map", "baseline", "potlp"), costs, strict=True)
+    ]
+    found = worst_of(rows, {"1": "F a", "2": "F b"}, 2)
+    assert [(loss.task, loss.world, loss.lost) for loss in found] == [("1", 1, 15), ("2", 0, 10)]
+    # Of all that is to be saved in the task, 40 cells in either.
+    assert [round(loss.points, 6) for loss in found] == [37.5, 25.0]
+
+
+@pytest.mark.parametrize(
+    ("costs", "cause"),
+    [
+        ((10, 20, 12, 30, 19), "P_S"),
+        ((10, 20, 18, 12, 19), "R_S and R_F"),
+        ((10, 20, 19, 19, 12), "several answers at once"),
+        ((10, 20, 19, 19, 19), "not to be seen"),
+    ],
+)
+def test_a_cause_is_what_cures_at_least_half_of_a_loss(costs, cause):
+    known, potlp, chances, true_costs, ideal = costs
+    loss = Loss(task="1", world=0, known_map=known, baseline=30, potlp=potlp, points=1.0)
+    found = {Arm.TRUE_CHANCES: chances, Arm.TRUE_COSTS: true_costs, Arm.IDEAL_OBSERVER: ideal}
+    assert cause_of(loss, found) == cause

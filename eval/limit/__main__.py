@@ -19,33 +19,18 @@ from typing import Any
 
 from eval.limit.arms import REFERENCES, Arm, Experiment, key_of, missing_rows
 from eval.limit.report import markdown, page, results_of
+from eval.limit.rows import ROWS, append_row, read_rows
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
 from potlp_jax.learning.estimator import named_estimator
 
-ROWS = "trials.jsonl"
-
-
-def read_rows(file: Path) -> list[dict[str, Any]]:
-    """Rows written so far; a line that was cut off by a kill is left out, and its trial runs again."""
-    rows = []
-    for line in file.read_text("utf-8").splitlines() if file.exists() else []:
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue
-    return rows
-
 
 def run(file: Path, experiment: Experiment, arms: Sequence[Arm], worlds: int) -> None:
     """Append what is missing."""
-    file.parent.mkdir(parents=True, exist_ok=True)
     for row in missing_rows(experiment, arms, worlds, read_rows(file)):
-        with file.open("a", encoding="utf-8") as stream:
-            # A new line first: the last one may have been cut off by a kill.
-            stream.write(f"\n{json.dumps(row)}\n")
+        append_row(file, row)
         print(f"task {row['task']} world {row['world']} {row['arm']}: {row['outcome']}, {row['cost']:.1f}", flush=True)
 
 

@@ -1,0 +1,27 @@
+"""Trials of different answers, kept as JSON lines, so that a command goes on where it was killed."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+ROWS = "trials.jsonl"
+
+
+def read_rows(file: Path) -> list[dict[str, Any]]:
+    """Rows written so far; a line that was cut off by a kill is left out, and its trial runs again."""
+    rows = []
+    for line in file.read_text("utf-8").splitlines() if file.exists() else []:
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return rows
+
+
+def append_row(file: Path, row: Mapping[str, Any]) -> None:
+    """Write a row behind the others; makes the folder and the file where they are missing."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with file.open("a", encoding="utf-8") as stream:
+        # A new line first: the last one may have been cut off by a kill.
+        stream.write(f"\n{json.dumps(row)}\n")
