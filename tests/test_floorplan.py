@@ -311,7 +311,7 @@ def _without_lab(folder, name="plan", label="GYM"):
 
 
 def test_a_plan_is_used_for_every_task_whose_places_it_has(tmp_path):
-    generator = make(f"floorplan:{_without_lab(tmp_path)}")
+    generator = FloorPlans.from_spec(f"floorplan:{_without_lab(tmp_path)}")
     assert generator.propositions == PEOPLE.propositions
     for possible in ("F undergrad", "F professor & F undergrad", "F grad | F undergrad", "!grad U professor"):
         assert generator.task(possible).text == possible
@@ -322,7 +322,7 @@ def test_a_plan_is_used_for_every_task_whose_places_it_has(tmp_path):
 
 
 def test_letters_mean_the_same_where_somebody_has_no_room(tmp_path):
-    generator = make(f"floorplan:{_without_lab(tmp_path)}")
+    generator = FloorPlans.from_spec(f"floorplan:{_without_lab(tmp_path)}")
     for index in range(3):
         world, found, placement = generator.generate_with_layout(world_key(Split.TEST, index, generator.name))
         letters = np.asarray(world.letters)
@@ -345,14 +345,14 @@ def test_rooms_whose_label_nobody_explained_are_rooms(tmp_path):
 def test_a_folder_takes_tasks_that_some_plan_can_do_and_leaves_out_what_lacks_what_it_needs(tmp_path):
     _academic().write(tmp_path, "a")
     _without_lab(tmp_path, "b")
-    both = make(f"floorplan:{tmp_path}")
+    both = FloorPlans.from_spec(f"floorplan:{tmp_path}")
     assert [floor.present for floor in both.floors] == [PEOPLE.propositions, ("professor", "undergrad")]
     assert both.task("1")
     with pytest.warns(MapWarning, match=r"1 of 2 plans are left out: b\.xml"):
-        generator = make(f"floorplan:{tmp_path},needs=grad+professor")
+        generator = FloorPlans.from_spec(f"floorplan:{tmp_path},needs=grad+professor")
     assert [floor.name for floor in generator.floors] == ["a"]
     with pytest.raises(MapError, match="no room of kind lab can be reached, for grad"):
-        make(f"floorplan:{tmp_path / 'b.xml'},needs=grad")
+        FloorPlans.from_spec(f"floorplan:{tmp_path / 'b.xml'},needs=grad")
 
 
 def test_many_lost_rooms_are_a_warning(tmp_path):

@@ -67,7 +67,7 @@ def _remark(file: Path, pixels: tuple[int, int], pixel: Fraction, cell: Fraction
     height, width = pixels
     narrow, finer = 2 * (radius + cell), max(DEFAULT_CELL, pixel)
     why = (
-        f"with cells of {float(finer):g} m it has {_cells(pixels, pixel, finer):,}, more than {MOST_CELLS:,}"
+        f"with cells of {float(finer):g} m there would be {_cells(pixels, pixel, finer):,}, more than {MOST_CELLS:,}"
         if cell > finer
         else "its pixels are as large"
     )
