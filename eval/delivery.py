@@ -52,7 +52,8 @@ def groups(plans: Path | None) -> dict[str, str]:
     """Environments by the name of their group."""
     found = {GENERATED: "delivery"}
     for folder in [] if plans is None else sorted(path for path in plans.iterdir() if path.is_dir()):
-        found[folder.name] = f"floorplan:{folder}"
+        # The tables are of plans with all places of the delivery task, for every one of its tasks.
+        found[folder.name] = f"floorplan:{folder},needs=professor+grad+undergrad"
     return found
 
 

@@ -17,7 +17,7 @@ from potlp_jax.environments.campus.floor_plans import FloorPlanConfig, FloorPlan
 from potlp_jax.environments.campus.furnishing import NO_ROOM, PEOPLE, Kind, missing_kinds
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, default_split, usable_splits, world_key
-from potlp_jax.errors import MapError, MapWarning, SpecificationError, WorldError
+from potlp_jax.errors import MapError, MapWarning, SpecificationError, TaskError, WorldError
 from potlp_jax.sweep.specification import specification_from_dict
 
 CLEAN = {"rooms_lost": 0, "doors_without_point": 0, "doors_unplaced": 0, "doors_narrowed": 0}
@@ -303,6 +303,58 @@ def test_a_folder_is_many_buildings_of_one_shape_and_tells_what_it_leaves_out(tm
         assert np.array_equal(np.asarray(world.occupied)[:rows, :columns], found.floor.occupied)
 
 
+def _without_lab(folder, name="plan", label="GYM"):
+    """The plan with a room of another kind in the place of the laboratory."""
+    drawing = _academic()
+    drawing.rooms = [room.replace("LAB", label) for room in drawing.rooms]
+    return drawing.write(folder, name)
+
+
+def test_a_plan_is_used_for_every_task_whose_places_it_has(tmp_path):
+    generator = FloorPlans.from_spec(f"floorplan:{_without_lab(tmp_path)}")
+    assert generator.propositions == PEOPLE.propositions
+    for possible in ("F undergrad", "F professor & F undergrad", "F grad | F undergrad", "!grad U professor"):
+        assert generator.task(possible).text == possible
+    message = r"(?s)plan\.xml: .*plan has no room for grad; it has professor, undergrad\. Its labels: CLASSROOM, CORR"
+    for impossible in ("1", "F grad", "F (grad & X professor)", "delivery-1"):
+        with pytest.raises(TaskError, match=message):
+            generator.task(impossible)
+
+
+def test_letters_mean_the_same_where_somebody_has_no_room(tmp_path):
+    generator = FloorPlans.from_spec(f"floorplan:{_without_lab(tmp_path)}")
+    for index in range(3):
+        world, found, placement = generator.generate_with_layout(world_key(Split.TEST, index, generator.name))
+        letters = np.asarray(world.letters)
+        assert set(np.unique(letters)) == {0, 0b001, 0b100}
+        assert {found.floor.kinds[room] for room in found.floor.rooms[letters == 0b100]} == {Kind.CLASSROOM}
+        assert set(placement.rooms) == {"professor", "undergrad"}
+
+
+def test_rooms_whose_label_nobody_explained_are_rooms(tmp_path):
+    with pytest.warns(MapWarning, match="no kind is given for AQUARIUM: rooms of no particular kind"):
+        generator = FloorPlans(FloorPlanConfig(_without_lab(tmp_path, label="AQUARIUM")))
+    found = generator.floors[0]
+    assert dict(zip(found.room_ids, found.floor.kinds, strict=True))["l"] is Kind.OTHER
+    assert _area(found, "l") > 0.75 * 30
+    assert generator.task("F undergrad")
+    with pytest.raises(TaskError, match="no room for grad"):
+        generator.task("F grad")
+
+
+def test_a_folder_takes_tasks_that_some_plan_can_do_and_leaves_out_what_lacks_what_it_needs(tmp_path):
+    _academic().write(tmp_path, "a")
+    _without_lab(tmp_path, "b")
+    both = FloorPlans.from_spec(f"floorplan:{tmp_path}")
+    assert [floor.present for floor in both.floors] == [PEOPLE.propositions, ("professor", "undergrad")]
+    assert both.task("1")
+    with pytest.warns(MapWarning, match=r"1 of 2 plans are left out: b\.xml"):
+        generator = FloorPlans.from_spec(f"floorplan:{tmp_path},needs=grad+professor")
+    assert [floor.name for floor in generator.floors] == ["a"]
+    with pytest.raises(MapError, match="no room of kind lab can be reached, for grad"):
+        FloorPlans.from_spec(f"floorplan:{tmp_path / 'b.xml'},needs=grad")
+
+
 def test_many_lost_rooms_are_a_warning(tmp_path):
     drawing = _academic().box("x", "OFFICE", 0, 80, 20, 100).box("y", "OFFICE", 30, 80, 50, 100)
     with pytest.warns(MapWarning, match="has lost many of its rooms: 6 rooms, 3 doors, 2 rooms without door"):
@@ -360,8 +412,12 @@ def _changed(old, new, count=-1):
         (_changed('x="60"', 'x="nan"'), "space o: bounding_polygon: 'nan' is not a finite number"),
         (_changed('id="l"', 'id="o"'), "space o: the id is given twice"),
         (_changed("<label>LAB</label>", ""), "space l: has no label"),
-        (_changed("LAB", "AQUARIUM"), "no kind is given for AQUARIUM"),
-        (_changed("LAB", "OFFICE"), "no room of kind lab can be reached"),
+        (_changed("CORRIDOR", "CLOSET"), "no room of kind hallway can be reached, where the robot could start"),
+        (
+            lambda text: text.replace("LAB", "GYM").replace("OFFICE", "GYM").replace("CLASSROOM", "GYM"),
+            "no room of kind office, lab, classroom can be reached, for professor, grad, undergrad. The labels are: "
+            "CORRIDOR, GYM",
+        ),
         (_changed("<id>o</id>", "<id>ghost</id>"), "must join two rooms, found \\['ghost', 'hall'\\]"),
         (_changed('<point x="60" y="0"/><point x="60" y="50"/>', ""), "has 2 points"),
         (lambda text: re.sub(r"<space .*</space>", "", text), "has no rooms"),
@@ -389,6 +445,7 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path, change, message):
         ("floorplan:PLAN,kinds=KINDS", "kitchen: is no kind of room; choose from: hallway, other, office"),
         ("floorplan:FOLDER", "no plan can be used"),
         ("floorplan:EMPTY", "holds no .xml file"),
+        ("floorplan:PLAN,needs=professor+dean", "needs: 'dean' is none of professor, grad, undergrad"),
     ],
 )
 def test_what_is_wrong_with_a_name_is_said(tmp_path, spec, message):
@@ -485,7 +542,7 @@ def test_enough_plans_of_the_corpora_have_all_kinds_of_rooms(corpus):
 
 def test_a_folder_of_the_corpora_becomes_buildings(external_data):
     with pytest.warns(MapWarning, match=r"1 of 12 plans are left out: 324-Elm-Furn-Plan\.xml"):
-        generator = make(f"floorplan:{external_data / 'floorplans' / 'office'}")
+        generator = make(f"floorplan:{external_data / 'floorplans' / 'office'},needs=professor+grad+undergrad")
     assert isinstance(generator, FloorPlans)
     assert len(generator.floors) == 11
     world, found, placement = generator.generate_with_layout(world_key(Split.TEST, 0, generator.name))
@@ -495,3 +552,18 @@ def test_a_folder_of_the_corpora_becomes_buildings(external_data):
     assert found.floor.kinds[found.floor.rooms[placement.cells["professor"]]] is Kind.OFFICE
     again = generator.generate(world_key(Split.TEST, 0, generator.name))
     assert all(map(np.array_equal, jax.tree.leaves(world), jax.tree.leaves(again)))
+
+
+def test_plans_of_the_corpora_load_with_the_places_that_they_have(external_data):
+    """No plan is refused for want of some kind of room, and each does what it has places for."""
+    files = sorted((external_data / "floorplans").glob("*/*.xml"))
+    loaded = [FloorPlans(FloorPlanConfig(file)) for file in files]
+    complete = [generator for generator in loaded if not generator.floors[0].absent]
+    assert len(complete) == USABLE
+    for generator in loaded:
+        for name in PEOPLE.propositions:
+            if name in generator.floors[0].present:
+                assert generator.task(f"F {name}")
+            else:
+                with pytest.raises(TaskError, match=f"no room for {name}; it has "):
+                    generator.task(f"F {name}")

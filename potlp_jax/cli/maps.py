@@ -46,7 +46,14 @@ MapFile = Annotated[
 Level = Annotated[
     str | None, typer.Option("--level", metavar="NAME", help="Of a building with several.", show_default=False)
 ]
-Resolution = Annotated[float, typer.Option("--resolution", help="Size of a cell of the working grid, in metres.")]
+Resolution = Annotated[
+    float | None,
+    typer.Option(
+        "--resolution",
+        help="Size of a cell of the working grid, in metres. Default: 0.2, larger on large maps.",
+        show_default=False,
+    ),
+]
 Radius = Annotated[float, typer.Option("--radius", help="The robot's radius in metres, by which obstacles grow.")]
 Start = Annotated[
     str | None,
@@ -71,7 +78,7 @@ Start = Annotated[
 )
 def inspect_map(
     file: MapFile,
-    resolution: Resolution = 0.2,
+    resolution: Resolution = None,
     radius: Radius = 0.1,
     start: Start = None,
     level: Level = None,
@@ -85,8 +92,8 @@ def inspect_map(
     # What is odd about the file is listed with the map's other defects rather than as notes on stderr.
     with _caught_warnings() as remarks:
         image_map = load_building(file, level)
-    # `--start` names the option in messages about a start that lies in a wall.
-    clean = clean_map(image_map, resolution, radius, _read_start(start), "--start")
+        # `--start` names the option in messages about a start that lies in a wall.
+        clean = clean_map(image_map, resolution, radius, _read_start(start), "--start")
     survey = survey_map(image_map, clean)
     defects = [*remarks, *_defects(survey, clean)]
     if json:
@@ -120,7 +127,7 @@ def inspect_map(
 def write_clean_map(
     file: MapFile,
     out: Annotated[Path, typer.Option("--out", "-o", metavar="NEW.yaml", help="Map to write, NEW.pgm beside it.")],
-    resolution: Resolution = 0.2,
+    resolution: Resolution = None,
     radius: Radius = 0.1,
     start: Start = None,
     level: Level = None,
@@ -150,7 +157,7 @@ def write_clean_map(
     for line in _cut_off_lines(clean):
         output.print(f"- {line}")
     output.print(f"wrote {out} and {image}")
-    next_one = f"potlp map label {out} --resolution {resolution:g} --radius 0, then potlp run {world}"
+    next_one = f"potlp map label {out} --resolution {clean.frame.resolution:g} --radius 0, then potlp run {world}"
     output.print(f"next: {next_one} (the radius is in the map already)", style="dim")
 
 
@@ -193,7 +200,7 @@ def label_map(
         list[str] | None,
         typer.Option("--named", metavar="NAME", help="A place that the file names, such as a vertex of Open-RMF."),
     ] = None,
-    resolution: Resolution = 0.2,
+    resolution: Resolution = None,
     radius: Radius = 0.1,
     level: Level = None,
     json: Json = False,
@@ -253,7 +260,7 @@ def preview_map(
     labels: Annotated[
         Path | None, typer.Option("--labels", metavar="LABELS.yaml", help="Labels to draw; default: FILE.places.yaml.")
     ] = None,
-    resolution: Resolution = 0.2,
+    resolution: Resolution = None,
     radius: Radius = 0.1,
     level: Level = None,
 ) -> None:
@@ -281,7 +288,7 @@ def preview_map(
     console().print(f"wrote {out}")
 
 
-def _environment(file: Path, places: Path | None, resolution: float, radius: float, level: str | None) -> str:
+def _environment(file: Path, places: Path | None, resolution: float | None, radius: float, level: str | None) -> str:
     """How the command line names the worlds on a map, without options that have their default."""
     from potlp_jax.environments.ros.ros_map import RosMapConfig
 

@@ -1,7 +1,7 @@
 """A task: a formula, its automaton and its outcome classes in one frozen object, and its arrays for the device."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import astuple, dataclass
 from functools import cached_property
 from typing import Any
@@ -224,6 +224,16 @@ class Task:
             max_positive_literals=max_positive_literals,
             structure=structure,
         )
+
+    def can_do_without(self, names: Collection[str]) -> bool:
+        """Whether some word satisfies the task in which none of these propositions ever holds."""
+        bits = sum(1 << self.propositions.index(name) for name in names)
+        transitions = self.dfa.transitions[:, (np.arange(self.dfa.transitions.shape[1]) & bits) == 0]
+        reached = {self.dfa.initial}
+        # As many rounds as there are states reach all that can be reached.
+        for _ in range(self.dfa.num_states):
+            reached |= {int(state) for state in np.unique(transitions[sorted(reached)])}
+        return bool(self.dfa.accepting[sorted(reached)].any())
 
     @property
     def edges(self) -> Int32[np.ndarray, "E 2"]:

@@ -13,14 +13,21 @@ A plan is a drawing, not a map. `rasterise` turns it into a floor:
    that the file calls implicit has no wall, and becomes as wide as the rooms face each other.
 4. Rooms without a door, and others that cannot be reached, are walled up: the largest connected part stays.
 
-``FloorReport`` counts what was lost or bent on the way. A plan without all the kinds of room that the task needs is an
-error; in a folder it is left out, with a warning.
+``FloorReport`` counts what was lost or bent on the way. A room whose label nobody explained is a room of no particular
+kind, and a warning names the label.
+
+A plan is used for every task whose places it has. Its worlds have all propositions of the delivery task, so that
+letters mean the same in all of them; one for which the plan has no room holds nowhere. A task that cannot be satisfied
+without it is refused by ``FloorPlans.task``. In a folder it is refused where that is so on every plan; on single ones
+the world is impossible, and sweeps draw another. ``needs=professor+grad`` leaves plans out that lack one of these. What
+every plan needs is a hallway, where the robot starts, and a place.
 """
 
 import itertools
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 
 import jax
@@ -38,15 +45,16 @@ from potlp_jax.environments.campus.furnishing import (
     FurnishConfig,
     Kind,
     Placement,
+    absent_propositions,
     furnish,
-    missing_kinds,
     name_kinds,
 )
 from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.ros.map_files import GridFrame
 from potlp_jax.environments.ros.places import Polygon, component_labels
 from potlp_jax.environments.splits import FLOOR_PLAN_PREFIX
-from potlp_jax.errors import MapError, MapWarning
+from potlp_jax.errors import MapError, MapWarning, TaskError
+from potlp_jax.task.task import Task
 from potlp_jax.world.grid import World
 from potlp_jax.world.settings import Settings
 
@@ -66,6 +74,9 @@ _SHIFTS = (0, 1, -1, 2, -2)
 Cut = tuple[Int[np.ndarray, " N"], Int[np.ndarray, " N"]]
 """Rows and columns of cells to open."""
 
+NAMED_PLANS = 5
+"""Plans of a folder that an error about a task names."""
+
 LOST_ROOMS = 0.25
 """Share of the rooms from which on their loss is worth a warning."""
 
@@ -78,12 +89,14 @@ class FloorPlanConfig:
         path: an XML file, or a folder of them.
         resolution: side of a cell in metres.
         kinds: YAML of what the labels mean; None: the shipped one.
+        needs: propositions that a plan must have a room for, to be used.
         furnishing: people, light and colours.
     """
 
     path: str | Path
     resolution: float = 0.5
     kinds: str | Path | None = None
+    needs: tuple[str, ...] = ()
     furnishing: FurnishConfig = FurnishConfig()
 
 
@@ -132,6 +145,8 @@ class PlanFloor:
         room_ids: of the floor's rooms, as in the file.
         frame: metres of the plan (y upwards) to cells.
         report: what was lost.
+        labels: of the plan's rooms, in alphabetical order.
+        unknown: those of which it was not given what they mean.
     """
 
     name: str
@@ -139,6 +154,18 @@ class PlanFloor:
     room_ids: tuple[str, ...]
     frame: GridFrame
     report: FloorReport
+    labels: tuple[str, ...]
+    unknown: tuple[str, ...]
+
+    @cached_property
+    def absent(self) -> tuple[str, ...]:
+        """Propositions of the delivery task for which the floor has no room."""
+        return absent_propositions(self.floor, PEOPLE)
+
+    @property
+    def present(self) -> tuple[str, ...]:
+        """The others."""
+        return tuple(name for name in PEOPLE.propositions if name not in self.absent)
 
 
 class FloorPlans(Generator):
@@ -162,7 +189,8 @@ class FloorPlans(Generator):
             MapError: a file cannot be used, or no plan of the folder can.
 
         Warns:
-            MapWarning: plans of a folder are left out, or a plan has lost more than a quarter of its rooms.
+            MapWarning: plans of a folder are left out, a plan has lost more than a quarter of its rooms, or has labels
+                of which nothing says what they mean.
         """
         self.config = config
         path, kinds = Path(config.path), read_kinds(config.kinds)
@@ -170,7 +198,7 @@ class FloorPlans(Generator):
         floors = []
         for file in _files(path):
             try:
-                floors.append(_usable_floor(file, kinds, config.resolution))
+                floors.append(_usable_floor(file, kinds, config))
             except MapError as error:
                 if not path.is_dir():
                     raise
@@ -186,12 +214,33 @@ class FloorPlans(Generator):
 
     @classmethod
     def from_spec(cls, spec: str) -> "FloorPlans":
-        """From ``floorplan:PATH``, with options ``,resolution=...`` and ``,kinds=...``.
+        """From ``floorplan:PATH``, with options ``,resolution=...``, ``,kinds=...`` and ``,needs=...``.
 
         Raises:
             MapError: the text is not of that form, or see the class.
         """
         return cls(parse_spec(spec))
+
+    def task(self, text: str | int) -> Task:
+        """A task over the propositions of the delivery task, as ``Generator.task``.
+
+        Raises:
+            TaskError: there is no such task, or it needs places that no plan has.
+        """
+        task = super().task(text)
+        lacking = [(floor, _needed(task, floor.absent)) for floor in self.floors]
+        if all(needed for _, needed in lacking):
+            plans = "\n".join(
+                f"{floor.name} has no room for {', '.join(needed)}; it has {', '.join(floor.present)}. "
+                f"Its labels: {', '.join(floor.labels)}"
+                for floor, needed in lacking[:NAMED_PLANS]
+            )
+            more = f"\nand {len(lacking) - NAMED_PLANS} plans more" if len(lacking) > NAMED_PLANS else ""
+            raise TaskError(
+                f"{self.config.path}: the task {task.text!r} needs places that no plan has:\n{plans}{more}\n"
+                "kinds=FILE.yaml gives labels another meaning; or give a task of the places that are there."
+            )
+        return task
 
     def draw(self, key: PRNGKeyArray) -> World:
         """The world of this key: a building, drawn uniformly, and people in it."""
@@ -202,7 +251,7 @@ class FloorPlans(Generator):
         # The key itself draws the building, so that people need one of their own.
         furnish_key = jax.random.fold_in(key, 0)
         floor = self.building(key)
-        world, placement = furnish(floor.floor, furnish_key, PEOPLE, self.config.furnishing, self._shape)
+        world, placement = furnish(floor.floor, furnish_key, PEOPLE, self.config.furnishing, self._shape, floor.absent)
         return self.signed(world), floor, placement
 
     def building(self, key: PRNGKeyArray) -> PlanFloor:
@@ -217,6 +266,11 @@ class FloorPlans(Generator):
         for floor in self.floors:
             if floor.report.rooms_lost > LOST_ROOMS * floor.report.rooms:
                 _warn(path, f"{floor.name} has lost many of its rooms: {floor.report}")
+        # A label that nobody explained must not become some kind of room in silence.
+        unknown = sorted({label for floor in self.floors for label in floor.unknown})
+        if unknown:
+            names = ", ".join(unknown)
+            _warn(path, f"no kind is given for {names}: rooms of no particular kind; list them in a file of kinds=")
 
 
 def parse_spec(spec: str) -> FloorPlanConfig:
@@ -225,9 +279,14 @@ def parse_spec(spec: str) -> FloorPlanConfig:
     Raises:
         MapError: the text is not of that form.
     """
-    usage = "write floorplan:FILE.xml (or a folder)[,resolution=METRES][,kinds=FILE.yaml]"
-    path, values = parse_options(spec, FLOOR_PLAN_PREFIX, "plan", {"resolution": float, "kinds": str}, usage)
-    return FloorPlanConfig(path, **values)
+    usage = "write floorplan:FILE.xml (or a folder)[,resolution=METRES][,kinds=FILE.yaml][,needs=NAME+NAME]"
+    options = {"resolution": float, "kinds": str, "needs": str}
+    path, values = parse_options(spec, FLOOR_PLAN_PREFIX, "plan", options, usage)
+    needs = tuple(values.pop("needs").split("+")) if "needs" in values else ()
+    unknown = [name for name in needs if name not in PEOPLE.propositions]
+    if unknown:
+        raise MapError(spec, "needs", f"{unknown[0]!r} is none of {', '.join(PEOPLE.propositions)}; {usage}")
+    return FloorPlanConfig(path, needs=needs, **values)
 
 
 def rasterise(plan: FloorPlan, kinds: Mapping[str, Kind], resolution: float) -> PlanFloor:
@@ -235,25 +294,21 @@ def rasterise(plan: FloorPlan, kinds: Mapping[str, Kind], resolution: float) -> 
 
     Args:
         plan: in metres.
-        kinds: the kind of room that each label means.
+        kinds: the kind of room that each label means; a room with another label is of the kind ``OTHER``.
         resolution: side of a cell in metres.
 
     Returns:
         The floor, and what was lost on the way.
 
     Raises:
-        MapError: a label is not in ``kinds``, the resolution is not positive or leaves nothing, or the floor would have
-            more than a thousand rows or columns.
+        MapError: the resolution is not positive or leaves nothing, or the floor would have more than a thousand rows or
+            columns.
     """
-    # A label that nobody explained would silently become some kind of room.
-    unknown = sorted({room.label for room in plan.rooms} - set(kinds))
-    if unknown:
-        raise MapError(plan.file, "label", f"no kind is given for {', '.join(unknown)}; list it in a file of kinds=")
     frame = _frame_around(plan, resolution)
     # Rooms that no door mentions would be solid in the end anyway, and until then be in the way of doors.
     with_door = {name for door in plan.doors for name in door.rooms}
     rooms = [room for room in plan.rooms if room.id in with_door]
-    drawing = _Drawing(rooms, [kinds[room.label] for room in rooms], frame)
+    drawing = _Drawing(rooms, [kinds.get(room.label, Kind.OTHER) for room in rooms], frame)
     without_cells = len(set(range(len(rooms))) - set(np.unique(drawing.cells).tolist()))
     # All doors are cut into the same building without doors, so that their order does not matter.
     placed = [drawing.cut_door(door) for door in plan.doors if door.points]
@@ -274,7 +329,9 @@ def rasterise(plan: FloorPlan, kinds: Mapping[str, Kind], resolution: float) -> 
     numbers = np.full(len(rooms) + 1, NO_ROOM, np.int32)
     numbers[kept] = np.arange(len(kept))
     floor = Floor(numbers[drawing.cells], drawing.doors, tuple(drawing.kinds[room] for room in kept), resolution)
-    return PlanFloor(plan.file.stem, floor, tuple(rooms[room].id for room in kept), frame, report)
+    labels = tuple(sorted({room.label for room in plan.rooms}))
+    unknown = tuple(label for label in labels if label not in kinds)
+    return PlanFloor(plan.file.stem, floor, tuple(rooms[room].id for room in kept), frame, report, labels, unknown)
 
 
 def _files(path: Path) -> list[Path]:
@@ -286,19 +343,30 @@ def _files(path: Path) -> list[Path]:
     return files
 
 
-def _usable_floor(file: Path, kinds: Mapping[str, Kind], resolution: float) -> PlanFloor:
-    plan = read_plan(file)
-    found = rasterise(plan, kinds, resolution)
-    missing = missing_kinds(found.floor, PEOPLE)
-    if missing:
-        labels = ", ".join(sorted({room.label for room in plan.rooms}))
+def _usable_floor(file: Path, kinds: Mapping[str, Kind], config: FloorPlanConfig) -> PlanFloor:
+    """The floor of a plan. Raises MapError where it has no hallway to start in, no place, or lacks what is needed."""
+    found = rasterise(read_plan(file), kinds, config.resolution)
+    # Without any place every task would be over at once, or impossible.
+    absent = found.absent if not found.present else tuple(name for name in config.needs if name in found.absent)
+    needed = [(Kind.HALLWAY,)] * (not found.floor.rooms_of(Kind.HALLWAY)) + [PEOPLE.rooms[name] for name in absent]
+    if needed:
+        purpose = f"for {', '.join(absent)}" if absent else "where the robot could start"
         raise MapError(
             file,
             "",
-            f"no room of kind {name_kinds(missing)} can be reached, and the delivery task needs one. The labels are: "
-            f"{labels}; kinds=FILE.yaml gives them another meaning. ({found.report})",
+            f"no room of kind {name_kinds(tuple(needed))} can be reached, {purpose}. The labels are: "
+            f"{', '.join(found.labels)}; kinds=FILE.yaml gives them another meaning. ({found.report})",
         )
     return found
+
+
+def _needed(task: Task, absent: tuple[str, ...]) -> tuple[str, ...]:
+    """Of the propositions that hold nowhere, those without which no path satisfies the task."""
+    if task.can_do_without(absent):
+        return ()
+    alone = tuple(name for name in absent if not task.can_do_without([name]))
+    # Of `F grad | F undergrad` neither is needed alone.
+    return alone or absent
 
 
 def _warn(path: Path, message: str) -> None:

@@ -15,7 +15,7 @@ laboratory's on both sides; between a laboratory and an office, too.
 
 import dataclasses
 import enum
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from types import MappingProxyType
 
 import cv2
@@ -179,17 +179,40 @@ class Placement:
     hallway_light: float
 
 
-def missing_kinds(floor: Floor, errand: Errand) -> tuple[tuple[Kind, ...], ...]:
-    """Of what the errand needs a room: the kinds of which the floor has none, or too few for all who need one."""
+def absent_propositions(floor: Floor, errand: Errand) -> tuple[str, ...]:
+    """Those for which the floor has no room, in the order of the letters' bits; where rooms are too few, the last."""
+    present: dict[str, tuple[Kind, ...]] = {}
+    for name, kinds in errand.rooms.items():
+        if kinds not in missing_kinds(floor, Errand({**present, name: kinds}, {})):
+            present[name] = kinds
+    return tuple(name for name in errand.propositions if name not in present)
+
+
+def missing_kinds(floor: Floor, errand: Errand, absent: Collection[str] = ()) -> tuple[tuple[Kind, ...], ...]:
+    """The kinds of room of which the floor has too few.
+
+    Args:
+        floor: the building.
+        errand: who needs a room; the robot needs a hallway.
+        absent: propositions that need none.
+
+    Returns:
+        For each kind (or choice of kinds) of which there is no room, or too few for all who need one.
+    """
     # The robot starts in a hallway, so that one is needed, too.
-    needed = [(Kind.HALLWAY,), *errand.rooms.values()]
+    needed = [(Kind.HALLWAY,), *(kinds for name, kinds in errand.rooms.items() if name not in absent)]
     rooms = {kinds: [number for kind in kinds for number in floor.rooms_of(kind)] for kinds in needed}
     # As many rooms as there are people with the same choice of kinds, because no two share a room.
     return tuple(kinds for kinds in rooms if len(rooms[kinds]) < needed.count(kinds))
 
 
 def furnish(
-    floor: Floor, key: PRNGKeyArray, errand: Errand, config: FurnishConfig, shape: tuple[int, int]
+    floor: Floor,
+    key: PRNGKeyArray,
+    errand: Errand,
+    config: FurnishConfig,
+    shape: tuple[int, int],
+    absent: Collection[str] = (),
 ) -> tuple[World, Placement]:
     """The floor with people, a start, light and colours, all drawn by key; costs are in metres.
 
@@ -200,6 +223,7 @@ def furnish(
         config: people, light and colours.
         shape: rows and columns of the world's arrays: what is missing is solid and no part of its ``extent``. Two
             floors of one shape cost one compilation.
+        absent: propositions that hold nowhere. Their bits stay, so that letters mean the same on every floor.
 
     Returns:
         The world, and who is where in it.
@@ -208,7 +232,7 @@ def furnish(
         WorldError: a room that somebody or the robot needs is missing, or the floor is larger than ``shape``.
     """
     # Before anything is drawn: the message names what a person could change, a failed draw would not.
-    missing = missing_kinds(floor, errand)
+    missing = missing_kinds(floor, errand, absent)
     if missing:
         raise WorldError(f"the floor has too few rooms of kind {name_kinds(missing)}, which the errand needs")
     # Padding is solid and belongs to no room; the extent remembers the size of the building.
@@ -216,9 +240,9 @@ def furnish(
     floor = _padded(floor, shape)
     # Separate streams, so that another palette moves nobody.
     people_rng, look_rng = host_generators(key, 2)
-    placement = _place_people(floor, people_rng, errand, config)
+    placement = _place_people(floor, people_rng, errand, config, absent)
     look = _appearance(floor, placement, look_rng, config)
-    letters = _letters(floor, placement, config)
+    letters = _letters(floor, placement, errand, config)
     world = make_world(floor.occupied, letters, placement.start, floor.resolution, look, errand.propositions)
     return dataclasses.replace(world, extent=jnp.asarray(np.array(extent, np.int32))), placement
 
@@ -236,12 +260,16 @@ def _padded(floor: Floor, shape: tuple[int, int]) -> Floor:
     return dataclasses.replace(floor, rooms=rooms, doors=np.pad(floor.doors, missing))
 
 
-def _place_people(floor: Floor, rng: np.random.Generator, errand: Errand, config: FurnishConfig) -> Placement:
+def _place_people(
+    floor: Floor, rng: np.random.Generator, errand: Errand, config: FurnishConfig, absent: Collection[str]
+) -> Placement:
     # A doorway is part of the room behind it, and no place to begin.
     hallway = np.isin(floor.rooms, floor.rooms_of(Kind.HALLWAY)) & ~floor.doors
     start = _draw_cell(rng, hallway)
     chosen: dict[str, int] = {}
     for name, kinds in errand.rooms.items():
+        if name in absent:
+            continue
         # One person a room: who is found must not tell where the next one is.
         vacant = [room for kind in kinds for room in floor.rooms_of(kind) if room not in chosen.values()]
         chosen[name] = vacant[int(rng.integers(len(vacant)))]
@@ -257,10 +285,11 @@ def _draw_cell(rng: np.random.Generator, allowed: Bool[np.ndarray, "H W"]) -> Ce
     return int(row), int(column)
 
 
-def _letters(floor: Floor, placement: Placement, config: FurnishConfig) -> Int32[np.ndarray, "H W"]:
+def _letters(floor: Floor, placement: Placement, errand: Errand, config: FurnishConfig) -> Int32[np.ndarray, "H W"]:
     letters = np.zeros(floor.rooms.shape, np.int32)
     reach = config.person_radius
-    for bit, (name, (row, column)) in enumerate(placement.cells.items()):
+    for name, (row, column) in placement.cells.items():
+        bit = errand.propositions.index(name)
         patch = (slice(max(row - reach, 0), row + reach + 1), slice(max(column - reach, 0), column + reach + 1))
         # A patch that reaches over a wall or through a door would be met from the hallway; it ends at its room's walls.
         letters[patch] |= np.where(floor.rooms[patch] == placement.rooms[name], 1 << bit, 0).astype(np.int32)

@@ -28,6 +28,7 @@ from scipy import ndimage
 
 from potlp_jax.environments.ros.map_files import GridFrame, OccupancyMap
 from potlp_jax.environments.ros.places import Point, component_labels, nearest_free
+from potlp_jax.environments.ros.working_grid import choose_cell
 from potlp_jax.errors import MapError, MapWarning
 
 CUT_OFF_AREA = 2.0
@@ -103,7 +104,7 @@ class CleanMap:
 
 def clean_map(
     image_map: OccupancyMap,
-    resolution: float = 0.2,
+    resolution: float | None = None,
     radius: float = 0.1,
     start: Point | None = None,
     source: str = "start",
@@ -112,7 +113,7 @@ def clean_map(
 
     Args:
         image_map: the map as published.
-        resolution: size of a working cell in metres.
+        resolution: size of a working cell in metres; None: as `working_grid.choose_cell` does.
         radius: the robot's radius in metres.
         start: metres (x, y) whose component is kept; None: the largest.
         source: the file that gives the start, for messages.
@@ -122,14 +123,20 @@ def clean_map(
 
     Raises:
         MapError: the resolution is finer than the map's, nothing is left free, or the start lies outside or is blocked.
+
+    Warns:
+        MapWarning: the cells that were chosen are larger than usual.
     """
     # Exact fractions: a cell of 0.2 m must be 4 pixels of 0.05 m, not 4.000000000000001.
     file, pixel = image_map.settings.file, image_map.settings.resolution
+    grown = _exact(file, "radius", radius)
+    if resolution is None:
+        resolution = float(choose_cell(file, image_map.free.shape, pixel, grown))
     ratio = _exact(file, "resolution", resolution) / pixel
     # Finer cells would invent detail that the map does not have.
     if ratio < 1:
         raise MapError(file, "resolution", f"{resolution} m a cell is finer than the map's {float(pixel)} m a pixel")
-    inflated = ~inflate(~image_map.free, _exact(file, "radius", radius) / pixel)
+    inflated = ~inflate(~image_map.free, grown / pixel)
     free = ~resample(~inflated, ratio)
     height, width = free.shape
     frame = GridFrame(height, width, float(ratio * pixel), *image_map.settings.origin)
@@ -283,15 +290,15 @@ CUT_OFF_NAMED = 3
 """Parts that a warning names; `CleanMap.cut_off` has all."""
 
 
-def warn_of_cut_off(file: str | Path, clean: CleanMap, resolution: float, radius: float) -> None:
-    """Say what of a map cannot be reached, one MapWarning for each cause."""
+def warn_of_cut_off(file: str | Path, clean: CleanMap, radius: float) -> None:
+    """Say what of a map cannot be reached by a robot of this radius, one MapWarning for each cause."""
     remarks = {
         Cause.MAP: "field start: on the map itself no free space joins {parts} with the rest, {total:.0f} of the "
         "{free:.0f} m2 in which a robot fits; open what joins them in the image, or give a start in the part you mean",
         Cause.RADIUS: f"radius: passages are too narrow for a robot of radius {radius} m, and cut off {{parts}}; "
         "use a smaller radius to keep them",
-        Cause.CELLS: f"resolution: cells of {resolution} m close passages into which a robot of radius {radius} m "
-        "fits, and cut off {parts}; use smaller cells to keep them",
+        Cause.CELLS: f"resolution: cells of {clean.frame.resolution} m close passages into which a robot of radius "
+        f"{radius} m fits, and cut off {{parts}}; use smaller cells to keep them",
     }
     for cause, remark in remarks.items():
         parts = [part for part in clean.cut_off if part.cause is cause]

@@ -23,6 +23,7 @@ from scipy import ndimage
 
 from potlp_jax.environments.ros.map_files import FREE, OCCUPIED, UNKNOWN, GridFrame, MapSettings, OccupancyMap
 from potlp_jax.environments.ros.places import Places, Point, component_labels
+from potlp_jax.environments.ros.working_grid import require_memory
 from potlp_jax.errors import MapError
 
 PIXEL = Fraction(1, 20)
@@ -75,6 +76,7 @@ def frame_around(file: Path, points: Sequence[Point]) -> GridFrame:
         if pixel > 1:
             raise MapError(file, "", f"measures {high[0] - low[0]:.0f} x {high[1] - low[1]:.0f} m: check the scale")
     width, height = (int(size) for size in np.ceil((high - low) / float(pixel)))
+    require_memory(file, width, height)
     return GridFrame(height, width, float(pixel), float(low[0]), float(low[1]))
 
 

@@ -38,6 +38,7 @@ import yaml
 from jaxtyping import Bool, Float64, Int8, Int64, Shaped
 
 from potlp_jax import files, images
+from potlp_jax.environments.ros.working_grid import require_memory
 from potlp_jax.errors import MapError, MapWarning
 from potlp_jax.files import short
 
@@ -361,6 +362,7 @@ def _read_image(file: Path) -> tuple[Shaped[np.ndarray, "H W C"], int]:
         with files.reading(file, MapError, "a PGM image"):
             return _read_pgm(file, content)
     with files.reading(file, MapError, "an image (PGM, PNG or BMP)"):
+        require_memory(file, *images.image_size(content))
         pixels = images.decode_image(content, cv2.IMREAD_UNCHANGED, whole=True)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise MapError(file, "", f"has pixels of type {pixels.dtype}; needed are 8 or 16 bits a channel")
@@ -378,6 +380,7 @@ def _read_pgm(file: Path, content: bytes) -> tuple[Int64[np.ndarray, "H W 1"], i
         raise MapError(file, "", f"has an invalid PGM header: {width} x {height} pixels, maximum {white}")
     if width * height > images.MOST_PIXELS:
         raise MapError(file, "", f"has {width:,} x {height:,} pixels; at most {images.MOST_PIXELS:,} are read")
+    require_memory(file, width, height)
     body = content[header.end() :]
     values = _ascii_values(file, body) if content[:2] == b"P2" else _binary_values(body, white)
     # A file with more is accepted, as by every reader; one with less has lost a part of the building.

@@ -59,13 +59,14 @@ class MappedRoomsConfig:
     Attributes:
         file: the map's YAML.
         rooms: YAML of its rooms; None: ``FILE.rooms.yaml`` beside the map.
-        resolution: size of a working cell in metres, not finer than the map's pixels.
+        resolution: size of a working cell in metres, not finer than the map's pixels; None: 0.2, or larger on large
+            maps (`environments.ros.working_grid`).
         radius: the robot's radius in metres, by which obstacles grow.
     """
 
     file: str | Path
     rooms: str | Path | None = None
-    resolution: float = 0.2
+    resolution: float | None = None
     radius: float = 0.1
 
 
@@ -100,7 +101,7 @@ class MappedRooms(Generator):
         regions = load_regions(file, ("rooms",))["rooms"]
         self.clean: CleanMap = clean_map(load_map(config.file), config.resolution, config.radius)
         self.name = f"{PARCELS_PREFIX}{Path(config.file).stem}"
-        warn_of_cut_off(config.file, self.clean, config.resolution, config.radius)
+        warn_of_cut_off(config.file, self.clean, config.radius)
         self.rooms, self.left_out, self.floor = _floor(regions, self.clean)
         # The hallway counts as the first; two people need two rooms.
         if len(self.rooms) < 3 or not np.any(self.floor.rooms == _HALLWAY):
@@ -117,9 +118,9 @@ class MappedRooms(Generator):
                 MapWarning,
                 stacklevel=2,
             )
-        self.settings = _settings(config.resolution)
+        self.settings = _settings(self.clean.frame.resolution)
         # At least the neighbouring cells: on a coarse grid a person is met beside their cell, too.
-        reach = max(1, round(PERSON_RADIUS / config.resolution))
+        reach = max(1, round(PERSON_RADIUS / self.clean.frame.resolution))
         self._furnishing = FurnishConfig(person_radius=reach, coloured=False)
 
     @classmethod

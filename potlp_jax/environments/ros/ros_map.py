@@ -38,7 +38,8 @@ class RosMapConfig:
     Attributes:
         file: the map, in one of the formats of `environments.ros.buildings`.
         places: YAML of the propositions, or the propositions; None: ``FILE.places.yaml`` beside the map.
-        resolution: size of a working cell in metres, not finer than the map's pixels.
+        resolution: size of a working cell in metres, not finer than the map's pixels; None: 0.2, or larger on large
+            maps (`environments.ros.working_grid`).
         radius: the robot's radius in metres, by which obstacles grow.
         level: of a building with several.
 
@@ -47,7 +48,7 @@ class RosMapConfig:
 
     file: str | Path
     places: str | Places | None = None
-    resolution: float = 0.2
+    resolution: float | None = None
     radius: float = 0.1
     level: str | None = None
 
@@ -72,7 +73,7 @@ class RosMap(Generator):
             MapError: the map or the places cannot be used; the message names the file, the field, and what to do.
 
         Warns:
-            MapWarning: a part of the building cannot be reached; see also
+            MapWarning: a part of the building cannot be reached, or cells are larger than usual; see also
                 `potlp_jax.environments.ros.buildings.load_building`.
         """
         self.config = config
@@ -81,7 +82,7 @@ class RosMap(Generator):
         places = config.places if isinstance(config.places, Places) else _find_places(config, self.image_map)
         self.places = places
         self.clean = clean_map(self.image_map, config.resolution, config.radius, places.start, places.source)
-        warn_of_cut_off(config.file, self.clean, config.resolution, config.radius)
+        warn_of_cut_off(config.file, self.clean, config.radius)
         # Not the path as typed: the name goes into the keys of its worlds, and a map is the same map from every folder.
         self.name = f"{PREFIX}{Path(config.file).stem}"
         self.propositions = places.names
