@@ -126,6 +126,18 @@ def _forget_programs() -> None:
         _TRIM(0)
 
 
+# Two workers and the processes that they start then fit into a small machine. A test adds up to half a gigabyte.
+_MOST_RESIDENT = 1.25e9
+_STATM = Path("/proc/self/statm")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown() -> None:
+    """A module with programs of many shapes begins anew where they take too much memory."""
+    if _STATM.exists() and int(_STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > _MOST_RESIDENT:
+        _forget_programs()
+
+
 @pytest.fixture(scope="module", autouse=True)
 def compiled_as_marked(request: pytest.FixtureRequest) -> Iterator[None]:
     """XLA's optimiser is on in modules marked ``optimised``, or in all by an option; off in what collecting compiles.
