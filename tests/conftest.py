@@ -5,6 +5,9 @@ those marked ``numbers`` too by ``make numbers``, which is part of CI.
 """
 
 import atexit
+import ctypes
+import functools
+import gc
 import importlib.metadata
 import os
 import shutil
@@ -16,6 +19,8 @@ import jax
 import pytest
 from hypothesis import Phase, settings
 from jax._src import compiler
+from jaxtyping import _array_types as jaxtyping_annotations
+from jaxtyping import _decorator as jaxtyping_decorator
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -27,6 +32,30 @@ settings.register_profile("mutants", derandomize=True, phases=[Phase.explicit, P
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
 
+# jaxtyping and beartype write a checker for a function whenever its ``def`` is executed: a function within a function
+# costs milliseconds, and memory that is never freed, at each call of the outer one. The signature alone decides on the
+# checker, so that it is written once for each; for that, equal annotations must be the same object.
+def _once_per_signature(make):
+    made = functools.cache(make)
+
+    @functools.wraps(make)
+    def make_or_reuse(*arguments, **options):
+        try:
+            return made(*arguments, **options)
+        except TypeError:  # A default that cannot be hashed, or an annotation that is refused.
+            return make(*arguments, **options)
+
+    return make_or_reuse
+
+
+for _module, _name in (
+    (jaxtyping_annotations, "_make_array"),
+    (jaxtyping_decorator, "_make_fn_with_signature"),
+    (jaxtyping_decorator, "_apply_typechecker"),
+):
+    setattr(_module, _name, _once_per_signature(getattr(_module, _name)))
+
+
 # Within one run the same program is compiled once, whichever test needs it first: the process that begins the run makes
 # a cache for itself and its workers, and takes it away.
 _CACHE = "POTLP_TEST_CACHE"
@@ -34,6 +63,8 @@ if _CACHE not in os.environ:
     os.environ[_CACHE] = tempfile.mkdtemp(prefix="potlp-tests-")
     atexit.register(shutil.rmtree, os.environ[_CACHE], ignore_errors=True)
 jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
+# Each module forgets its programs (`compiled_as_marked`), so that what compiles in less than jax's second is met often.
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
 @pytest.fixture(scope="session")
@@ -83,6 +114,30 @@ def pytest_configure(config: pytest.Config) -> None:
     )
 
 
+# glibc's alone: it keeps freed memory, most of it XLA's compiler's, for the thread that had it.
+_TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)
+
+
+def _forget_programs() -> None:
+    """Free what earlier modules compiled, and give the memory back to the system."""
+    jax.clear_caches()
+    gc.collect()
+    if _TRIM is not None:
+        _TRIM(0)
+
+
+# Two workers and the processes that they start then fit into a small machine. A test adds up to half a gigabyte.
+_MOST_RESIDENT = 1.25e9
+_STATM = Path("/proc/self/statm")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown() -> None:
+    """A module with programs of many shapes begins anew where they take too much memory."""
+    if _STATM.exists() and int(_STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > _MOST_RESIDENT:
+        _forget_programs()
+
+
 @pytest.fixture(scope="module", autouse=True)
 def compiled_as_marked(request: pytest.FixtureRequest) -> Iterator[None]:
     """XLA's optimiser is on in modules marked ``optimised``, or in all by an option; off in what collecting compiles.
@@ -90,7 +145,7 @@ def compiled_as_marked(request: pytest.FixtureRequest) -> Iterator[None]:
     Each module begins without compiled programs: some are of the other kind, and a worker's memory would grow to
     several gigabytes.
     """
-    jax.clear_caches()
+    _forget_programs()
     with pytest.MonkeyPatch.context() as patch:
         if request.node.get_closest_marker("optimised") or request.config.getoption("optimised"):
             patch.setattr(compiler, "get_compile_options", _compile_options)

@@ -231,8 +231,6 @@ import json, jax
 hits = []
 jax.monitoring.register_event_listener(lambda event, **_: hits.append(event.endswith("/cache_hits")))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-from potlp_jax.learning.estimator import TrainedEstimator
-from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.bench.problems import family_problem
 from potlp_jax.planning.search.api import plan_actions
 from potlp_jax.planning.search.config import BestFirstConfig

@@ -309,7 +309,7 @@ def test_it_learns_64_samples_whose_label_needs_picture_bearing_and_phi():
     state, batch = initial_state(network, config), _batch(samples, 16, 4)
     for _ in range(config.steps):
         state, _ = step(state, batch)
-    answers, of_views = network.answers(state.average, batch.inputs, batch.phi_stay, batch.phi_go)
+    answers, of_views = jax.jit(network.answers)(state.average, batch.inputs, batch.phi_stay, batch.phi_go)
     sums = loss_sums(answers, of_views, batch, network.config, DataScale.of(samples), 1.0)
     evaluation = evaluation_of(sums, network.config, config.cost_share, config.view_share)
     assert evaluation.skill > 0.95

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
+from beartype import beartype
 
 import potlp_jax
 from potlp_jax import types
@@ -84,3 +85,29 @@ def test_status_bits_are_distinct_and_combine_on_the_device():
             assert found.dtype == np.uint32
             assert Status(int(found)) == wanted
     assert int(status_array(Status.FALLBACK)) == Status.FALLBACK
+
+
+def test_a_function_within_a_function_is_checked_at_each_call_by_one_checker():
+    """The checkers that ``conftest.py`` reuses know the sizes of no earlier call, and are not written anew."""
+    written = []
+
+    def typechecker(function):
+        written.append(function.__name__)
+        return beartype(function)
+
+    def turned(image):
+        @jaxtyping.jaxtyped(typechecker=typechecker)
+        def turn(image: jaxtyping.Float32[jax.Array, "H W"]) -> jaxtyping.Float32[jax.Array, "W H"]:
+            return image
+
+        return turn(image)
+
+    for size in (2, 3):
+        assert turned(jnp.zeros((size, size), jnp.float32)).shape == (size, size)
+    once = len(written)
+    with pytest.raises(jaxtyping.TypeCheckError, match="turn"):
+        turned(jnp.zeros((2, 3), jnp.float32))
+    with pytest.raises(jaxtyping.TypeCheckError, match="turn"):
+        turned(jnp.zeros((2, 2), jnp.int32))
+    # Of the arguments, and of these and the result.
+    assert (once, written.count("turn")) == (2, 2)
