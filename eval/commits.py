@@ -69,10 +69,12 @@ def prior(belief: BeliefMap, subgoals: Subgoals, task: TaskArrays) -> Estimates:
 
 
 def random_task(rng: np.random.Generator) -> Task:
-    """A formula of two or three branches that exclude each other, with an irrevocable move and within ``SIZES``."""
+    """A formula of two or three branches, within ``SIZES``, whose first letter can be an irrevocable one."""
     while True:
-        branches = [_branch(rng, int(rng.integers(1, 3))) for _ in range(int(rng.integers(2, 4)))]
-        text = " | ".join(branches)
+        if rng.random() < 0.5:
+            text = _excluding(rng)
+        else:
+            text = " | ".join(_branch(rng, int(rng.integers(1, 3))) for _ in range(int(rng.integers(2, 4))))
         if rng.random() < 0.2:
             text = f"({text}) & F {rng.choice(NAMES)}"
         try:
@@ -81,8 +83,17 @@ def random_task(rng: np.random.Generator) -> Task:
                 task = Task.from_formula(text, propositions=NAMES)
         except TaskError:
             continue
-        if SIZES.covers(task.sizes) and task.irrevocable.any():
+        # A proposition on its own: cells with two are too few to be met by chance.
+        first = int(task.dfa.transitions[task.dfa.initial, 0])
+        if SIZES.covers(task.sizes) and task.irrevocable[first, [1, 2, 4, 8]].any():
             return task
+
+
+def _excluding(rng: np.random.Generator) -> str:
+    """Two branches that begin with different propositions, each of which the other branch avoids."""
+    one, other = (str(name) for name in rng.choice(NAMES, 2, replace=False))
+    ends = [str(name) for name in rng.choice([name for name in NAMES if name not in (one, other)], 2)]
+    return f"(!{other} U ({one} & (!{other} U {ends[0]}))) | (!{one} U ({other} & (!{one} U {ends[1]})))"
 
 
 def _branch(rng: np.random.Generator, depth: int) -> str:
@@ -101,9 +112,12 @@ def random_world(rng: np.random.Generator) -> World:
     doors = list(_walls(rng, occupied))
     free = np.argwhere(~occupied)
     for bit in range(len(NAMES)):
-        for _ in range(int(rng.integers(1, 4))):
-            cell = doors[rng.integers(len(doors))] if rng.random() < 0.3 else tuple(free[rng.integers(len(free))])
-            letters[cell] |= 1 << bit
+        # Often nowhere, so that a branch may have no end; often in doors, where there is no way round.
+        for _ in range(int(rng.integers(0, 5))):
+            cell = doors[rng.integers(len(doors))] if rng.random() < 0.5 else tuple(free[rng.integers(len(free))])
+            # In a room a patch, which the nearest way may well lead over.
+            size = 1 if cell in doors else int(rng.integers(1, 5))
+            letters[cell[0] : cell[0] + size, cell[1] : cell[1] + size] |= 1 << bit
     plain = np.argwhere(~occupied & (letters == 0))
     row, column = plain[rng.integers(len(plain))].tolist()
     return make_world(occupied, letters, (row, column), propositions=NAMES)

@@ -216,18 +216,28 @@ def _run_toy(world, task, last):
     return run_trial(world, task, Policy.POTLP, jax.random.key(0), config, estimator=prior)
 
 
-def test_a_batch_decides_as_trials_alone_do():
+@pytest.mark.parametrize("last", [True, False])
+def test_a_batch_decides_as_trials_alone_do(last):
+    config = dataclasses.replace(CONFIG, decision=dataclasses.replace(CONFIG.decision, irrevocable_last=last))
     pairs = {number: pair(number) for number in range(6)}
     # A task without irrevocable moves stands beside the others.
     pairs[6] = (Task.from_formula("F a & F b", NAMES), pairs[0][1])
     for policy in (Policy.BASELINE, Policy.OPTIMISTIC, Policy.POTLP):
         estimator = prior if policy is Policy.POTLP else None
         starts = [Start(w, t.padded(SIZES), jax.random.key(n), name=n) for n, (t, w) in pairs.items()]
-        for finished in run_batch(starts, policy, CONFIG, slots=3, estimator=estimator):
+        for finished in run_batch(starts, policy, config, slots=3, estimator=estimator):
             task, world = pairs[finished.name]
             key = jax.random.key(finished.name)
-            alone = run_trial(world, task, policy, key, CONFIG, arrays=task.padded(SIZES), estimator=estimator)
+            alone = run_trial(world, task, policy, key, config, arrays=task.padded(SIZES), estimator=estimator)
             assert (finished.outcome, finished.path.tolist()) == (alone.outcome, [list(cell) for cell in alone.path])
+
+
+@pytest.mark.parametrize(("last", "outcome"), [(True, Outcome.SATISFIED), (False, Outcome.INFEASIBLE)])
+def test_a_batch_heeds_the_setting(last, outcome):
+    config = dataclasses.replace(CONFIG, decision=dataclasses.replace(CONFIG.decision, irrevocable_last=last))
+    world, task = _two_doors(A, 0, {(20, 30): B, (20, 40): D}), Task.from_formula(TWO_BRANCHES, NAMES)
+    (finished,) = run_batch([Start(world, task.padded(SIZES), jax.random.key(0))], Policy.BASELINE, config, slots=1)
+    assert finished.outcome is outcome
 
 
 def test_random_pairs_end_satisfied_unless_a_move_was_forced():

@@ -300,7 +300,7 @@ def measure_decision(
     phases = Phases(repeats)
     situation = phases.measure(
         "assess",
-        lambda belief, cell, state, task: assess(belief, cell, state, task, config.frontiers),
+        lambda belief, cell, state, task: assess(belief, cell, state, task, config.frontiers, config.irrevocable_last),
         scene.belief,
         scene.cell,
         scene.state,

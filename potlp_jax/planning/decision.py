@@ -51,7 +51,7 @@ def frontier_subgoals(
     Raises:
       PropositionsError: belief and task are not over the same propositions.
     """
-    return assess(belief, cell, state, task, config.frontiers).subgoals
+    return assess(belief, cell, state, task, config.frontiers, config.irrevocable_last).subgoals
 
 
 def subgoals_at(cells: Int32[Array, "S 2"], mask: Bool[Array, " S"], height: int, width: int) -> Subgoals:
