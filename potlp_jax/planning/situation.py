@@ -156,7 +156,16 @@ def assess(
     permitted, within = transitions, distances
     if irrevocable_last:
         permitted, within = _revocable_first(
-            transitions, distances, subgoals.frontier, finish_cost, belief, cell, state, task.irrevocable
+            transitions,
+            distances,
+            subgoals.frontier,
+            finish_cost,
+            belief.letters,
+            belief.free,
+            jnp.asarray(belief.resolution),
+            cell,
+            state,
+            task.irrevocable,
         )
     return Situation(
         belief=belief,
@@ -183,7 +192,9 @@ def _revocable_first(
     distances: Float32[Array, "H W Z"],
     frontier: Bool[Array, "H W"],
     finish_cost: Float32[Array, ""],
-    belief: BeliefMap,
+    letters: Int32[Array, "H W"],
+    free: Bool[Array, "H W"],
+    resolution: Float32[Array, ""],
     cell: Int32[Array, "2"],
     state: Int32[Array, ""],
     irrevocable: Bool[Array, "Z L"],
@@ -195,7 +206,7 @@ def _revocable_first(
       distances: by all moves.
       frontier: True on frontier cells.
       finish_cost: path cost to acceptance by all moves, inf where it is out of reach in known space.
-      belief: what is known of the map.
+      letters, free, resolution: of the belief; as plain arrays, because vmap puts marks in their place.
       cell, state: the robot's product state.
       irrevocable: of the task.
 
@@ -204,8 +215,8 @@ def _revocable_first(
     """
 
     def without() -> tuple[Array, Array]:
-        masked = jnp.where(jnp.moveaxis(irrevocable[:, belief.letters], 0, -1), NO_STATE, transitions)
-        within = product_distances(masked, belief.free, cell[None], state[None], belief.resolution)[0]
+        masked = jnp.where(jnp.moveaxis(irrevocable[:, letters], 0, -1), NO_STATE, transitions)
+        within = product_distances(masked, free, cell[None], state[None], resolution)[0]
         # Where acceptance is certain there is progress, too: it is what the task was explored for.
         leads_on = jnp.any(frontier[:, :, None] & jnp.isfinite(within)) | jnp.isfinite(finish_cost)
         return jnp.where(leads_on, masked, transitions), jnp.where(leads_on, within, distances)
