@@ -20,7 +20,7 @@ from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.distances.paths import shortest_path
 from potlp_jax.planning.distances.product import grid_distances, product_distances, product_transitions
 from potlp_jax.planning.estimates import Estimator, ask
-from potlp_jax.planning.move import Move
+from potlp_jax.planning.move import Move, MoveKind
 from potlp_jax.planning.policies import Policy, decide
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions, search
@@ -300,7 +300,7 @@ def measure_decision(
     phases = Phases(repeats)
     situation = phases.measure(
         "assess",
-        lambda belief, cell, state, task: assess(belief, cell, state, task, config.frontiers),
+        lambda belief, cell, state, task: assess(belief, cell, state, task, config.frontiers, config.irrevocable_last),
         scene.belief,
         scene.cell,
         scene.state,
@@ -345,8 +345,7 @@ def _decide(scene: Scene, key: Array, policy: Policy, config: DecisionConfig) ->
 def _path(situation: Situation, move: Move, config: DecisionConfig) -> Any:
     """The last phase: from the robot to the move's target."""
     return shortest_path(
-        situation.distances,
-        situation.transitions,
+        *situation.moves_for(move.kind == MoveKind.FINISH),
         situation.belief.free,
         situation.cell,
         situation.state,

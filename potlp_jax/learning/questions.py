@@ -219,6 +219,7 @@ def question_sheet(questions: Sequence[Question], count: int, staying_sets: int)
         transitions=jnp.asarray(np.where(keeps, states, (states + 1) % staying_sets)),
         accepting=jnp.zeros(staying_sets, bool),
         trap=jnp.zeros(staying_sets, bool),
+        irrevocable=jnp.zeros((staying_sets, letters), bool),
         state_mask=jnp.ones(staying_sets, bool),
         initial=jnp.int32(0),
         edges=jnp.zeros((1, 2), jnp.int32),

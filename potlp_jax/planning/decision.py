@@ -51,7 +51,7 @@ def frontier_subgoals(
     Raises:
       PropositionsError: belief and task are not over the same propositions.
     """
-    return assess(belief, cell, state, task, config.frontiers).subgoals
+    return assess(belief, cell, state, task, config.frontiers, config.irrevocable_last).subgoals
 
 
 def subgoals_at(cells: Int32[Array, "S 2"], mask: Bool[Array, " S"], height: int, width: int) -> Subgoals:
@@ -125,7 +125,7 @@ def decide_from_estimates(
     _check_shapes(belief, subgoals, cell, state)
     check_shapes(estimates, subgoals.mask.shape[0], task.class_mask.shape[0])
     # Assessed again, although the caller may have called `frontier_subgoals`: arrays in between are the caller's.
-    situation = assess(belief, cell, state, task, config.frontiers)
+    situation = assess(belief, cell, state, task, config.frontiers, config.irrevocable_last)
     # The frontiers themselves stay those of the belief: they count where no action is available.
     given = dataclasses.replace(situation.subgoals, cells=subgoals.cells, mask=subgoals.mask)
     # Outside of the map an index would be clamped, and the distances of another cell be taken for those of the subgoal.

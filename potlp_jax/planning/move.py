@@ -98,7 +98,8 @@ def move_to(
         config: settings; ``config.path_horizon`` limits the path.
         kind: one of ``MoveKind``; NONE stays where the robot is.
         target_cell: where to go; a known free cell.
-        target_state: the automaton's state in which to arrive there, such that ``situation.distances`` is finite.
+        target_state: the automaton's state in which to arrive there, such that its distance is finite: in
+            ``situation.all_distances`` for FINISH, otherwise in ``situation.distances``.
         value: what the policy expects the task to cost from here; for the record.
         action: index of the chosen action, where the policy searches.
         search: what it considered, where it searches.
@@ -114,8 +115,7 @@ def move_to(
     cell = jnp.where(goes, target_cell, situation.cell).astype(jnp.int32)
     state = jnp.where(goes, target_state, situation.state).astype(jnp.int32)
     path = shortest_path(
-        situation.distances,
-        situation.transitions,
+        *situation.moves_for(kind == MoveKind.FINISH),
         situation.belief.free,
         situation.cell,
         situation.state,

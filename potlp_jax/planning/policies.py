@@ -100,7 +100,7 @@ def decide(
         ValueError: the policy searches and there is no estimator.
         EstimatesError: the estimator's answer has other shapes than were asked for.
     """
-    situation = assess(belief, cell, state, task, config.frontiers)
+    situation = assess(belief, cell, state, task, config.frontiers, config.irrevocable_last)
     estimates = None if estimator is None else ask(estimator, belief, situation.subgoals, task, state)
     situation = situation.with_status_of(estimates)
     intention = Intention.none() if intention is None else intention
@@ -165,7 +165,9 @@ def direct_move(situation: Situation, policy: Policy, config: DecisionConfig) ->
     Returns:
         The move; it has the kind NONE where there is none.
     """
-    return _optimistic(situation, config) if policy is Policy.OPTIMISTIC else _finish_or_frontier(situation, config)
+    if policy is not Policy.OPTIMISTIC:
+        return _finish_or_frontier(situation, config)
+    return _unless_withheld(situation, _optimistic(situation, config), config)
 
 
 def named_policy(policy: Policy | PolicyFunction | str) -> Policy | PolicyFunction:
@@ -335,6 +337,19 @@ def _optimistic(situation: Situation, config: DecisionConfig) -> Move:
         intention=Intention.none(),
         status=situation.status | status_if(kind == MoveKind.NONE, Status.NO_FRONTIER),
     )
+
+
+def _unless_withheld(situation: Situation, move: Move, config: DecisionConfig) -> Move:
+    """The optimistic move; that of the baseline where it relied on a move that is withheld.
+
+    A path through unobserved cells alone may be longer than the known one to acceptance, or not exist, because
+    irrevocable moves are withheld from it.
+    """
+    if not config.irrevocable_last:
+        return move
+    # Infinite on both sides: no path, known or hoped for. A frontier may be left nevertheless.
+    beaten = jnp.any(situation.task.irrevocable) & (situation.finish_cost <= move.value)
+    return jax.lax.cond(beaten, lambda: _finish_or_frontier(situation, config), lambda: move)
 
 
 def _cut_before_unobserved(path: KnownPath, belief: BeliefMap) -> KnownPath:

@@ -6,9 +6,11 @@ References:
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
 from potlp_jax.planning.distances.product import (
@@ -39,6 +41,8 @@ class DecisionConfig:
       commitment: hysteresis: fraction of its expected cost by which another action must be cheaper before the robot
         switches to it. 0: it switches at once, as published. The default was chosen on validation worlds, against
         0, 30 % and fixed numbers of cells (docs/results/panorama.md, "Commitment").
+      irrevocable_last: an irrevocable move is made only on a known path to acceptance, or where no frontier can be
+        reached without one (docs/model.md section 7). False: it is weighed like any other move.
       path_horizon: moves in the path of one decision, at most; None means ``4 (H + W)``.
     """
 
@@ -46,6 +50,7 @@ class DecisionConfig:
     search: BestFirstConfig | UctConfig = BestFirstConfig()
     dead_end_factor: float = 4.0
     commitment: float = 0.15
+    irrevocable_last: bool = True
     path_horizon: int | None = None
 
     def __post_init__(self) -> None:
@@ -66,9 +71,11 @@ class Situation:
       task: arrays of the task.
       cell: the robot's row and column.
       state: the automaton's state, the letter of the robot's cell read.
-      transitions: state after entering a cell in a state; ``NO_STATE`` where that is impossible, and from accepting
-        states.
-      distances: path cost from the robot to a cell in a state; inf where it is out of reach.
+      transitions: state after entering a cell in a state; ``NO_STATE`` where that is impossible or not permitted now
+        (``DecisionConfig.irrevocable_last``), and from accepting states.
+      distances: path cost from the robot to a cell in a state by such moves; inf where it is out of reach.
+      all_transitions: as ``transitions``, with all moves that are possible.
+      all_distances: as ``distances``, with all moves that are possible: the known path to acceptance may use them.
       subgoals: of the belief, nearest first.
       finish_cell: cell of the nearest accepting product state in known space.
       finish_state: its state.
@@ -83,6 +90,8 @@ class Situation:
     state: Int32[Array, "*batch"]
     transitions: Int32[Array, "*batch H W Z"]
     distances: Float32[Array, "*batch H W Z"]
+    all_transitions: Int32[Array, "*batch H W Z"]
+    all_distances: Float32[Array, "*batch H W Z"]
     subgoals: Subgoals
     finish_cell: Int32[Array, "*batch 2"]
     finish_state: Int32[Array, "*batch"]
@@ -94,6 +103,11 @@ class Situation:
         """False where the inputs hold something that is not allowed: no move follows from them."""
         return (self.status & np.uint32(int(Status.INVALID))) == 0
 
+    def moves_for(self, finishes: Bool[Array, ""]) -> tuple[Float32[Array, "H W Z"], Int32[Array, "H W Z"]]:
+        """Distances and transitions of the path to a target; ``finishes``: the target is acceptance itself."""
+        distances = jnp.where(finishes, self.all_distances, self.distances)
+        return distances, jnp.where(finishes, self.all_transitions, self.transitions)
+
     def with_status_of(self, estimates: Estimates | None) -> "Situation":
         """The situation with what the estimator reports."""
         if estimates is None or estimates.status is None:
@@ -102,7 +116,12 @@ class Situation:
 
 
 def assess(
-    belief: BeliefMap, cell: Int32[Array, "2"], state: Int32[Array, ""], task: TaskArrays, config: FrontierConfig
+    belief: BeliefMap,
+    cell: Int32[Array, "2"],
+    state: Int32[Array, ""],
+    task: TaskArrays,
+    config: FrontierConfig,
+    irrevocable_last: bool = True,
 ) -> Situation:
     """Distances, subgoals and the path to acceptance from the robot's product state.
 
@@ -112,6 +131,7 @@ def assess(
       state: the automaton's state, the letter of the robot's cell read.
       task: arrays of the task.
       config: how frontiers become subgoals.
+      irrevocable_last: as in ``DecisionConfig``; static.
 
     Returns:
       What every policy decides from.
@@ -132,19 +152,76 @@ def assess(
     # Where the task ends in known space, if it can.
     finish = jnp.where(task.accepting[None, None, :], distances, jnp.inf)
     finish_cell, finish_state = cell_and_state(jnp.argmin(finish.reshape(-1)), finish.shape)
+    finish_cost = jnp.min(finish)
+    permitted, within = transitions, distances
+    if irrevocable_last:
+        permitted, within = _revocable_first(
+            transitions,
+            distances,
+            subgoals.frontier,
+            finish_cost,
+            belief.letters,
+            belief.free,
+            jnp.asarray(belief.resolution),
+            cell,
+            state,
+            task.irrevocable,
+        )
     return Situation(
         belief=belief,
         task=task,
         cell=cell,
         state=state,
-        transitions=transitions,
-        distances=distances,
+        transitions=permitted,
+        distances=within,
+        all_transitions=transitions,
+        all_distances=distances,
         subgoals=subgoals,
         finish_cell=finish_cell,
         finish_state=finish_state,
-        finish_cost=jnp.min(finish),
+        finish_cost=finish_cost,
         status=subgoals.status | status_if(~_can_be_assessed(belief, cell, state, task), Status.INVALID),
     )
+
+
+# Under vmap the maps are taken one after the other, so that ``cond`` runs one branch only: a task without irrevocable
+# moves pays for none, whatever stands beside it in a batch.
+@sequential_vmap
+def _revocable_first(
+    transitions: Int32[Array, "H W Z"],
+    distances: Float32[Array, "H W Z"],
+    frontier: Bool[Array, "H W"],
+    finish_cost: Float32[Array, ""],
+    letters: Int32[Array, "H W"],
+    free: Bool[Array, "H W"],
+    resolution: Float32[Array, ""],
+    cell: Int32[Array, "2"],
+    state: Int32[Array, ""],
+    irrevocable: Bool[Array, "Z L"],
+) -> tuple[Int32[Array, "H W Z"], Float32[Array, "H W Z"]]:
+    """Transitions and distances by revocable moves; by all moves where the former lead to nothing.
+
+    Args:
+      transitions: all moves that are possible.
+      distances: by all moves.
+      frontier: True on frontier cells.
+      finish_cost: path cost to acceptance by all moves, inf where it is out of reach in known space.
+      letters, free, resolution: of the belief; as plain arrays, because vmap puts marks in their place.
+      cell, state: the robot's product state.
+      irrevocable: of the task.
+
+    Returns:
+      Arrays of the same shapes.
+    """
+
+    def without() -> tuple[Array, Array]:
+        masked = jnp.where(jnp.moveaxis(irrevocable[:, letters], 0, -1), NO_STATE, transitions)
+        within = product_distances(masked, free, cell[None], state[None], resolution)[0]
+        # Where acceptance is certain there is progress, too: it is what the task was explored for.
+        leads_on = jnp.any(frontier[:, :, None] & jnp.isfinite(within)) | jnp.isfinite(finish_cost)
+        return jnp.where(leads_on, masked, transitions), jnp.where(leads_on, within, distances)
+
+    return jax.lax.cond(jnp.any(irrevocable), without, lambda: (transitions, distances))
 
 
 def _can_be_assessed(
@@ -209,7 +286,9 @@ def _subgoal_travel(
     task, subgoals = situation.task, situation.subgoals
     count, states = subgoals.mask.shape[0], task.transitions.shape[0]
     # From the unknown region a rollout comes back over the subgoal's cell, and reads its letter.
-    reentered = situation.transitions[subgoals.cells[:, 0], subgoals.cells[:, 1]]
+    # What a rollout does later costs what it is expected to cost, irrevocable moves too: only the move that is made now
+    # is withheld.
+    reentered = situation.all_transitions[subgoals.cells[:, 0], subgoals.cells[:, 1]]
     # Rollouts leave a subgoal only after an action there, so one where nothing can succeed needs no table. Nor does a
     # state that no re-entry leads to from where the automaton can still get, or an accepting one.
     promising = subgoals.mask & jnp.any(estimates.success_probability > 0.0, axis=1)
@@ -218,7 +297,7 @@ def _subgoal_travel(
     needed = jnp.any(ahead[:, :, None] == own[None, None, :], axis=1) & promising[:, None] & ~task.accepting[None]
     sources = jnp.where(needed, own[None, :], NO_STATE)
     travel, finish = distance_table(
-        situation.transitions,
+        situation.all_transitions,
         situation.belief.free,
         task.accepting,
         jnp.repeat(subgoals.cells, states, axis=0),

@@ -151,7 +151,8 @@ class Explorer:
 def _assess(
     belief: BeliefMap, cell: Int32[Array, "2"], state: Int32[Array, ""], task, frontiers: FrontierConfig
 ) -> Situation:
-    return assess(belief, cell, state, task, frontiers)
+    # Data are of every branch of a task, also of those that turn out to lead nowhere.
+    return assess(belief, cell, state, task, frontiers, irrevocable_last=False)
 
 
 @jax.jit

@@ -223,8 +223,15 @@ class TaskEnv:
 
     def _assessed(self, scene: Scene, progress: Progress) -> EnvState:
         """The state with known space assessed; where no action is left the task is infeasible."""
-        frontiers = self.config.decision.frontiers
-        situation = assess(progress.belief, progress.cell, progress.tally.state, scene.task, frontiers)
+        decision = self.config.decision
+        situation = assess(
+            progress.belief,
+            progress.cell,
+            progress.tally.state,
+            scene.task,
+            decision.frontiers,
+            decision.irrevocable_last,
+        )
         # Assessed once, for this observation and for the next move: distances are most of a step's work.
         nowhere = progress.tally.running & ~jnp.any(self._action_mask(situation))
         outcome = jnp.where(nowhere, jnp.int8(_INFEASIBLE), progress.tally.outcome)

@@ -98,7 +98,7 @@ def canonical_dfa(transitions: Int[np.ndarray, "Z L"], accepting: Bool[np.ndarra
         TaskError: the language is not co-safe; names a state that shows it.
     """
     # A task over 16 propositions has 65,536 letters, most of which act alike: all the work is done on one of each kind.
-    letter_class, representative = _letter_classes(transitions)
+    letter_class, representative = letter_classes(transitions)
     reduced = transitions[:, representative]
     # From here on a state accepts if it accepts whatever follows; the Büchi condition is needed no more.
     satisfied = _satisfied_states(reduced, accepting)
@@ -118,7 +118,7 @@ def canonical_dfa(transitions: Int[np.ndarray, "Z L"], accepting: Bool[np.ndarra
     )
 
 
-def _letter_classes(transitions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def letter_classes(transitions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Letters that act alike, by equal columns: the class of each letter, and the first letter of each class."""
     _, first, inverse = np.unique(transitions, axis=1, return_index=True, return_inverse=True)
     # ``np.unique`` sorts columns by content. Classes are numbered by their first letter instead, because the canonical

@@ -18,6 +18,7 @@ from potlp_jax.task.automaton import Dfa, canonical_dfa, check_size, translate
 from potlp_jax.task.formula import Structure, parse_formula, unknown_proposition
 from potlp_jax.task.guards import Phi, minimal_cover
 from potlp_jax.task.hoa import HoaAutomaton, read_hoa, write_hoa
+from potlp_jax.task.irrevocable import irrevocable_moves
 from potlp_jax.task.language import UnreadableError, names_of, read_formula
 from potlp_jax.task.outcomes import Condition, OutcomeClass, Outcomes, find_outcomes
 from potlp_jax.task.propositions import MAX_PROPOSITIONS, check_propositions, require_same_propositions
@@ -40,6 +41,8 @@ class TaskArrays:
         transitions: ``[z, letter]`` is the next state.
         accepting: the task is satisfied.
         trap: acceptance is out of reach; True on padding.
+        irrevocable: ``[z, letter]``: entering a cell of this letter in z cannot be taken back (``task.irrevocable``);
+            False on padding.
         state_mask: True on real states.
         initial: the state before the first letter.
         edges: ``(z', z'')`` in lexicographic order; (0, 0) on padding.
@@ -58,6 +61,7 @@ class TaskArrays:
     transitions: Int32[Array, "*batch Z L"]
     accepting: Bool[Array, "*batch Z"]
     trap: Bool[Array, "*batch Z"]
+    irrevocable: Bool[Array, "*batch Z L"]
     state_mask: Bool[Array, "*batch Z"]
     initial: Int32[Array, "*batch"]
     edges: Int32[Array, "*batch E 2"]
@@ -266,6 +270,11 @@ class Task:
         )
 
     @cached_property
+    def irrevocable(self) -> Bool[np.ndarray, "Z L"]:
+        """``[z, letter]``: entering a cell of this letter in z cannot be taken back (``task.irrevocable``)."""
+        return irrevocable_moves(self.dfa)
+
+    @cached_property
     def arrays(self) -> TaskArrays:
         """The device form, without more padding than ``sizes`` has."""
         return self.padded(self.sizes)
@@ -431,6 +440,7 @@ def _state_fields(task: Task, sizes: TaskSizes) -> dict[str, np.ndarray]:
         "transitions": transitions,
         "accepting": _grow(dfa.accepting, sizes.states, False),
         "trap": _grow(dfa.trap, sizes.states, True),
+        "irrevocable": _grow(_ignore_padded_propositions(task.irrevocable, sizes), sizes.states, False),
         "state_mask": np.arange(sizes.states) < dfa.num_states,
         "initial": np.array(dfa.initial, dtype=np.int32),
     }

@@ -282,7 +282,7 @@ def _replayed_problem(
     estimator: Estimator,
     config: DecisionConfig,
 ) -> PlanningProblem:
-    situation = assess(belief, cell, state, task, config.frontiers)
+    situation = assess(belief, cell, state, task, config.frontiers, config.irrevocable_last)
     # The same two calls as in ``policies.decide``: the problem is what its search saw, bit by bit.
     estimates = ask(estimator, belief, situation.subgoals, task, state)
     return planning_problem(situation, estimates, config)

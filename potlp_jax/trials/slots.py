@@ -256,11 +256,11 @@ def _consider(
 ) -> tuple[Any, Situation, Estimates | None, PRNGKeyArray]:
     """What every policy is given: the situation, and estimates where it asks for them."""
     # Panoramas first: an estimator answers from what can be seen here too.
-    running = progress.tally.running
+    running, decision = progress.tally.running, setup.config.decision
     memory = None if progress.memory is None else _memory_after_looking(setup, asked, progress, scene)
     situation = _phase(
         running,
-        partial(assess, config=setup.config.decision.frontiers),
+        partial(assess, config=decision.frontiers, irrevocable_last=decision.irrevocable_last),
         progress.belief,
         progress.cell,
         progress.tally.state,
