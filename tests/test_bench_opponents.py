@@ -191,7 +191,8 @@ def test_the_goal_counts_from_where_it_is_kept():
     from eval.bench.regret_report import Row, time_to_goal
 
     def row(budget, percent):
-        return Row("test", "find", 1, "best-first", budget, float(budget), [0], [percent], [percent], [True], [0.0])
+        of_instance = ([0], [percent], [percent], [True], [0.0], [False])
+        return Row("test", "find", 1, "best-first", budget, float(budget), *of_instance)
 
     assert time_to_goal([row(1, 0.5), row(10, 3.0), row(100, 0.9), row(1000, 0.1)]) == 100.0
     assert time_to_goal([row(1, 0.5), row(10, 3.0)]) == np.inf
@@ -213,7 +214,7 @@ def test_every_instance_is_answered_by_its_own_row():
         )
         assert actions == [cost + index for index, cost in enumerate(costs)]
     answers = list(regret.numba_pouct(problems, [10, 3000]))
-    assert [(name, budget) for name, budget, _, _ in answers][:2] == [("po-uct-numba", 10), ("po-uct-numba", 3000)]
+    assert [(name, budget) for name, budget, *_ in answers][:2] == [("po-uct-numba", 10), ("po-uct-numba", 3000)]
     assert answers[1][3] == [
         searched(problem, 3000, seed).statistics().most_visited for seed, problem in enumerate(problems)
     ]

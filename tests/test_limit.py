@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import json
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -45,6 +44,7 @@ from potlp_jax.learning.observing import observe_panorama
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.policies import Policy, direct_move
 from potlp_jax.planning.situation import assess
+from potlp_jax.sweep.store import Item, Row
 from potlp_jax.trials.batch import Start, run_batch
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import Outcome
@@ -453,10 +453,9 @@ def test_a_trial_that_does_not_end_is_in_no_gain():
 
 
 def test_the_worst_trials_are_those_that_lose_most():
-    def row(task, world, policy, cost, outcome="satisfied"):
-        return SimpleNamespace(
-            item=SimpleNamespace(task=task, world=world, policy=policy), cost=cost, outcome=outcome, status=0
-        )
+    def row(task, world, policy, cost):
+        item = Item("firefighting", task, policy, world)
+        return Row(item, "satisfied", float(cost), 99.0, 1, 1, 0, 0, (1, 2), "p", "c", {}, "", 0.0, "d")
 
     rows = [
         row(task, world, policy, cost)
