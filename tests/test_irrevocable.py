@@ -13,6 +13,7 @@ from eval.commits import CONFIG, POLICIES, SIZES, irrevocable_steps, pair, prior
 from eval.formulas import random_tasks
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.toy import Toy
+from potlp_jax.errors import TaskWarning
 from potlp_jax.planning.policies import Policy, decide
 from potlp_jax.planning.situation import assess
 from potlp_jax.task import irrevocable
@@ -117,11 +118,13 @@ def test_padding_adds_no_irrevocable_move():
     assert not padded[states:].any()
 
 
-def test_an_automaton_that_is_too_large_has_none(monkeypatch):
+def test_an_automaton_that_is_too_large_has_none_and_says_so(monkeypatch):
     task = Task.from_formula(TWO_BRANCHES, NAMES)
     monkeypatch.setattr(irrevocable, "MOST_COMPARISONS", 10)
-    assert irrevocable_moves(task.dfa).shape == task.dfa.transitions.shape
-    assert not irrevocable_moves(task.dfa).any()
+    with pytest.warns(TaskWarning, match=f"an automaton of {task.dfa.num_states} states"):
+        moves = irrevocable_moves(task.dfa)
+    assert moves.shape == task.dfa.transitions.shape
+    assert not moves.any()
 
 
 # Trials

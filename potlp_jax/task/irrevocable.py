@@ -9,14 +9,17 @@ References:
     Taheri and Aksaray, arXiv 2602.18951 (commit states).
 """
 
+import warnings
+
 import numpy as np
 from jaxtyping import Bool, Int
 
+from potlp_jax.errors import TaskWarning
 from potlp_jax.task.automaton import Dfa, letter_classes
 
 MOST_COMPARISONS: int = 1 << 28
 """Comparisons of one round, pairs of states times kinds of letters, at most: about a second. A larger automaton counts
-as having no irrevocable move. Tasks that ship need 1,024 at most."""
+as having no irrevocable move, and a warning says so. Tasks that ship need 1,024 at most."""
 
 
 def irrevocable_moves(dfa: Dfa) -> Bool[np.ndarray, "Z L"]:
@@ -34,6 +37,12 @@ def irrevocable_moves(dfa: Dfa) -> Bool[np.ndarray, "Z L"]:
     moves = dfa.transitions[:, representative]
     states, kinds = moves.shape
     if states * kinds * max(states, kinds) > MOST_COMPARISONS:
+        warnings.warn(
+            f"an automaton of {states} states and {kinds} kinds of letters is too large to tell which moves cannot be "
+            "taken back: none is made last",
+            TaskWarning,
+            stacklevel=2,
+        )
         return np.zeros(dfa.transitions.shape, dtype=bool)
     included = inclusion(moves, dfa.accepting)
     loses = np.zeros(moves.shape, dtype=bool)
