@@ -89,7 +89,7 @@ def test_every_trial_is_what_it_is_alone(ran):
     assert kept > 0 or not policy.searches
 
 
-@pytest.mark.parametrize("policy", [Policy.OPTIMISTIC, Policy.POTLP])
+@pytest.mark.parametrize("policy", [Policy.OPTIMISTIC, Policy.ORACLE, Policy.POTLP])
 def test_lockstep_without_native_kernels_is_slot_by_slot_with_them(policy, monkeypatch):
     # What accelerators run, against what CPUs run.
     expected = _figures(run_batch(_starts(5), policy, CONFIG, slots=3, estimator=UNTRAINED))
