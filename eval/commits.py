@@ -6,8 +6,8 @@ run again alone, and its irrevocable moves are judged in plain Python: *forced* 
 without one and acceptance was not within reach in known space, otherwise *free*. With ``irrevocable_last`` no move may
 be free, and a trial without a forced move must end satisfied: both are counted as ``broken``.
 
-    python -m eval.commits --pairs 10000 --out build/commits.jsonl
-    python -m eval.commits --out build/commits.jsonl --report docs/results/commits.json
+    python -m eval.commits --pairs 10000 --out out/commits.jsonl
+    python -m eval.commits --out out/commits.jsonl --report docs/results/commits.json
 
 Results are appended by chunks of pairs; the same command again continues where it stopped.
 """
