@@ -20,7 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from potlp_jax.cache import enable_compilation_cache
-from potlp_jax.environments.firefighting import Firefighting, FirefightingConfig
+from potlp_jax.environments.firefighting import Firefighting
+from potlp_jax.environments.firefighting_layout import FirefightingConfig
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.planning.distances.product import product_distances, product_transitions
 from potlp_jax.task.task import Task

@@ -15,9 +15,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from scipy import ndimage
 
-from potlp_jax.environments.firefighting import (
+from potlp_jax.environments.firefighting import Firefighting
+from potlp_jax.environments.firefighting_layout import (
     HALLWAYS,
-    Firefighting,
     FirefightingConfig,
     FirefightingLayout,
     Room,

@@ -12,6 +12,7 @@ the reader's own kind of `PotlpError`. What they see to:
 import contextlib
 import io
 import json
+import re
 import stat
 import xml.etree.ElementTree as ElementTree
 import zipfile
@@ -51,6 +52,15 @@ _LONGEST_REASON = 200
 """Characters of another library's message that are passed on."""
 
 _LIBYAML = yaml.__with_libyaml__
+
+
+class _Loader(yaml.CSafeLoader if _LIBYAML else yaml.SafeLoader):
+    """The safe values of PyYAML, and numbers as YAML 1.2 and everybody write them: ``1e-3`` is one, too."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
+)
 
 
 def one_line(value: object, longest: int = _LONGEST_REASON) -> str:
@@ -174,7 +184,7 @@ def read_yaml(path: Path | str, error: type[PotlpError], loader: type[Any] | Non
     Args:
         path: of the file.
         error: what is raised.
-        loader: makes values of the text; None: those of ``yaml.safe_load``.
+        loader: makes values of the text; None: those of ``yaml.safe_load``, where 1e-3 is a number.
 
     Returns:
         The value.
@@ -205,7 +215,7 @@ def read_xml(path: Path | str, error: type[PotlpError]) -> ElementTree.Element:
 def parse_yaml(text: str, loader: type[Any] | None = None) -> Any:
     """The value of a YAML text. Raises YAMLError, or whatever a value that is out of range makes its type raise."""
     _check_events(text)
-    reader = (loader or (yaml.CSafeLoader if _LIBYAML else yaml.SafeLoader))(text)
+    reader = (loader or _Loader)(text)
     try:
         node = reader.get_single_node()
         _check_keys(node)

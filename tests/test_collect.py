@@ -14,12 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from flax import struct
 
 from potlp_jax.engine.engine import Broken, Here
 from potlp_jax.engine.opening import open_engine
 from potlp_jax.environments.firefighting import Firefighting
+from potlp_jax.environments.firefighting_layout import FirefightingConfig
+from potlp_jax.environments.posterior import Drawn
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
-from potlp_jax.errors import DatasetError
+from potlp_jax.errors import DatasetError, WorldError
 from potlp_jax.learning.dataset import decode, finished_shards, read_dataset, read_metadata, samples_file, views_file
 from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.recording import survey
@@ -288,3 +292,75 @@ def test_the_explorer_sees_much_of_the_building_and_walks_through_known_cells(co
 def test_settings_that_mean_nothing_are_refused(changes, message):
     with pytest.raises(DatasetError, match=message):
         CollectConfig(**changes)
+
+
+@struct.dataclass(kw_only=True)
+class Certain:
+    """A posterior that knows the building; its evidence counts the panoramas."""
+
+    evidence: jax.Array
+    occupied: jax.Array
+    letters: jax.Array
+
+    def after(self, cell):
+        return dataclasses.replace(self, evidence=self.evidence + 1)
+
+    def draw(self, belief):
+        return Drawn(occupied=self.occupied[None], letters=self.letters[None], agrees=self.evidence > 0)
+
+
+class CertainFirefighting(Firefighting):
+    """Whose posterior has no doubt."""
+
+    def posterior(self, key, noise, count):
+        world = self.generate(key)
+        return Certain(evidence=jnp.int32(0), occupied=world.occupied, letters=world.letters)
+
+
+class Contradicting(Firefighting):
+    """Whose posterior agrees with nothing."""
+
+    def posterior(self, key, noise, count):
+        return dataclasses.replace(CertainFirefighting(self.config).posterior(key, noise, count), evidence=-1000)
+
+
+def test_labels_by_a_posterior_without_doubt_are_those_of_the_true_map(dataset, tmp_path):
+    config = dataclasses.replace(CONFIG, posterior=1)
+    collect(CertainFirefighting(GENERATOR.config), "firefighting", Split.TRAINING, 2, tmp_path / "one", config)
+    mine, its = (pd.read_parquet(samples_file(folder, 0)) for folder in (tmp_path / "one", dataset))
+    pd.testing.assert_frame_equal(mine, its)
+
+
+def test_labels_by_a_posterior_are_means_that_are_right_on_average(compiled, tmp_path):
+    # Narrow hallways with thin smoke: from the room nobody sees which of them burns.
+    family = Firefighting(
+        FirefightingConfig(
+            room_width=6, room_height=15, hallway_length=16, hallway_width=1, hallway_spacing=5, smoke_reach=0.5
+        )
+    )
+    folders = []
+    for buildings in (0, 12):
+        folders.append(tmp_path / str(buildings))
+        config = dataclasses.replace(CONFIG, posterior=buildings)
+        collect(family, "firefighting", Split.TRAINING, WORLDS, folders[-1], config)
+    (views, hard), (mine, means) = map(_tables, folders)
+    # The same views and questions: only the answers differ.
+    pd.testing.assert_frame_equal(mine, views)
+    asked = ["view", "task", "outcome_class", "row", "column"]
+    pd.testing.assert_frame_equal(means[asked], hard[asked])
+    doubt = (means["success_probability"] > 0) & (means["success_probability"] < 1)
+    assert doubt.mean() > 0.05
+    np.testing.assert_array_equal(means["success_cost"].isna(), means["success_probability"] == 0)
+    # Whatever the doubt is, the answers of the buildings themselves are right that often.
+    assert abs((means["success_probability"] - hard["success_probability"])[doubt].mean()) < 0.15
+    assert (means["success_probability"] == hard["success_probability"])[~doubt].mean() > 0.9
+
+
+def test_families_that_do_not_say_what_they_can_be_give_no_such_labels(tmp_path):
+    config = dataclasses.replace(CONFIG, posterior=12, held_out=())
+    with pytest.raises(WorldError, match="does not say what its worlds can be"):
+        collect(make("delivery"), "delivery", Split.TRAINING, 2, tmp_path / "delivery", config)
+    with pytest.raises(DatasetError, match="no building of its family agrees"):
+        collect(Contradicting(GENERATOR.config), "firefighting", Split.TRAINING, 2, tmp_path / "wrong", config)
+    with pytest.raises(DatasetError, match="posterior is -1"):
+        dataclasses.replace(CONFIG, posterior=-1)

@@ -8,9 +8,9 @@ import jax
 import numpy as np
 import pytest
 
-from potlp_jax.environments.firefighting import (
+from potlp_jax.environments.firefighting import Firefighting
+from potlp_jax.environments.firefighting_layout import (
     HALLWAYS,
-    Firefighting,
     FirefightingConfig,
     FirefightingLayout,
     Room,

@@ -184,8 +184,8 @@ def test_a_collection_paints_what_the_camera_sees_on_the_way(every):
     asked, painted = [], {}
 
     class Keeping(recording.Recorder):
-        def add(self, world, pose, image, painting, scene, questions):
-            painted[pose.step] = painting
+        def add(self, world, pose, image, seen, scene, questions):
+            painted[pose.step] = seen.painting
 
     def photograph(cell, step):
         asked.append(step)

@@ -8,6 +8,7 @@ import warnings
 import jax
 import pytest
 
+from potlp_jax.codec import settings_from_words
 from potlp_jax.environments.campus.delivery import Delivery
 from potlp_jax.environments.toy import Toy
 from potlp_jax.errors import BatchError, PotlpWarning
@@ -78,3 +79,12 @@ def test_tasks_of_a_family_are_over_its_propositions():
     assert generator.task("F hazard").propositions == generator.propositions
     with pytest.raises(ValueError, match=r"toy has no task 3; it has: 1 \(F goal\), 2 "):
         generator.task(3)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("1e-3", 1e-3), ("2E5", 2e5), ("-1.e2", -100.0), ("1e3x", "1e3x"), ("12", 12)]
+)
+def test_numbers_with_an_exponent_are_numbers(text, value):
+    found = settings_from_words([f"training.rate={text}"])["training"]["rate"]
+    assert found == value
+    assert type(found) is type(value)

@@ -7,12 +7,12 @@ import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from typing import Any
 
-from eval.limit.observer import ideal_observer, mixed
+from eval.limit.mixed import mixed
 from potlp_jax.environments import base
-from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for, identity_of
+from potlp_jax.learning.ideal_observer import ideal_observer
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy
@@ -145,10 +145,8 @@ class Experiment:
         return {Arm.TRUE_CHANCES: mixed(truth, own), Arm.TRUE_COSTS: mixed(own, truth)}.get(arm, self.trained)
 
     def _observer(self, number: int) -> Estimator:
-        assert isinstance(self.generator, Firefighting), "only its buildings have an ideal observer"
         key = world_key(self.split, number, self.generator.name)
-        world, layout = self.generator.generate_with_layout(key)
-        return ideal_observer(self.generator, world, layout, trial_key(number), self.buildings)
+        return ideal_observer(self.generator.posterior(key, trial_key(number), self.buildings), self.world(number))
 
 
 @functools.lru_cache(maxsize=2)

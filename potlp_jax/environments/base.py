@@ -10,8 +10,9 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from potlp_jax.environments.posterior import Posterior
 from potlp_jax.environments.splits import Split, default_split, world_key
-from potlp_jax.errors import TaskError
+from potlp_jax.errors import TaskError, WorldError
 from potlp_jax.precision import in_32_bits
 from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.reading import read_task
@@ -80,6 +81,25 @@ class Generator(abc.ABC):
             WorldError: the family has no such world.
         """
         return self.generate(world_key(default_split(self.name) if split is None else split, index, self.name))
+
+    def posterior(self, key: PRNGKeyArray, noise: PRNGKeyArray, count: int) -> Posterior:
+        """What the world of a key can be, to a robot that has seen nothing of it yet.
+
+        Args:
+            key: of the world, as of ``generate``.
+            noise: another key; decides which buildings are drawn.
+            count: how many are drawn at a time.
+
+        Returns:
+            The distribution of the family's worlds, given what a robot knows at its start.
+
+        Raises:
+            WorldError: the family does not say what its worlds can be.
+        """
+        raise WorldError(
+            f"{self.name} does not say what its worlds can be: what asks for it needs a family with `posterior`, such "
+            "as firefighting"
+        )
 
     def task(self, text: str | int) -> Task:
         """A task over the family's propositions.

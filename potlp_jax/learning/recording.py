@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float32, Int32, UInt8
 from scipy import ndimage
 
 from potlp_jax.codec import json_copy
+from potlp_jax.errors import DatasetError
 from potlp_jax.learning.dataset import (
     JPEG_QUALITY,
     SAMPLES_SCHEMA,
@@ -30,7 +31,8 @@ from potlp_jax.learning.dataset import (
     writer_versions,
 )
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
-from potlp_jax.learning.labels import true_labels
+from potlp_jax.learning.ideal_observer import IdealObserver
+from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.map_images import encode_view, encode_world
 from potlp_jax.learning.observing import look_step, looks_between
 from potlp_jax.learning.painting import Painting, blank_painting, paint
@@ -39,6 +41,7 @@ from potlp_jax.learning.sample_weights import WeightBounds, Weights, loss_weight
 from potlp_jax.planning.distances.product import grid_distances
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.task.task import Task, TaskArrays
+from potlp_jax.types import Status
 from potlp_jax.world.camera import CameraConfig, Disturbance, bearing
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
 from potlp_jax.world.grid import BeliefMap, World
@@ -187,9 +190,14 @@ def survey(
 
 @partial(jax.jit, static_argnames="bounds")
 def label(
-    world: World, belief: BeliefMap, scene: Scene, sheet: TaskArrays, bounds: WeightBounds
+    world: World,
+    belief: BeliefMap,
+    scene: Scene,
+    sheet: TaskArrays,
+    bounds: WeightBounds,
+    observer: IdealObserver | None = None,
 ) -> tuple[Estimates, Weights]:
-    """True labels and weights of every (subgoal, question), also of subgoals out of view.
+    """Labels and weights of every (subgoal, question), also of subgoals out of view.
 
     Args:
         world: the true map.
@@ -197,12 +205,14 @@ def label(
         scene: the subgoals.
         sheet: the questions (``question_sheet``).
         bounds: of the weights; static.
+        observer: answers in place of the true map, by all that can be where the robot has not been.
 
     Returns:
-        Labels and weights, 0 where masked.
+        Labels and weights, 0 where masked. The observer's have its status.
     """
     # Subgoals out of view are labelled too: missing one is cheap where another, seen or not, would do as well.
-    labels = true_labels(world, belief, scene.subgoals, sheet)
+    by = TrueMapEstimator(world=world) if observer is None else observer
+    labels = by(belief, scene.subgoals, sheet)
     mask = scene.subgoals.mask[:, None] & sheet.class_mask[None, :]
     return labels, loss_weights(scene.distance, labels, mask, bounds)
 
@@ -237,6 +247,31 @@ def is_answered(
     return answers
 
 
+@struct.dataclass(kw_only=True)
+class Seen:
+    """What the camera has shown on a drive.
+
+    Attributes:
+        painting: on the map.
+        observer: remembers what was in sight and gives the labels; None where the true map does.
+    """
+
+    painting: Painting
+    observer: IdealObserver | None
+
+
+@partial(jax.jit, static_argnames="camera")
+def _after_picture(
+    seen: Seen,
+    image: UInt8[Array, "rows columns 3"],
+    belief: BeliefMap,
+    cell: Int32[Array, "2"],
+    camera: CameraConfig,
+) -> Seen:
+    observer = None if seen.observer is None else seen.observer.remember(None, belief, cell)
+    return Seen(painting=paint(seen.painting, image, belief, cell, camera), observer=observer)
+
+
 class Recorder:
     """Columns of the worlds, views and samples of one shard."""
 
@@ -263,7 +298,7 @@ class Recorder:
         world: World,
         pose: Pose,
         image: UInt8[np.ndarray, "rows columns 3"],
-        painting: Painting,
+        seen: Seen,
         scene: Scene,
         questions: Sequence[Question],
     ) -> None:
@@ -273,14 +308,22 @@ class Recorder:
             world: the true map.
             pose: where the robot stands.
             image: what the camera saw.
-            painting: what it painted on the map until then, this image included.
+            seen: what it has shown until then, this image included.
             scene: the subgoals; each becomes a sample for every question.
             questions: what is asked of each of them.
+
+        Raises:
+            DatasetError: no building of the family agrees with what was seen.
         """
         config = self.config
         # One sheet size for all views: the labels are compiled once.
         sheet = question_sheet(questions, config.classes, config.staying_sets)
-        labels, weights = label(world, pose.belief, scene, sheet, self._bounds)
+        labels, weights = label(world, pose.belief, scene, sheet, self._bounds, seen.observer)
+        if labels.status is not None and Status.INVALID in Status(int(labels.status)):
+            raise DatasetError(
+                f"world {self.worlds['world'][-1]}, step {pose.step}: no building of its family agrees with what was "
+                "seen, so that it cannot give labels: its `posterior` does not fit its worlds"
+            )
         # Numbered in the order of recording; samples refer to their view by it.
         view = view_id(self._shard, len(self.views["view"]))
         row = {
@@ -291,7 +334,7 @@ class Recorder:
             "column": pose.cell[1],
             "format": config.image_format,
             "image": encode(image, config.image_format, config.quality),
-            **dataclasses.asdict(encode_view(pose.belief, painting)),
+            **dataclasses.asdict(encode_view(pose.belief, seen.painting)),
         }
         for name, value in row.items():
             self.views[name].append(value)
@@ -309,6 +352,7 @@ def record_views(
     *,
     most: int,
     unexplored: Bool[np.ndarray, "H W"] | None = None,
+    observer: IdealObserver | None = None,
 ) -> int:
     """Record views of one drive through a world at random intervals along ``poses``.
 
@@ -323,21 +367,22 @@ def record_views(
         most: views to record.
         unexplored: as in ``is_answered``; subgoals that ``world`` does not answer for are left out. None: it answers
             for all.
+        observer: of the world, that has seen nothing; gives the labels in place of the true map.
 
     Returns:
         How many views were recorded.
     """
     config, due, recorded = recorder.config, 0.0, 0
-    painting = blank_painting(*world.shape)
+    seen = Seen(painting=blank_painting(*world.shape), observer=observer)
     for pose in poses:
         if recorded == most:
             break
         # At every pose and on the way, as in a trial, where panoramas precede each decision.
-        painting = _painted_on_the_way(painting, pose, photograph, config)
+        seen = _seen_on_the_way(seen, pose, photograph, config)
         image = photograph(pose.cell, pose.step)
         if image is None:
             continue
-        painting = _painted(painting, image, pose.belief, jnp.asarray(pose.cell, jnp.int32), config.camera)
+        seen = _after_picture(seen, image, pose.belief, jnp.asarray(pose.cell, jnp.int32), config.camera)
         # Before the scene is made: finding subgoals is what takes time.
         if pose.travelled < due:
             continue
@@ -347,31 +392,28 @@ def record_views(
         if not np.any(scene.asked):
             continue
         questions = draw_questions(rng, tasks, config.classes, config.staying_sets)
-        recorder.add(world, pose, image, painting, scene, questions)
+        recorder.add(world, pose, image, seen, scene, questions)
         # More views where there is more to choose, which is where a decision matters.
         due = pose.travelled + rng.uniform(*config.spacing) / max(1, int(np.sum(scene.in_view)))
         recorded += 1
     return recorded
 
 
-_painted = jax.jit(paint, static_argnames="camera")
-
-
-def _painted_on_the_way(
-    painting: Painting,
+def _seen_on_the_way(
+    seen: Seen,
     pose: Pose,
     photograph: Callable[[Cell, int], UInt8[np.ndarray, "rows columns 3"] | None],
     config: RecordingConfig,
-) -> Painting:
-    """The painting with what the camera saw since the pose before, this pose's own panorama left out."""
+) -> Seen:
+    """With what the camera showed since the pose before, this pose's own panorama left out."""
     before = pose.step - len(pose.way) - 1
     for number in range(looks_between(before, pose.step, config.look_every)):
         step = look_step(before, number, config.look_every)
         cell = pose.way[step - before - 1]
         image = photograph(cell, step)
         if image is not None:
-            painting = _painted(painting, image, pose.belief, jnp.asarray(cell, jnp.int32), config.camera)
-    return painting
+            seen = _after_picture(seen, image, pose.belief, jnp.asarray(cell, jnp.int32), config.camera)
+    return seen
 
 
 def _answered_part(scene: Scene, world: World, belief: BeliefMap, unexplored: Bool[np.ndarray, "H W"]) -> Scene:

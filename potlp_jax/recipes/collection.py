@@ -36,6 +36,7 @@ from potlp_jax.learning.dataset import (
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.domain import unit_of
 from potlp_jax.learning.estimator import TrainedEstimator, identity_of, named_estimator
+from potlp_jax.learning.ideal_observer import IdealObserver, ideal_observer
 from potlp_jax.learning.questions import HELD_OUT, TaskDistribution
 from potlp_jax.learning.recording import (
     Pose,
@@ -74,6 +75,9 @@ class CollectConfig(RecordingConfig):
             one leaves over is the next one's.
         pursued: tasks that the wandering robot pursues in a world, in turn. One alone shapes what is known of the
             building as a trial does: who avoids a fire all the time sees what lies behind it and never goes there.
+        posterior: buildings of the family, drawn among those that agree with what was seen, whose true labels' means
+            are recorded; 0: the labels of the one building in which the robot is. Only of families that say what their
+            worlds can be (``Generator.posterior``).
     """
 
     first_world: int = 0
@@ -84,10 +88,15 @@ class CollectConfig(RecordingConfig):
     estimator: str = ""
     drives: int = 3
     pursued: int = 12
+    posterior: int = 0
 
     def __post_init__(self) -> None:
         names = ("drives", "pursued", "tasks_per_world", "worlds_per_shard")
         require_fields(self, names, AT_LEAST_ONE, DatasetError)
+        if self.posterior < 0:
+            raise DatasetError(
+                f"posterior is {self.posterior}: give a number of buildings, or 0 for the labels of the robot's own"
+            )
         if self.first_world < 0:
             raise DatasetError(f"first_world is {self.first_world}; worlds are numbered from 0")
         # An estimator that nobody asks would be named in the data set all the same.
@@ -153,6 +162,7 @@ def collect(
     Raises:
         DatasetError: the folder holds a dataset with other metadata, another command collects into it, or ``worlds``
             does not fill whole shards.
+        WorldError: ``config.posterior`` is asked of a family that does not say what its worlds can be.
     """
     shards = _whole_shards(worlds, config.worlds_per_shard)
     # Before anything is made: a collection with other settings must not mix with what is there.
@@ -263,7 +273,18 @@ def _collect_world(recorder: Recorder, world: World, index: int, tasks: TaskDist
     for number, poses in enumerate(drives, start=1):
         # What the drives before left over is for those that follow.
         most = config.views_per_world * number // count - recorded
-        recorded += record_views(recorder, world, poses, asked, rng, photograph, most=most)
+        recorded += record_views(
+            recorder, world, poses, asked, rng, photograph, most=most, observer=_observer(world, index, job)
+        )
+
+
+def _observer(world: World, index: int, job: _Job) -> IdealObserver | None:
+    """What gives the labels of a world, if it is not the world itself."""
+    if not job.config.posterior:
+        return None
+    noise = jax.random.fold_in(jax.random.key(job.config.seed), index)
+    key = world_key(job.split, index, job.generator.name)
+    return ideal_observer(job.generator.posterior(key, noise, job.config.posterior), world)
 
 
 def _drives(

@@ -4,10 +4,10 @@ Hallways, alarm and fire are few choices: all their combinations are listed once
 that contradict an observation drop out. Where extinguisher and exit lie in the far room is independent of them, given
 the robot's room, and is drawn apart.
 
-Draws are stable: the same noise is used at every decision, so that drawn buildings change only as far as the posterior
-does. Estimates that are drawn anew at every decision make the robot turn back and forth.
+``FirefightingPosterior`` is what ``Firefighting.posterior`` returns (``environments.posterior``).
 """
 
+import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Iterator
@@ -19,9 +19,9 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32, PRNGKeyArray, UInt8
 
-from potlp_jax.environments.firefighting import (
+from potlp_jax.environments.firefighting_layout import (
+    PROPOSITIONS,
     Building,
-    Firefighting,
     FirefightingConfig,
     FirefightingLayout,
     Room,
@@ -30,7 +30,9 @@ from potlp_jax.environments.firefighting import (
     layout_of,
     room_cells,
 )
+from potlp_jax.environments.posterior import Drawn
 from potlp_jax.world.grid import BeliefMap
+from potlp_jax.world.sensing import SensorConfig, visible
 
 # Bits of a cell's code.
 OCCUPIED, GREEN, SMOKY, FIRE, ALARM = (1 << bit for bit in range(5))
@@ -41,7 +43,7 @@ _MAPPED = OCCUPIED | FIRE | ALARM
 SMOKE_SEEN: float = 0.01
 """Density above which smoke in a cell is seen; nearer to the fire it is denser."""
 
-_BIT = {name: 1 << index for index, name in enumerate(Firefighting.propositions)}
+_BIT = {name: 1 << index for index, name in enumerate(PROPOSITIONS)}
 _EVEN_SHARES = Shares(*[0.5] * len(Shares._fields))
 
 
@@ -137,6 +139,63 @@ class Noise:
 
     extinguisher: Float32[Array, "N H W"]
     exit: Float32[Array, "N H W"]
+
+
+@struct.dataclass(kw_only=True)
+class FirefightingPosterior:
+    """The buildings around one robot that agree with the map and with what its camera showed.
+
+    What the camera showed: tiles and smoke of every floor cell that has been in line of sight from where a panorama was
+    taken, at any distance.
+
+    Attributes:
+        evidence: what the camera showed so far.
+        prior: what can be built.
+        noise: of the buildings that are drawn.
+        truth: codes of the building in which the robot is; read for what is in line of sight, and for nothing else.
+    """
+
+    evidence: Evidence
+    prior: Prior
+    noise: Noise
+    truth: UInt8[Array, "H W"]
+
+    def after(self, cell: Int32[Array, "2"]) -> "FirefightingPosterior":
+        """The posterior after a panorama from ``cell``."""
+        occupied = self.truth & OCCUPIED > 0
+        # The longest line of sight on the grid is shorter than the sum of its sides.
+        everywhere = SensorConfig(range_cells=float(sum(occupied.shape)))
+        in_sight = self.evidence.in_sight | (visible(occupied, cell, everywhere) & ~occupied)
+        signs = jnp.where(in_sight, self.truth & SIGNS, 0).astype(jnp.uint8)
+        return dataclasses.replace(self, evidence=Evidence(in_sight=in_sight, signs=signs))
+
+    def draw(self, belief: BeliefMap) -> Drawn:
+        """Buildings of the posterior."""
+        occupied, letters = draw_buildings(self.prior, belief, self.evidence, self.noise)
+        agrees = jnp.sum(posterior(self.prior, belief, self.evidence)) > 0.0
+        return Drawn(occupied=occupied, letters=letters, agrees=agrees)
+
+
+def firefighting_posterior(
+    config: FirefightingConfig, layout: FirefightingLayout, key: PRNGKeyArray, count: int
+) -> FirefightingPosterior:
+    """The posterior of a robot that has seen nothing yet.
+
+    Args:
+        config: of the generator.
+        layout: of the building in which the robot is.
+        key: of the noise.
+        count: how many buildings are drawn at a time.
+
+    Returns:
+        What the robot's building can be.
+    """
+    return FirefightingPosterior(
+        evidence=Evidence(in_sight=jnp.zeros(config.shape, bool), signs=jnp.zeros(config.shape, jnp.uint8)),
+        prior=prior_of(config, layout.robot_room),
+        noise=draw_noise(key, count, config.shape),
+        truth=jnp.asarray(code_of(building_of(config, layout))),
+    )
 
 
 def draw_noise(key: PRNGKeyArray, count: int, shape: tuple[int, int]) -> Noise:
