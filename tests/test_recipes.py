@@ -18,6 +18,8 @@ from potlp_jax.learning.dataset import read_dataset, read_metadata
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import read_estimator, shipped_files
 from potlp_jax.learning.serialization import load_estimator
+from potlp_jax.learning.training import Trained
+from potlp_jax.recipes import recipe as recipes
 from potlp_jax.recipes.fitting import ESTIMATOR
 from potlp_jax.recipes.journal import Display
 from potlp_jax.recipes.recipe import PACKAGE, TIMES, _stages, follow, read_recipe
@@ -75,11 +77,14 @@ def test_a_shipped_recipe_is_what_made_the_shipped_file(name):
         assert data["collection"][field] == collected[field]
     # No world gives more views than this; many give as many, but some drives end early.
     most = recipe.training_worlds * recipe.collect.views_per_world
-    most += sum((part.explored + part.worlds) * part.views_per_world for part in recipe.rounds)
+    most += sum((part.explored.worlds + part.worlds) * part.views_per_world for part in recipe.rounds)
     assert 0.75 * most < estimator.metadata["panoramas"] <= most
     explored = [(recipe.collect.driver, recipe.training_worlds)]
     further = [
-        found for part in recipe.rounds for found in (("potlp", part.worlds), ("explorer", part.explored)) if found[1]
+        found
+        for part in recipe.rounds
+        for found in (("potlp", part.worlds), ("explorer", part.explored.worlds))
+        if found[1]
     ]
     sources = estimator.metadata.get("training_data", {}).values()
     assert [(source["driver"], source["worlds"]) for source in sources] == (explored + further if sources else [])
@@ -123,7 +128,9 @@ def test_a_small_recipe_makes_an_estimator_and_continues(tmp_path):
 
 def test_rounds_drive_with_what_was_fitted_and_learn_from_all_records(tmp_path):
     building = {"kind": "building", "widths": [4, 4, 6], "blocks": [0, 0, 1], "decoder": 4, "head": 8, "condition": 4}
-    rounds = [{"worlds": 2, "validation_worlds": 2, "views_per_world": 2, "drives": 2, "epochs": 1, "explored": 2}]
+    rounds = [
+        {"worlds": 2, "validation_worlds": 2, "views_per_world": 2, "drives": 2, "epochs": 1, "explored": {"worlds": 2}}
+    ]
     small = {**SMALL, "fit": {**SMALL["fit"], "network": building}, "rounds": rounds}
     (tmp_path / "small.yaml").write_text(json.dumps(small))
     recipe = read_recipe(tmp_path / "small.yaml")
@@ -164,8 +171,46 @@ def test_rounds_drive_with_what_was_fitted_and_learn_from_all_records(tmp_path):
     assert any(line.startswith("resumed at step") for line in lines[again:])
 
 
+def test_a_round_may_record_otherwise_and_leave_the_records_of_before(monkeypatch, tmp_path):
+    rounds = [
+        {"worlds": 2, "validation_worlds": 2},
+        {
+            **{"worlds": 4, "validation_worlds": 2, "explored": {"worlds": 2, "spacing": [0, 2]}, "alone": True},
+            **{"posterior": 8, "look_every": 3, "spacing": [1, 9]},
+        },
+        {"worlds": 2, "validation_worlds": 2},
+    ]
+    (tmp_path / "small.yaml").write_text(json.dumps({**SMALL, "rounds": rounds}))
+    recipe = read_recipe(tmp_path / "small.yaml")
+    collected, fitted = {}, []
+
+    def collect(generator, environment, split, worlds, into, config, engine, tell):
+        collected[str(into.relative_to(tmp_path))] = config
+
+    monkeypatch.setattr(recipes, "collect", collect)
+    monkeypatch.setattr(recipes, "read_dataset", lambda folder: str(folder.relative_to(tmp_path)))
+    monkeypatch.setattr(recipes, "joined", list)
+    ended = Trained(params={}, best_step=1, best_loss=0.0, steps=1, reason="planned", seconds=0.0)
+    monkeypatch.setattr(recipes, "fit", lambda training, *_: fitted.append(training) or ended)
+    follow(recipe, tmp_path)
+    assert fitted == [
+        ["round-0/training"],
+        ["round-0/training", "round-1/training"],
+        ["round-2/training", "round-2/explored"],
+        ["round-2/training", "round-2/explored", "training"],
+    ]
+    for folder, config in collected.items():
+        own = (config.posterior, config.look_every, config.spacing)
+        usual = (recipe.collect.posterior, recipe.collect.look_every, recipe.collect.spacing)
+        if folder.startswith("round-2"):
+            usual = (8, 3, (0.0, 2.0) if folder.endswith("explored") else (1.0, 9.0))
+        assert own == usual
+
+
 def test_worlds_of_another_family_are_recorded_beside_those_of_the_recipe(tmp_path):
-    rounds = [{"worlds": 2, "validation_worlds": 2, "views_per_world": 2, "drives": 1, "epochs": 1, "explored": 2}]
+    rounds = [
+        {"worlds": 2, "validation_worlds": 2, "views_per_world": 2, "drives": 1, "epochs": 1, "explored": {"worlds": 2}}
+    ]
     # The family itself serves as the other one: its worlds are counted on.
     small = {**SMALL, "rounds": rounds, "beside": [{"environment": "toy", "share": 0.25}]}
     (tmp_path / "small.yaml").write_text(json.dumps(small))

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from potlp_jax.checks import POSITIVE, require_fields
 from potlp_jax.codec import read_settings, settings_file, with_settings
@@ -41,25 +42,64 @@ TIMES: str = "times.csv"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Explored:
+    """Worlds that are recorded in a round as at first, by the robot that wanders.
+
+    Drives cost much more than exploration, and more buildings keep a network from learning those that it has seen by
+    heart.
+
+    Attributes:
+        worlds: how many further worlds of the split.
+        pursued: as in ``CollectConfig``.
+        views_per_world, spacing: as in ``CollectConfig``; None: as in the round. Few views close to each other are of
+            the first steps, where a trial chooses among all that there is, and cost little.
+    """
+
+    worlds: int = 0
+    pursued: int = CollectConfig.pursued
+    views_per_world: int | None = None
+    spacing: tuple[float, float] | None = None
+
+    def of_round(self, collect: CollectConfig) -> CollectConfig:
+        """What is recorded, in a round that records this in its drives."""
+        return _where_said(collect, self, ("views_per_world", "spacing"), pursued=self.pursued)
+
+
+def _where_said(collect: CollectConfig, part: Any, names: Sequence[str], **changes: Any) -> CollectConfig:
+    """A collection with the fields of ``part`` that are not None, and with further changes."""
+    said = {name: value for name in names if (value := getattr(part, name)) is not None}
+    return dataclasses.replace(collect, **said, **changes)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Round:
     """Once more: PO-TLP drives through new worlds with what was fitted before, and the fit goes on with all records.
 
     Attributes:
         worlds, validation_worlds: how many further worlds of the splits it drives through. The validation data of the
             round are its own alone: they are of the states that the estimator meets.
-        explored: how many further worlds are recorded as at first. Drives cost much more than exploration, and more
-            buildings keep a network from learning those that it has seen by heart.
-        views_per_world, drives, pursued: as in ``CollectConfig``.
-        epochs: passes over all records of training so far.
+        explored: worlds that are recorded beside those of the drives.
+        views_per_world, drives: as in ``CollectConfig``.
+        posterior, look_every, spacing: as in ``CollectConfig``; None: as in the recipe's own collection.
+        alone: whether records of the stages before are left from here on, as worth less: of other states, or with
+            labels of single buildings where those of the round are means.
+        epochs: passes over all records of training so far that are not left.
     """
 
     worlds: int
     validation_worlds: int
-    explored: int = 0
-    pursued: int = CollectConfig.pursued
+    explored: Explored = Explored()
     views_per_world: int = 24
     drives: int = 2
+    posterior: int | None = None
+    look_every: int | None = None
+    spacing: tuple[float, float] | None = None
+    alone: bool = False
     epochs: int = 4
+
+    def of_collection(self, collect: CollectConfig) -> CollectConfig:
+        """What a round records: as ``collect`` does where the round says nothing else."""
+        return _where_said(collect, self, ("posterior", "look_every", "spacing"), views_per_world=self.views_per_world)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -183,6 +223,8 @@ def follow(
                 with _timed(out, number, part.name):
                     generator = make(part.environment)
                     collect(generator, part.environment, part.split, part.worlds, into, config, engine, told)
+        if stage.alone:
+            records.clear()
         records += [read_dataset(folder / part.name) for part in stage.parts if part.split == Split.TRAINING]
         validation = read_dataset(folder / Split.VALIDATION.value)
         initial = folders[number - 1] / ESTIMATOR if number else None
@@ -219,6 +261,7 @@ class _Stage:
 
     parts: tuple[_Part, ...]
     fit: FitConfig
+    alone: bool = False
 
 
 class _Parts:
@@ -260,17 +303,12 @@ def _stages(recipe: Recipe, folders: Sequence[Path]) -> Iterator[_Stage]:
 
     yield _Stage(tuple(recorded(recipe.collect, recipe.training_worlds, recipe.validation_worlds)), recipe.fit)
     for number, chosen in enumerate(recipe.rounds):
-        driven = dataclasses.replace(
-            recipe.collect,
-            driver=Policy.POTLP.value,
-            estimator=str(folders[number] / ESTIMATOR),
-            drives=chosen.drives,
-            views_per_world=chosen.views_per_world,
-        )
+        own = chosen.of_collection(recipe.collect)
+        estimator = str(folders[number] / ESTIMATOR)
+        driven = dataclasses.replace(own, driver=Policy.POTLP.value, estimator=estimator, drives=chosen.drives)
         collected = list(recorded(driven, chosen.worlds, chosen.validation_worlds))
-        if chosen.explored:
-            changes = {"pursued": chosen.pursued, "views_per_world": chosen.views_per_world}
-            explored = dataclasses.replace(recipe.collect, **changes)
-            collected.append(parts.of_own("explored", training, chosen.explored, explored))
-            collected.extend(parts.of_others("explored", chosen.explored, explored))
-        yield _Stage(tuple(collected), dataclasses.replace(recipe.fit, epochs=chosen.epochs))
+        if chosen.explored.worlds:
+            explored = chosen.explored.of_round(own)
+            collected.append(parts.of_own("explored", training, chosen.explored.worlds, explored))
+            collected.extend(parts.of_others("explored", chosen.explored.worlds, explored))
+        yield _Stage(tuple(collected), dataclasses.replace(recipe.fit, epochs=chosen.epochs), chosen.alone)
