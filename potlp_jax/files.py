@@ -53,8 +53,10 @@ _LONGEST_REASON = 200
 
 _LIBYAML = yaml.__with_libyaml__
 
+_SafeLoader: Any = yaml.CSafeLoader if _LIBYAML else yaml.SafeLoader
 
-class _Loader(yaml.CSafeLoader if _LIBYAML else yaml.SafeLoader):
+
+class _Loader(_SafeLoader):
     """The safe values of PyYAML, and numbers as YAML 1.2 and everybody write them: ``1e-3`` is one, too."""
 
 

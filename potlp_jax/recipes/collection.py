@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int32, PRNGKeyArray, UInt8
 
@@ -257,12 +256,11 @@ def _recorded(job: _Job, shard: int) -> Iterator[Recorder]:
 def _collect_world(recorder: Recorder, world: World, index: int, tasks: TaskDistribution, job: _Job) -> None:
     """Drive through one world and record views."""
     config = job.config
+    key = jax.random.fold_in(jax.random.key(config.seed), index)
     rng, pool = draws_of_world(config, job.split, index, tasks)
 
     def photograph(cell: Cell, step: int) -> UInt8[np.ndarray, "rows columns 3"]:
-        # By world and step, so that a picture does not depend on how many were taken before it.
-        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), index), step)
-        return np.asarray(_image(world, jnp.asarray(cell, jnp.int32), key, config))
+        return np.asarray(_image(world, np.asarray(cell, np.int32), key, np.int32(step), config))
 
     recorder.add_world(world, index)
     # Half of the questions are of the tasks that are pursued: they are asked in the states that pursuing them leads to.
@@ -306,9 +304,14 @@ def _drives(
 
 @partial(jax.jit, static_argnames="config")
 def _image(
-    world: World, cell: Int32[Array, "2"], key: PRNGKeyArray, config: CollectConfig
+    world: World,
+    cell: Int32[Array | np.ndarray, "2"],
+    key: PRNGKeyArray,
+    step: Int32[Array, ""] | np.int32,
+    config: CollectConfig,
 ) -> UInt8[Array, "rows columns 3"]:
-    return disturb(render(world, cell, config.camera), key, config.disturbance)
+    # By world and step, so that a picture does not depend on how many were taken before it.
+    return disturb(render(world, cell, config.camera), jax.random.fold_in(key, step), config.disturbance)
 
 
 def summary(samples: Samples) -> str:

@@ -129,12 +129,11 @@ class SimulatedRobot:
 
     def panorama_before(self, back: int) -> UInt8[Array, "rows columns 3"]:
         """What the camera saw on the last advance, ``back`` cells before the robot's cell."""
-        return self._photograph(jnp.asarray(self._way[-1 - back], jnp.int32), self._steps - back)
+        return self._photograph(np.asarray(self._way[-1 - back], np.int32), self._steps - back)
 
-    def _photograph(self, cell: Int32[Array, "2"], step: int) -> UInt8[Array, "rows columns 3"]:
-        # By the number of moves, as in a batch: a panorama depends on where it was taken, not on how many were.
-        key = jax.random.fold_in(self._key, step)
-        return photograph(self._world, cell, key, self._config.camera, self._config.disturbance)
+    def _photograph(self, cell: Int32[Array | np.ndarray, "2"], step: int) -> UInt8[Array, "rows columns 3"]:
+        config = self._config
+        return _photograph_after(self._world, cell, self._key, np.int32(step), config.camera, config.disturbance)
 
     def advance(self, path: KnownPath, stop: Stop) -> Leg:
         """Follow ``path`` through known space, observing at every cell, until it ends or ``stop.is_due``."""
@@ -166,7 +165,11 @@ _observe = jax.jit(observe, static_argnames=("config",))
 
 @partial(jax.jit, static_argnames=("camera", "disturbance"))
 def photograph(
-    world: World, cell: Int32[Array, "2"], key: PRNGKeyArray, camera: CameraConfig, disturbance: Disturbance
+    world: World,
+    cell: Int32[Array | np.ndarray, "2"],
+    key: PRNGKeyArray,
+    camera: CameraConfig,
+    disturbance: Disturbance,
 ) -> UInt8[Array, "rows columns 3"]:
     """What the camera sees from a cell.
 
@@ -183,6 +186,20 @@ def photograph(
     image = render(world, cell, camera)
     # The disturbance is static: a camera without one compiles no random draws.
     return image if disturbance == Disturbance() else disturb(image, key, disturbance)
+
+
+@partial(jax.jit, static_argnames=("camera", "disturbance"))
+def _photograph_after(
+    world: World,
+    cell: Int32[Array | np.ndarray, "2"],
+    key: PRNGKeyArray,
+    step: Int32[Array, ""] | np.int32,
+    camera: CameraConfig,
+    disturbance: Disturbance,
+) -> UInt8[Array, "rows columns 3"]:
+    """What the camera sees after so many moves."""
+    # By the number of moves, as in a batch: a panorama depends on where it was taken, not on how many were.
+    return photograph(world, cell, jax.random.fold_in(key, step), camera, disturbance)
 
 
 @partial(jax.jit, static_argnames=("config",))
