@@ -114,7 +114,7 @@ def _read_whole_map(folder: Path) -> None:
 
 def _read_plan(folder: Path) -> None:
     from potlp_jax.environments.campus.floor_plan_xml import read_kinds
-    from potlp_jax.environments.campus.floor_plans import rasterise
+    from potlp_jax.environments.campus.plan_floor import rasterise
 
     kinds = read_kinds(folder / "kinds.yaml")
     rasterise(read_plan(folder / "plan.xml"), kinds, 0.25)
