@@ -23,8 +23,9 @@ from potlp_jax.errors import CheckpointError, TrainingError
 from potlp_jax.learning.augmentation import Augmentation
 from potlp_jax.learning.batches import Batch, Batches, Share
 from potlp_jax.learning.checkpoints import checkpoint_steps
-from potlp_jax.learning.dataset import Samples, encode, joined
+from potlp_jax.learning.dataset import Samples, encode
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
+from potlp_jax.learning.dataset_reading import joined
 from potlp_jax.learning.devices import divide_processor, everywhere, is_first, join_processes, mesh, shared_out
 from potlp_jax.learning.estimator import read_estimator
 from potlp_jax.learning.loss import DataScale, evaluation_of, loss_sums, total_loss

@@ -224,7 +224,8 @@ def _dataset_trees(folder: Path) -> list[Tree]:
 
 
 def _read_dataset(folder: Path) -> Any:
-    from potlp_jax.learning.dataset import decode, read_dataset
+    from potlp_jax.learning.dataset import decode
+    from potlp_jax.learning.dataset_reading import read_dataset
 
     samples = read_dataset(folder)
     for image in samples.images:

@@ -65,7 +65,7 @@ def evaluate_estimator(
     if importlib.util.find_spec("pyarrow") is None:
         fail("data sets are Parquet files, and pyarrow is not installed: pip install 'potlp-jax[train]'", FAILED)
     from potlp_jax.codec import finite_or_null
-    from potlp_jax.learning.dataset import read_dataset
+    from potlp_jax.learning.dataset_reading import read_dataset
     from potlp_jax.learning.learners import learner_of
     from potlp_jax.learning.metrics import INTACT, answerable, check_fit, evaluate, prior_of
     from potlp_jax.learning.serialization import load_estimator
