@@ -21,10 +21,12 @@ from typing import Any
 from eval.savings import compare_first, figures, policy_row, read_rows, sweep
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
-from potlp_jax.learning.dataset import Samples, read_dataset
+from potlp_jax.learning.dataset import Samples
+from potlp_jax.learning.dataset_reading import read_dataset
 from potlp_jax.learning.estimator import TrainedEstimator, named_estimator
 from potlp_jax.learning.learners import learner_of
-from potlp_jax.learning.metrics import answerable, evaluate, predict, prior_of
+from potlp_jax.learning.metrics import evaluate, prior_of
+from potlp_jax.learning.predictions import answerable, predict
 from potlp_jax.planning.policies import Policy
 from potlp_jax.recipes.fitting import ESTIMATOR
 from potlp_jax.recipes.recipe import TIMES

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from potlp_jax.learning.dataset import read_dataset
+from potlp_jax.learning.dataset_reading import read_dataset
 from potlp_jax.learning.learners import learner_of
-from potlp_jax.learning.metrics import answerable, predict
+from potlp_jax.learning.predictions import answerable, predict
 from potlp_jax.learning.serialization import load_estimator
 
 EDGES = (0, 10, 16, 25, 40, 80, 200)

@@ -16,7 +16,8 @@ from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.loss import DataScale
 from potlp_jax.learning.map_images import encode_view, encode_world
 from potlp_jax.learning.painting import blank_painting, paint
-from potlp_jax.learning.training import TrainingConfig, initial_state, make_train_step
+from potlp_jax.learning.training_options import TrainingConfig
+from potlp_jax.learning.training_steps import initial_state, make_train_step
 from potlp_jax.task.task import Task
 from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals

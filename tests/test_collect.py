@@ -24,7 +24,8 @@ from potlp_jax.environments.posterior import Drawn
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import DatasetError, WorldError
-from potlp_jax.learning.dataset import decode, finished_shards, read_dataset, read_metadata, samples_file, views_file
+from potlp_jax.learning.dataset import decode, finished_shards, read_metadata, samples_file, views_file
+from potlp_jax.learning.dataset_reading import read_dataset
 from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.recording import survey
 from potlp_jax.recipes.collection import CollectConfig, collect, summary

@@ -21,8 +21,6 @@ from potlp_jax.learning.dataset import (
     decode,
     encode,
     finished_shards,
-    joined,
-    read_dataset,
     read_metadata,
     remove_unfinished_files,
     samples_file,
@@ -32,6 +30,7 @@ from potlp_jax.learning.dataset import (
     write_shard,
 )
 from potlp_jax.learning.dataset_metadata import SCHEMA_VERSION, DatasetMetadata
+from potlp_jax.learning.dataset_reading import joined, read_dataset
 from tests.reference.data_sets import SHAPE, blank_columns, world_columns
 
 ROOT = Path(__file__).parents[1]
@@ -341,7 +340,7 @@ def test_the_most_that_a_view_is_asked_is_found_in_pieces(tmp_path, monkeypatch,
 READER = """
 import resource, sys
 from potlp_jax.learning.batches import Batches
-from potlp_jax.learning.dataset import read_dataset
+from potlp_jax.learning.dataset_reading import read_dataset
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 samples = read_dataset(sys.argv[1])
 batches = Batches(samples, lambda samples, choice: [samples.images[view] for view in choice.views], 8, 2, 0)

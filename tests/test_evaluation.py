@@ -18,38 +18,28 @@ from typer.testing import CliRunner
 from potlp_jax.cli import app
 from potlp_jax.codec import config_from_dict
 from potlp_jax.errors import EvaluationError, PropositionsError
+from potlp_jax.learning.ablations import INTACT, ablated
 from potlp_jax.learning.dataset import Samples, decode, encode, view_id, write_shard
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.map_images import without_painting
 from potlp_jax.learning.metrics import (
     BINS,
     DISTANCE_BANDS,
-    INTACT,
-    Predictions,
     Prior,
-    ablated,
-    check_fit,
-    class_in_words,
     cost_bins,
     evaluate,
     figures_of,
     groups_of,
-    most_confident,
-    predict,
     prior_of,
     reliability,
     roc_auc,
 )
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.learning.panorama_learner import PanoramaLearner
+from potlp_jax.learning.predictions import Predictions, check_fit, most_confident, predict
 from potlp_jax.learning.serialization import save_estimator
-from potlp_jax.view.calibration import (
-    cost_bin_table,
-    draw_costs,
-    draw_predictions,
-    draw_reliability,
-    probability_table,
-)
+from potlp_jax.view.calibration import cost_bin_table, draw_costs, draw_reliability, probability_table
+from potlp_jax.view.predictions import class_in_words, draw_predictions
 from potlp_jax.view.style import CHOSEN, rgb
 from potlp_jax.world.camera import CameraConfig
 from tests.reference import data_sets as blank

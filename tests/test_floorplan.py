@@ -13,8 +13,9 @@ from scipy import ndimage
 
 from potlp_jax.cli.inputs import read_split
 from potlp_jax.environments.campus.floor_plan_xml import read_kinds, read_plan
-from potlp_jax.environments.campus.floor_plans import FloorPlanConfig, FloorPlans, PlanFloor, rasterise
+from potlp_jax.environments.campus.floor_plans import FloorPlanConfig, FloorPlans
 from potlp_jax.environments.campus.furnishing import NO_ROOM, PEOPLE, Kind, missing_kinds
+from potlp_jax.environments.campus.plan_floor import PlanFloor, rasterise
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, default_split, usable_splits, world_key
 from potlp_jax.errors import MapError, MapWarning, SpecificationError, TaskError, WorldError

@@ -15,7 +15,8 @@ from typer.testing import CliRunner
 from potlp_jax.cli import app
 from potlp_jax.environments.ros.places import Places, load_places
 from potlp_jax.errors import LogError, MapError, PropositionsError, RecordError
-from potlp_jax.learning.dataset import decode, encode, finished_shards, read_dataset, samples_file, views_file
+from potlp_jax.learning.dataset import decode, encode, finished_shards, samples_file, views_file
+from potlp_jax.learning.dataset_reading import read_dataset
 from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.recording import Pose, Recorder, RecordingConfig, is_answered, record_views, survey
 from potlp_jax.learning.sample_weights import WeightBounds

@@ -14,7 +14,8 @@ from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
 from potlp_jax.errors import ConfigurationError
 from potlp_jax.learning.architectures import architecture_of
-from potlp_jax.learning.dataset import read_dataset, read_metadata
+from potlp_jax.learning.dataset import read_metadata
+from potlp_jax.learning.dataset_reading import read_dataset
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import read_estimator, shipped_files
 from potlp_jax.learning.serialization import load_estimator

@@ -23,23 +23,18 @@ from potlp_jax.errors import CheckpointError, TrainingError
 from potlp_jax.learning.augmentation import Augmentation
 from potlp_jax.learning.batches import Batch, Batches, Share
 from potlp_jax.learning.checkpoints import checkpoint_steps
-from potlp_jax.learning.dataset import Samples, encode, joined
+from potlp_jax.learning.dataset import Samples, encode
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
+from potlp_jax.learning.dataset_reading import joined
 from potlp_jax.learning.devices import divide_processor, everywhere, is_first, join_processes, mesh, shared_out
 from potlp_jax.learning.estimator import read_estimator
 from potlp_jax.learning.loss import DataScale, evaluation_of, loss_sums, total_loss
 from potlp_jax.learning.network import Answers
 from potlp_jax.learning.panorama_learner import PanoramaLearner, PanoramaOptions
 from potlp_jax.learning.serialization import load_estimator, save_estimator
-from potlp_jax.learning.training import (
-    TrainingConfig,
-    batches_of,
-    initial_state,
-    learning_rate_schedule,
-    make_train_step,
-    shared_sums,
-    train,
-)
+from potlp_jax.learning.training import batches_of, train
+from potlp_jax.learning.training_options import TrainingConfig
+from potlp_jax.learning.training_steps import initial_state, learning_rate_schedule, make_train_step, shared_sums
 from potlp_jax.world.camera import CameraConfig
 from tests.reference import data_sets as blank
 from tests.reference.data_sets import blank_columns, blank_fields, world_columns

@@ -114,7 +114,7 @@ def _read_whole_map(folder: Path) -> None:
 
 def _read_plan(folder: Path) -> None:
     from potlp_jax.environments.campus.floor_plan_xml import read_kinds
-    from potlp_jax.environments.campus.floor_plans import rasterise
+    from potlp_jax.environments.campus.plan_floor import rasterise
 
     kinds = read_kinds(folder / "kinds.yaml")
     rasterise(read_plan(folder / "plan.xml"), kinds, 0.25)
@@ -224,7 +224,8 @@ def _dataset_trees(folder: Path) -> list[Tree]:
 
 
 def _read_dataset(folder: Path) -> Any:
-    from potlp_jax.learning.dataset import decode, read_dataset
+    from potlp_jax.learning.dataset import decode
+    from potlp_jax.learning.dataset_reading import read_dataset
 
     samples = read_dataset(folder)
     for image in samples.images:

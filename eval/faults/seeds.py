@@ -225,7 +225,8 @@ def make_checkpoint(folder: Path) -> None:
 
 def make_dataset(folder: Path) -> None:
     """A dataset of two shards."""
-    from potlp_jax.learning.dataset import DatasetMetadata, encode, view_id, write_shard
+    from potlp_jax.learning.dataset import encode, view_id, write_shard
+    from potlp_jax.learning.dataset_metadata import DatasetMetadata
     from potlp_jax.learning.map_images import encode_view, encode_world
     from potlp_jax.learning.painting import blank_painting
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from eval.floor_statistics.walls import Sides, gazebo_sides, traffic_editor_sides
 from potlp_jax.environments.campus.floor_generator import FloorGenerator
 from potlp_jax.environments.campus.floor_plan_xml import read_kinds, read_plan
-from potlp_jax.environments.campus.floor_plans import rasterise
 from potlp_jax.environments.campus.furnishing import Floor
+from potlp_jax.environments.campus.plan_floor import rasterise
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 

@@ -70,7 +70,7 @@ def collect(
     from potlp_jax.codec import settings_from_words, with_settings
     from potlp_jax.engine.opening import open_engine
     from potlp_jax.environments.registry import make
-    from potlp_jax.learning.dataset import read_dataset
+    from potlp_jax.learning.dataset_reading import read_dataset
     from potlp_jax.recipes import collection
 
     chosen = _chosen(environment, recipe)

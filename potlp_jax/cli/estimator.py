@@ -20,8 +20,9 @@ from potlp_jax.cli.output import FAILED, console, fail, file_console, make_folde
 if TYPE_CHECKING:
     from potlp_jax.learning.dataset import Samples
     from potlp_jax.learning.learner import Learner
-    from potlp_jax.learning.metrics import Predictions, Prior, Report
+    from potlp_jax.learning.metrics import Prior, Report
     from potlp_jax.learning.network import Params
+    from potlp_jax.learning.predictions import Predictions
 
 logger = logging.getLogger(__name__)
 
@@ -65,9 +66,11 @@ def evaluate_estimator(
     if importlib.util.find_spec("pyarrow") is None:
         fail("data sets are Parquet files, and pyarrow is not installed: pip install 'potlp-jax[train]'", FAILED)
     from potlp_jax.codec import finite_or_null
-    from potlp_jax.learning.dataset import read_dataset
+    from potlp_jax.learning.ablations import INTACT
+    from potlp_jax.learning.dataset_reading import read_dataset
     from potlp_jax.learning.learners import learner_of
-    from potlp_jax.learning.metrics import INTACT, answerable, check_fit, evaluate, prior_of
+    from potlp_jax.learning.metrics import evaluate, prior_of
+    from potlp_jax.learning.predictions import answerable, check_fit
     from potlp_jax.learning.serialization import load_estimator
     from potlp_jax.sweep.rows import provenance
 
@@ -113,7 +116,7 @@ def evaluate_estimator(
 
 
 def _read_variants(ablate: str) -> tuple[str, ...]:
-    from potlp_jax.learning.metrics import ABLATIONS, INTACT
+    from potlp_jax.learning.ablations import ABLATIONS, INTACT
 
     chosen = {"none": (), "all": ABLATIONS, **{name: (name,) for name in ABLATIONS}}
     if ablate not in chosen:
@@ -145,7 +148,8 @@ def _trained_on(metadata: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 def _predict(
     learner: "Learner", params: "Params", samples: "Samples", variants: tuple[str, ...]
 ) -> "dict[str, Predictions]":
-    from potlp_jax.learning.metrics import ablated, predict
+    from potlp_jax.learning.ablations import ablated
+    from potlp_jax.learning.predictions import predict
 
     predictions = {}
     with progress_bar() as progress:
@@ -184,8 +188,10 @@ def _print_reports(out: Console, heading: str, reports: "Mapping[str, Report]", 
 def _write(
     folder: Path, heading: str, *, reports: "Mapping[str, Report]", samples: "Samples", predictions: "Predictions"
 ) -> None:
-    from potlp_jax.learning.metrics import INTACT, most_confident
-    from potlp_jax.view.calibration import draw_costs, draw_predictions, draw_reliability
+    from potlp_jax.learning.ablations import INTACT
+    from potlp_jax.learning.predictions import most_confident
+    from potlp_jax.view.calibration import draw_costs, draw_reliability
+    from potlp_jax.view.predictions import draw_predictions
     from potlp_jax.view.style import save_figure
 
     with (folder / "table.txt").open("w", encoding="utf-8") as file:

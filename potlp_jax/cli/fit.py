@@ -78,7 +78,7 @@ def fit(
     import jax
 
     from potlp_jax.codec import settings_from_words, with_settings
-    from potlp_jax.learning.dataset import joined, read_dataset
+    from potlp_jax.learning.dataset_reading import joined, read_dataset
     from potlp_jax.learning.devices import divide_processor, is_first, join_processes
     from potlp_jax.recipes import fitting
     from potlp_jax.recipes.recipe import follow, read_recipe

@@ -154,7 +154,7 @@ def logs_to_dataset(
     if importlib.util.find_spec("pyarrow") is None:
         fail("datasets are Parquet files, and pyarrow is not installed: pip install 'potlp-jax[train]'", FAILED)
     from potlp_jax.environments.ros.places import load_places
-    from potlp_jax.learning.dataset import read_dataset
+    from potlp_jax.learning.dataset_reading import read_dataset
     from potlp_jax.learning.questions import HELD_OUT
     from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
     from potlp_jax.logs.working_grid import GridConfig

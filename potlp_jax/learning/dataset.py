@@ -1,19 +1,16 @@
-"""Records for training the estimator, on disk: Parquet shards, made by simulation or from a robot's log.
+"""What a dataset is, on disk and in memory: records for training the estimator, by simulation or from a robot's log.
 
 A dataset is a folder. Shard ``S`` is three files: ``worlds-SSSSS.parquet`` (one row a true map),
 ``views-SSSSS.parquet`` (one row a panorama, with what was known and painted on the map when it was taken) and
 ``samples-SSSSS.parquet`` (one row a (view, subgoal, outcome class)). Each is written under a temporary name and
 renamed, the samples last: a shard exists when its samples file does. Every file carries the dataset's metadata as JSON
-in its schema, under the key ``potlp``. ``docs/dataset.md`` describes the columns.
+in its schema, under the key ``potlp``. ``docs/dataset.md`` describes the columns, ``dataset_reading`` reads them.
 """
 
-import contextlib
-import dataclasses
 import functools
 import itertools
-import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,29 +18,20 @@ from typing import Any
 import cv2
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
-from jaxtyping import Bool, Float32, Int8, Int32, Int64, UInt8
+from jaxtyping import Bool, Float32, Int8, Int32, UInt8
 
 from potlp_jax.errors import DatasetError
-from potlp_jax.files import reading, require_file
+from potlp_jax.files import reading
 from potlp_jax.images import decode_image
 from potlp_jax.learning.dataset_metadata import DatasetMetadata, DataSource, data_source
 from potlp_jax.learning.map_images import MAP_COLUMNS, EncodedView, EncodedWorld
-from potlp_jax.learning.on_disk import Chained, ColumnFile, Entries, ImageFile, OnDisk
+from potlp_jax.learning.on_disk import Entries
+from potlp_jax.learning.shard_files import TEMPORARY, metadata_of, write_table
 
 JPEG_QUALITY: int = 92
 
-_METADATA_KEY = b"potlp"
-
-_TEMPORARY = ".tmp"
-
-# Rows of a file, and bytes, that are read at once.
-_ROWS = 64
-_BUFFER = 1 << 20
 # Samples that are looked at together.
 _SAMPLES = 1 << 18
-
-_REMEDY = "delete all files of the shard and collect or convert it again"
 
 # docs/dataset.md says what the columns mean; who changes them changes dataset_metadata.SCHEMA_VERSION.
 WORLDS_SCHEMA = pa.schema(
@@ -249,14 +237,14 @@ def write_shard(
     """
     Path(folder).mkdir(parents=True, exist_ok=True)
     # The samples last: a shard exists when its samples file does.
-    _write_table(worlds_file(folder, number), worlds, WORLDS_SCHEMA, metadata)
-    _write_table(views_file(folder, number), views, VIEWS_SCHEMA, metadata)
-    _write_table(samples_file(folder, number), samples, SAMPLES_SCHEMA, metadata)
+    write_table(worlds_file(folder, number), worlds, WORLDS_SCHEMA, metadata)
+    write_table(views_file(folder, number), views, VIEWS_SCHEMA, metadata)
+    write_table(samples_file(folder, number), samples, SAMPLES_SCHEMA, metadata)
 
 
 def remove_unfinished_files(folder: Path | str) -> None:
     """Remove what processes that were killed had begun to write; nobody may be writing to the folder."""
-    for path in Path(folder).glob(f"*.parquet.*{_TEMPORARY}"):
+    for path in Path(folder).glob(f"*.parquet.*{TEMPORARY}"):
         path.unlink()
 
 
@@ -271,234 +259,9 @@ def read_metadata(folder: Path | str) -> DatasetMetadata:
         raise DatasetError(f"there is no dataset in {folder}: no finished shard (samples-*.parquet)")
     # Every file carries the metadata: shards of two collections in one folder are found out.
     paths = [path(folder, shard) for shard in shards for path in (worlds_file, views_file, samples_file)]
-    first = _metadata_of(paths[0], _schema_of(paths[0]))
+    first = metadata_of(paths[0])
     for path in paths[1:]:
-        found = first.differences(_metadata_of(path, _schema_of(path)))
+        found = first.differences(metadata_of(path))
         if found:
             raise DatasetError(f"{path.name} is from another dataset than {paths[0].name}: {'; '.join(found)}")
     return first
-
-
-def read_dataset(folder: Path | str) -> Samples:
-    """All finished shards of a dataset, in the order of their numbers.
-
-    Raises:
-        DatasetError: no shards, a file that is truncated or has other columns, another schema version, shards with
-            different metadata, samples without a view, values out of range, or no space for the images in the
-            temporary folder.
-    """
-    metadata = read_metadata(folder)
-    # Images and maps are most of a dataset: 25 KB a view, 1.3 GB for 51,000 views.
-    kept = ImageFile()
-    # One shard at a time: its columns are on disk before the next one is read.
-    return _one_after_another(_read_shard(folder, shard, metadata, kept) for shard in sorted(finished_shards(folder)))
-
-
-def joined(parts: Sequence[Samples]) -> Samples:
-    """Several data sets as one, in this order; the metadata are the first one's, with arrays as large as any has.
-
-    Raises:
-        DatasetError: what decides the meaning of a row differs: propositions, family, camera, unit or resolution.
-    """
-    first = parts[0].metadata
-    for part in parts[1:]:
-        for name in ("propositions", "family", "camera", "unit", "resolution"):
-            mine, other = getattr(first, name), getattr(part.metadata, name)
-            if mine != other:
-                raise DatasetError(f"data sets that differ in {name} cannot be joined: {mine} and {other}")
-    sources = tuple(source for part in parts for source in part.sources)
-    rows, columns = (max(sides) for sides in zip(*(part.metadata.shape for part in parts), strict=True))
-    metadata = dataclasses.replace(first, shape=(rows, columns))
-    return dataclasses.replace(_one_after_another(parts), metadata=metadata, joined_from=sources)
-
-
-def _one_after_another(parts: Iterable[Samples]) -> Samples:
-    """Several as one; at least one."""
-    columns: dict[str, ColumnFile] = {}
-    images, maps, worlds, metadata = [], [], [], []
-    for part in parts:
-        shifts = {"view_of": sum(map(len, images)), "world_of": sum(map(len, worlds))}
-        for field in dataclasses.fields(Samples):
-            column = getattr(part, field.name)
-            if isinstance(column, np.ndarray):
-                shift = shifts.get(field.name)
-                shifted = column if shift is None else column + np.int32(shift)
-                columns.setdefault(field.name, ColumnFile()).append(shifted)
-        images.append(part.images)
-        maps.append(part.maps)
-        worlds.append(part.worlds)
-        metadata.append(part.metadata)
-    mapped: dict[str, Any] = {name: column.mapped() for name, column in columns.items()}
-    return Samples(images=Chained(images), maps=Chained(maps), worlds=Chained(worlds), metadata=metadata[0], **mapped)
-
-
-def _read_shard(folder: Path | str, shard: int, metadata: DatasetMetadata, kept: ImageFile) -> Samples:
-    """A shard whose images, maps and worlds are kept in a file."""
-    paths = worlds_file(folder, shard), views_file(folder, shard), samples_file(folder, shard)
-    worlds, of_worlds = _read_worlds(paths[0], kept)
-    views, world_of_views, images, maps = _read_views(paths[1], kept)
-    columns = _sample_columns(_read_table(paths[2], SAMPLES_SCHEMA), len(metadata.propositions), paths[2])
-    view_of = _index_of(columns.pop("view"), views, "view", paths[2])
-    world_of = _index_of(world_of_views, worlds, "world", paths[1])
-    return Samples(
-        images=images, maps=maps, worlds=of_worlds, world_of=world_of, view_of=view_of, metadata=metadata, **columns
-    )
-
-
-def _read_worlds(path: Path, kept: ImageFile) -> tuple[Int64[np.ndarray, " worlds"], OnDisk[EncodedWorld]]:
-    """Numbers of a shard's worlds, and their maps on disk."""
-    numbers, bounds = [np.zeros(0, np.int64)], [np.zeros((0, 4), np.int64)]
-    for rows in _pieces(path, WORLDS_SCHEMA, WORLDS_SCHEMA.names):
-        numbers.append(rows["world"].to_numpy())
-        sizes = np.stack([rows["rows"].to_numpy(), rows["columns"].to_numpy()], axis=-1)
-        maps = (rows[name].to_pylist() for name in ("cells", "letters"))
-        bounds.append(kept.write(zip(map(np.ndarray.tobytes, sizes), *maps, strict=True)))
-    return np.concatenate(numbers), OnDisk(kept, _world, np.concatenate(bounds))
-
-
-def _world(size: bytes, cells: bytes, letters: bytes) -> EncodedWorld:
-    rows, columns = np.frombuffer(size, np.int32).tolist()
-    return EncodedWorld(rows, columns, cells, letters)
-
-
-def _read_views(
-    path: Path, kept: ImageFile
-) -> tuple[Int64[np.ndarray, " views"], Int64[np.ndarray, " views"], OnDisk[bytes], OnDisk[EncodedView]]:
-    """Numbers of a shard's views and of their worlds; their images and maps on disk."""
-    names = ("view", "world", "image", *MAP_COLUMNS)
-    views, worlds = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    images, maps = [np.zeros((0, 2), np.int64)], [np.zeros((0, 1 + len(MAP_COLUMNS)), np.int64)]
-    for rows in _pieces(path, VIEWS_SCHEMA, names):
-        views.append(rows["view"].to_numpy())
-        worlds.append(rows["world"].to_numpy())
-        images.append(kept.write((image,) for image in rows["image"].to_pylist()))
-        maps.append(kept.write(zip(*(rows[name].to_pylist() for name in MAP_COLUMNS), strict=True)))
-    return (
-        np.concatenate(views),
-        np.concatenate(worlds),
-        OnDisk(kept, bytes, np.concatenate(images)),
-        OnDisk(kept, EncodedView, np.concatenate(maps)),
-    )
-
-
-def _write_table(path: Path, columns: Mapping[str, Any], schema: pa.Schema, metadata: DatasetMetadata) -> None:
-    table = pa.Table.from_pydict(dict(columns), schema.with_metadata({_METADATA_KEY: metadata.to_json().encode()}))
-    # With the process's number: two that write the same shard by mistake do not write into one file.
-    temporary = path.with_name(f"{path.name}.{os.getpid()}{_TEMPORARY}")
-    with temporary.open("wb") as file:
-        # With checksums of the pages, so that a flipped bit is found when they are read.
-        pq.write_table(table, file, compression="zstd", write_page_checksum=True)
-        file.flush()
-        # Before the rename: otherwise a power cut could leave the name without the contents.
-        os.fsync(file.fileno())
-    temporary.replace(path)
-
-
-def _broken(path: Path, why: str) -> DatasetError:
-    return DatasetError(f"{path} {why}: {_REMEDY}")
-
-
-def _schema_of(path: Path) -> pa.Schema:
-    if not path.exists():
-        raise _broken(path, "is missing")
-    require_file(path, DatasetError)
-    with _reading(path):
-        return pq.read_schema(path)
-
-
-@contextlib.contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """As ``files.reading``, with what to do about a shard that is damaged."""
-    try:
-        with reading(path, DatasetError, "a shard of a dataset"):
-            yield
-    except DatasetError as error:
-        raise DatasetError(f"{error}: {_REMEDY}") from error
-
-
-def _metadata_of(path: Path, schema: pa.Schema) -> DatasetMetadata:
-    text = (schema.metadata or {}).get(_METADATA_KEY)
-    if text is None:
-        raise DatasetError(f"{path} has no metadata of a dataset in its schema (key '{_METADATA_KEY.decode()}')")
-    try:
-        return DatasetMetadata.from_json(text.decode("utf-8", "replace"))
-    except DatasetError as error:
-        raise DatasetError(f"{path}: {error}") from error
-
-
-def _pieces(path: Path, schema: pa.Schema, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
-    """The rows of a file, some at a time, each checked; other columns than the schema's are left out."""
-    found = _schema_of(path)
-    wrong = [field.name for field in schema if field.name not in found.names or found.field(field.name) != field]
-    # More columns than the schema's are no harm: data from elsewhere may keep what they need.
-    if wrong:
-        raise _broken(path, f"has other columns than the schema: {', '.join(wrong)}")
-    # Through a buffer, and not a file's column as a whole: a shard may be larger than memory.
-    options: dict[str, Any] = {"buffer_size": _BUFFER, "pre_buffer": False, "page_checksum_verification": True}
-    with _reading(path), pq.ParquetFile(path, **options) as file:
-        for rows in file.iter_batches(_ROWS, columns=list(columns), use_threads=False):
-            # Offsets that point beyond their values would be followed later.
-            rows.validate(full=True)
-            if any(column.null_count for column in rows.columns):
-                raise _broken(path, "has missing values")
-            if len(rows):
-                yield rows
-
-
-def _read_table(path: Path, schema: pa.Schema) -> pa.Table:
-    return pa.Table.from_batches(_pieces(path, schema, schema.names), schema)
-
-
-def _sample_columns(table: pa.Table, propositions: int, path: Path) -> dict[str, Any]:
-    """Columns of ``Samples`` by name, and ``view``."""
-    numbers = {
-        "view": "view",
-        "in_view": "in_view",
-        "bearing": "bearing",
-        "distance": "distance",
-        "success": "success_probability",
-        "success_cost": "success_cost",
-        "failure_cost": "failure_cost",
-        "success_weight": "success_weight",
-        "failure_weight": "failure_weight",
-    }
-    columns = {name: table[column].to_numpy() for name, column in numbers.items()}
-    columns["cells"] = np.stack([table["row"].to_numpy(), table["column"].to_numpy()], axis=-1)
-    for name in ("phi_stay", "phi_go"):
-        # All lists of a column are one array with offsets; equal steps between them mean equal lengths.
-        lists = table[name].combine_chunks()
-        if np.any(np.diff(np.asarray(lists.offsets)) != propositions):
-            raise _broken(path, f"has {name} whose length is not the number of propositions, {propositions}")
-        columns[name] = lists.flatten().to_numpy().reshape(-1, propositions)
-    _check_values(columns, path)
-    return columns
-
-
-def _check_values(columns: Mapping[str, np.ndarray], path: Path) -> None:
-    # NaN fails every comparison, so that it is refused wherever a rule does not allow it by name.
-    success = columns["success"] > 0
-    positive = ("success_weight", "failure_weight")
-    rules = {
-        "success_probability must lie in [0, 1]": (columns["success"] >= 0) & (columns["success"] <= 1),
-        "success_cost must be a positive number where success_probability > 0": ~success
-        | (np.isfinite(columns["success_cost"]) & (columns["success_cost"] > 0)),
-        "failure_cost must be a number >= 0": np.isfinite(columns["failure_cost"]) & (columns["failure_cost"] >= 0),
-        "distance must be a number >= 0": np.isfinite(columns["distance"]) & (columns["distance"] >= 0),
-        "bearing must be a number": np.isfinite(columns["bearing"]),
-        **{f"{name} must be a positive number": np.isfinite(columns[name]) & (columns[name] > 0) for name in positive},
-    }
-    for rule, holds in rules.items():
-        if not holds.all():
-            raise DatasetError(f"{path}, row {int(np.argmin(holds))}: {rule}")
-
-
-def _index_of(wanted: np.ndarray, known: np.ndarray, what: str, path: Path) -> Int32[np.ndarray, "N"]:
-    """Position of each row's view, or world, among those of the shard."""
-    # Files from elsewhere may number them as they like.
-    position = {number: index for index, number in enumerate(known.tolist())}
-    if len(position) < len(known):
-        raise _broken(path, f"belongs to {what}s that occur twice")
-    try:
-        return np.array([position[number] for number in wanted.tolist()], np.int32)
-    except KeyError as error:
-        raise _broken(path, f"has rows of {what} {error}, which is not in the shard") from error

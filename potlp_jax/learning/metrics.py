@@ -1,6 +1,6 @@
-"""How good an estimator is on a data set: predictions, their figures, and what is left without picture or question.
+"""How good an estimator's predictions are: figures of a data set, and of parts of it.
 
-**Figures.** For samples with label y = P_S (0 or 1; real data may lie between) and prediction p:
+For samples with label y = P_S (0 or 1; real data may lie between) and prediction p:
 
 - Brier score: mean of (p - y)^2. Skill over the constant prior q: 1 - Brier / mean of (q - y)^2: 1 is perfect, 0 no
   better than saying q always. The prior is one number for all groups of samples; ``own_skill`` compares with the
@@ -12,64 +12,25 @@
   - true, R^2 = 1 - squared error / squared error of the constant mean of these very samples, and the calibration error:
   mean of |mean predicted - mean true| over ``BINS`` bins of the predicted cost with equally many samples each, as far
   as ties allow, weighted by their weight.
-
-**Ablations.** A network that does not look answers as well with its pictures blacked out; one that does not heed the
-question answers as well with the vectors phi of other samples. Groups and labels stay those of the intact samples.
 """
 
 import dataclasses
-import functools
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int8, Int64
+from jaxtyping import Bool, Float32, Float64
 
-from potlp_jax.errors import EvaluationError
-from potlp_jax.learning.architectures import EstimatorConfig
-from potlp_jax.learning.batches import Batch, Batches
-from potlp_jax.learning.dataset import Samples, decode, encode
-from potlp_jax.learning.domain import Domain
-from potlp_jax.learning.learner import Learner
-from potlp_jax.learning.map_images import without_painting
-from potlp_jax.learning.network import Answers, Params, require_propositions
+from potlp_jax.learning.dataset import Samples
+from potlp_jax.learning.predictions import Predictions, part_of
 
 # Ten is usual for reliability diagrams.
 BINS: int = 10
 
 DISTANCE_BANDS: tuple[float, ...] = (15.0, 30.0, 60.0, 120.0)
 """Bounds between the bands of distance, in sides of a cell."""
-
-INTACT = "intact"
-ABLATIONS: tuple[str, ...] = ("image", "phi")
-
-# Fixed, so that the ablation of a data set is the same for every estimator.
-SHUFFLE_SEED: int = 0
-
-# As in training by default: the answers do not depend on it, only the memory and the time.
-_VIEWS_PER_BATCH = 16
-_SAMPLES_PER_VIEW = 16
-
-
-@dataclass(frozen=True)
-class Predictions:
-    """What an estimator says of each sample of a data set, in the data set's order."""
-
-    success_logit: Float32[np.ndarray, "N"]
-    """Log odds of P_S."""
-    success_cost: Float32[np.ndarray, "N"]
-    """R_S, in the unit of cost."""
-    failure_cost: Float32[np.ndarray, "N"]
-    """R_F, in the unit of cost."""
-
-    @property
-    def success(self) -> Float64[np.ndarray, "N"]:
-        """P_S."""
-        # In float64 and without overflow on either side.
-        return np.exp(-np.logaddexp(0.0, -self.success_logit.astype(np.float64)))
 
 
 @dataclass(frozen=True)
@@ -168,36 +129,6 @@ class Report:
         return {"overall": dataclasses.asdict(self.overall), "groups": groups}
 
 
-def check_fit(config: EstimatorConfig, domain: Domain, samples: Samples, estimator: str, dataset: str) -> None:
-    """Whether the estimator's answers mean the same as the data set's labels.
-
-    Args:
-        config: the estimator's network.
-        domain: of the worlds that the estimator learned from.
-        samples: the data set.
-        estimator, dataset: their names in messages.
-
-    Raises:
-        PropositionsError: other propositions.
-        EvaluationError: another size of panorama, another camera or another unit of cost than those it learned from.
-    """
-    require_propositions(config.propositions, tuple(samples.metadata.propositions), estimator, asker=dataset)
-    if not samples.images:
-        raise EvaluationError(f"{dataset} has no panoramas")
-    size = decode(samples.images[0]).shape[:2]
-    if size != config.image_shape:
-        raise EvaluationError(
-            f"{dataset} has panoramas of {size} pixels; {estimator} was made for {config.image_shape}"
-        )
-    # The unit and the camera decide what the numbers and pictures mean; another split or family is fair to ask about.
-    misfits = domain.measure_misfits(samples.metadata.domain)
-    if misfits:
-        raise EvaluationError(
-            f"{dataset} is not what {estimator} learned from: {'; '.join(misfits)}. Collect a data set with the same, "
-            "or train an estimator for this one"
-        )
-
-
 def prior_of(metadata: Mapping[str, Any], samples: Samples) -> Prior:
     """The mean P_S of the training data if the estimator's metadata have it (``prior``), else of these samples."""
     # Metadata are anybody's JSON: a prior that is none is not worth an error, and the report says which one was used.
@@ -205,77 +136,6 @@ def prior_of(metadata: Mapping[str, Any], samples: Samples) -> Prior:
     if isinstance(stored, int | float) and 0 <= stored <= 1:
         return Prior(float(stored), "training")
     return Prior(float(np.mean(samples.success, dtype=np.float64)), "evaluated")
-
-
-def ablated(samples: Samples, ablation: str) -> Samples:
-    """The samples without what ``ablation`` takes away.
-
-    ``image``: all panoramas black, and nothing painted on the maps. ``phi``: each sample has the pair of vectors phi of
-    another one, by a permutation drawn from ``SHUFFLE_SEED``. ``intact``: the samples themselves.
-    """
-    if ablation == INTACT:
-        return samples
-    if ablation == "image":
-        # As PNG: JPEG may not give back what is exactly black.
-        black = encode(np.zeros_like(decode(samples.images[0])), "png")
-        blank = [without_painting(view) for view in samples.maps]
-        return dataclasses.replace(samples, images=[black] * len(samples.images), maps=blank)
-    if ablation == "phi":
-        # A permutation keeps how often each pair occurs: only its connection with the sample is gone.
-        order = np.random.default_rng(SHUFFLE_SEED).permutation(len(samples.view_of))
-        return dataclasses.replace(samples, phi_stay=samples.phi_stay[order], phi_go=samples.phi_go[order])
-    raise EvaluationError(f"unknown ablation {ablation!r}; choose from: {', '.join(ABLATIONS)}")
-
-
-@functools.lru_cache(8)
-def _make_answer_step(learner: Learner) -> Callable[[Params, Batch], Answers]:
-    """The compiled answers to one batch, not augmented."""
-
-    @jax.jit
-    def answer_step(params: Params, batch: Batch) -> Answers:
-        answers, _ = learner.answers(params, batch.inputs, batch.phi_stay, batch.phi_go)
-        return answers
-
-    return answer_step
-
-
-def predict(
-    learner: Learner, params: Params, samples: Samples, on_progress: Callable[[int], None] = lambda done: None
-) -> Predictions:
-    """The estimator's answers to all samples.
-
-    Args:
-        learner, params: the estimator.
-        samples: what is asked; all must be such as the estimator can answer (``answerable``).
-        on_progress: told the number of answers so far, after every batch.
-
-    Returns:
-        Answers in the order of the samples.
-
-    Raises:
-        TrainingError: there are no samples.
-    """
-    step = _make_answer_step(learner)
-    names = tuple(Answers.__dataclass_fields__)
-    rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
-    done = 0
-    batches = Batches(samples, learner.inputs, _VIEWS_PER_BATCH, _SAMPLES_PER_VIEW, seed=0)
-    for batch in batches.evaluation_batches():
-        answers, mask = step(params, batch), np.asarray(batch.mask)
-        for name in names:
-            rows[name].append(np.asarray(getattr(answers, name))[mask])
-        done += int(mask.sum())
-        on_progress(done)
-    # Batches give the samples view by view.
-    columns = {name: np.empty(len(samples.success), np.float32) for name in names}
-    for name in names:
-        columns[name][batches.order] = np.concatenate(rows[name])
-    return Predictions(**columns)
-
-
-def answerable(learner: Learner, samples: Samples) -> Samples:
-    """The samples that an estimator can answer: a panorama network those in view, a building network all."""
-    return _part(samples, learner.usable(samples))
 
 
 def evaluate(samples: Samples, predictions: Predictions, prior: Prior) -> Report:
@@ -291,7 +151,7 @@ def evaluate(samples: Samples, predictions: Predictions, prior: Prior) -> Report
     """
 
     def of(chosen: np.ndarray | slice) -> Figures:
-        return figures_of(_part(samples, chosen), _part(predictions, chosen), prior)
+        return figures_of(part_of(samples, chosen), part_of(predictions, chosen), prior)
 
     groups = {
         name: {part: of(chosen) for part, chosen in parts.items() if chosen.any()}
@@ -441,73 +301,5 @@ def cost_bins(
     return tuple(bins), np.array(weights)
 
 
-def most_confident(samples: Samples, predictions: Predictions, count: int) -> dict[str, Int64[np.ndarray, " k"]]:
-    """Up to ``count`` samples each of the most confident answers that are right or wrong, one per panorama.
-
-    Args:
-        samples: the data set.
-        predictions: in the order of the samples.
-        count: of each kind, at most.
-
-    Returns:
-        Indices by kind: ``true positives``, ``true negatives``, ``false positives``, ``false negatives``. A label
-        counts as a success from one half on.
-    """
-    happened, logit = samples.success >= 0.5, predictions.success_logit
-    kinds = {
-        "true positives": (happened & (logit >= 0), -logit),
-        "true negatives": (~happened & (logit < 0), logit),
-        "false positives": (~happened & (logit >= 0), -logit),
-        "false negatives": (happened & (logit < 0), logit),
-    }
-    chosen = {}
-    for name, (belongs, doubt) in kinds.items():
-        order = np.argsort(doubt, kind="stable")
-        order = order[belongs[order]]
-        # The first of each panorama in this order is its most confident one.
-        _, first = np.unique(samples.view_of[order], return_index=True)
-        chosen[name] = order[np.sort(first)[:count]]
-    return chosen
-
-
-def class_in_words(
-    phi_stay: Int8[np.ndarray, "P"], phi_go: Int8[np.ndarray, "P"], propositions: tuple[str, ...]
-) -> tuple[str, str]:
-    """What must hold on the way, and what at its end.
-
-    Args:
-        phi_stay, phi_go: vectors of the class, entries -1, 0, 1.
-        propositions: their names, in the vectors' order.
-
-    Returns:
-        Two texts such as ``stay: not fire`` and ``go: alarm, not exit``.
-    """
-
-    def words(phi: np.ndarray) -> str:
-        literals = list(zip(phi.tolist(), propositions, strict=True))
-        wanted, unwanted = (
-            [p for value, p in literals if value == 1],
-            [f"not {p}" for value, p in literals if value == -1],
-        )
-        return ", ".join(wanted + unwanted) or "anything"
-
-    return f"stay: {words(phi_stay)}", f"go: {words(phi_go)}"
-
-
 def _gain(error: float, reference: float) -> float:
     return 1 - error / reference if reference > 0 else float("nan")
-
-
-def _part(columns: Any, chosen: np.ndarray | slice) -> Any:
-    """Some of the samples (or predictions); images and maps are not touched."""
-    arrays = {field.name: getattr(columns, field.name) for field in dataclasses.fields(columns)}
-    # One entry a view, not a sample.
-    of_views = {"world_of"}
-    return dataclasses.replace(
-        columns,
-        **{
-            name: array[chosen]
-            for name, array in arrays.items()
-            if isinstance(array, np.ndarray) and name not in of_views
-        },
-    )

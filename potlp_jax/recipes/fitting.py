@@ -35,15 +35,8 @@ from potlp_jax.learning.loss import DataScale
 from potlp_jax.learning.network import parameter_count, require_propositions
 from potlp_jax.learning.panorama_learner import PanoramaOptions
 from potlp_jax.learning.serialization import save_estimator
-from potlp_jax.learning.training import (
-    Trained,
-    TrainingConfig,
-    TrainingOptions,
-    provenance,
-    seconds_per_step,
-    steps_per_epoch,
-    train,
-)
+from potlp_jax.learning.training import Trained, provenance, seconds_per_step, steps_per_epoch, train
+from potlp_jax.learning.training_options import TrainingConfig, TrainingOptions
 from potlp_jax.recipes.journal import Display, Journal
 
 ESTIMATOR: str = "estimator.npz"

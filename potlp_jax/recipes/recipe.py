@@ -27,7 +27,8 @@ from potlp_jax.engine.opening import open_engine
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
 from potlp_jax.errors import ConfigurationError
-from potlp_jax.learning.dataset import Samples, joined, read_dataset
+from potlp_jax.learning.dataset import Samples
+from potlp_jax.learning.dataset_reading import joined, read_dataset
 from potlp_jax.learning.training import Trained
 from potlp_jax.planning.policies import Policy
 from potlp_jax.recipes.collection import CollectConfig, Collected, collect, collection_of

@@ -1,11 +1,10 @@
-"""An estimator's figures as tables, and as pictures: reliability, costs, right and wrong predictions."""
+"""An estimator's figures as tables, and as pictures: reliability and costs."""
 
 import itertools
 import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
-import jax.numpy as jnp
 import numpy as np
 from matplotlib import patheffects
 from matplotlib.axes import Axes
@@ -14,25 +13,16 @@ from matplotlib.ticker import MaxNLocator
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from potlp_jax.learning.dataset import Samples, decode
-from potlp_jax.learning.metrics import INTACT, CostErrors, Figures, Predictions, Report, class_in_words
-from potlp_jax.view.style import CHOSEN, FAINT, INK, QUIET, RIGHT, SERIES_COLOURS, WRONG, new_figure
-from potlp_jax.world.camera import roll_to
+from potlp_jax.learning.ablations import INTACT
+from potlp_jax.learning.dataset import Samples
+from potlp_jax.learning.metrics import CostErrors, Figures, Report
+from potlp_jax.learning.predictions import Predictions
+from potlp_jax.view.style import CHOSEN, FAINT, INK, SERIES_COLOURS, new_figure
 
 VARIANTS: Mapping[str, str] = MappingProxyType({INTACT: "intact", "image": "image blacked out", "phi": "phi shuffled"})
 """What was evaluated, in words."""
 
 _PARTS = {"proposition": "asks for {}", "avoided": "propositions avoided: {}", "distance": "distance {}"}
-
-_KINDS = {
-    "true positives": "right: success predicted, and the attempt succeeds",
-    "true negatives": "right: failure predicted, and the attempt fails",
-    "false positives": "wrong: success predicted, but the attempt fails",
-    "false negatives": "wrong: failure predicted, but the attempt succeeds",
-}
-_COLUMNS = 2
-
-_QUESTION_KEY = "stay: what must hold on the way; go: what is looked for beyond the subgoal, between the arrows"
 
 
 def probability_table(report: Report, title: str) -> Table:
@@ -303,87 +293,3 @@ def _draw_cost(axes: Axes, true: np.ndarray, said: np.ndarray, share: np.ndarray
     axes.set(xlim=(0, limit), ylim=(0, limit))
     axes.set_xlabel(f"true cost [{unit}]", color=INK)
     axes.set_ylabel(f"predicted cost [{unit}]", color=INK)
-
-
-def draw_predictions(
-    samples: Samples, predictions: Predictions, chosen: Mapping[str, np.ndarray], title: str
-) -> Figure:
-    """Panoramas of the samples that ``most_confident`` chose, each rolled so that its subgoal is in the centre.
-
-    Args:
-        samples: with their images.
-        predictions: of the same samples, in the same order.
-        chosen: by kind ("true positives", ...), the indices of the samples to show, the most confident first.
-        title: stands above.
-
-    Returns:
-        One block a kind, with the question and the figures below each panorama.
-    """
-    # Inches. Panoramas of the default camera (512 by 128) keep their proportions.
-    width, picture, words, heading = 11.5, 5.5 / 4, 0.62, 0.42
-    rows = {name: max(1, math.ceil(len(members) / _COLUMNS)) for name, members in chosen.items()}
-    height = 0.68 + sum(heading + count * (picture + words) for count in rows.values())
-    figure = new_figure(width, height)
-    figure.text(0.5, 1 - 0.1 / height, title, ha="center", va="top", size=9, color=INK)
-    figure.text(0.5, 1 - 0.34 / height, _QUESTION_KEY, ha="center", va="top", size=8, color=QUIET)
-    top = height - 0.68
-    for name, members in chosen.items():
-        # True positives and true negatives: what was said came true.
-        colour = RIGHT if name.startswith("true") else WRONG
-        label = f"{_KINDS[name]} (most confident first)" if len(members) else f"{_KINDS[name]}: none"
-        figure.text(0.2 / width, (top - 0.2) / height, label, va="center", size=11, weight="bold", color=colour)
-        top -= heading
-        for number, index in enumerate(members.tolist()):
-            row, column = divmod(number, _COLUMNS)
-            left, bottom = 0.2 + 5.6 * column, top - row * (picture + words) - picture
-            box = (left / width, bottom / height, 5.5 / width, picture / height)
-            _draw_prediction(figure, box, samples, predictions, index)
-            text = describe_prediction(samples, predictions, index)
-            figure.text(box[0], box[1] - 0.04 / height, text, va="top", size=7.5, color=INK, linespacing=1.15)
-        top -= rows[name] * (picture + words)
-    return figure
-
-
-def _draw_prediction(
-    figure: Figure,
-    box: tuple[float, float, float, float],
-    samples: Samples,
-    predictions: Predictions,
-    index: int,
-) -> None:
-    axes = figure.add_axes(box)
-    image = jnp.asarray(decode(samples.images[int(samples.view_of[index])]))
-    # The network sees panoramas rolled in the same manner (docs/estimator.md).
-    rolled = np.asarray(roll_to(image, jnp.float32(samples.bearing[index])))
-    axes.imshow(rolled, aspect="auto", interpolation="nearest")
-    rows, columns = rolled.shape[:2]
-    centre = columns / 2 - 0.5
-    style = {"color": CHOSEN, "markersize": 7, "markeredgecolor": "white", "markeredgewidth": 0.8, "clip_on": False}
-    axes.plot([centre, centre], [0, rows - 1], color=CHOSEN, linewidth=0.6, alpha=0.55)
-    axes.plot(centre, rows * 0.035, marker="v", **style)
-    axes.plot(centre, rows * 0.955, marker="^", **style)
-    axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xticks=[], yticks=[])
-
-
-def describe_prediction(samples: Samples, predictions: Predictions, index: int) -> str:
-    """Three lines: what must hold on the way, what is looked for, and the numbers, with the true ones that count.
-
-    Args:
-        samples: the questions and true answers.
-        predictions: of the same samples, in the same order.
-        index: which sample.
-
-    Returns:
-        The lines, joined. A true cost is given only where it was paid: R_S after success, R_F after failure.
-    """
-    stay, go = class_in_words(samples.phi_stay[index], samples.phi_go[index], samples.metadata.propositions)
-    true = float(samples.success[index])
-    numbers = [f"P_S {predictions.success[index]:.3f} (true {true:g})"]
-    costs = (
-        ("R_S", predictions.success_cost[index], samples.success_cost[index], true > 0),
-        ("R_F", predictions.failure_cost[index], samples.failure_cost[index], true < 1),
-    )
-    # Costs are shown without digits: their errors are tens.
-    numbers += [f"{name} {said:.0f}" + (f" (true {cost:.0f})" if counts else "") for name, said, cost, counts in costs]
-    numbers.append(f"distance {samples.distance[index]:.0f} {samples.metadata.unit}")
-    return "\n".join((stay, go, "    ".join(numbers)))

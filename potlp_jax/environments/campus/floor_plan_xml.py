@@ -9,7 +9,7 @@
         portals > portal                           linesegment: the id of a door; target > id, id: the rooms it joins
 
 What the files leave open or get wrong, and what is done about it, is told in
-``potlp_jax.environments.campus.floor_plans``.
+``potlp_jax.environments.campus.plan_floor``.
 """
 
 import math

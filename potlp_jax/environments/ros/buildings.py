@@ -4,14 +4,14 @@
 ``FILE.yaml`` with an image             `environments.ros.map_files`: ROS ``map_server``
 ``FILE.yaml`` with levels               `environments.ros.rmf`: a level of Open-RMF's ``building.yaml``
 ``FILE.world``, ``FILE.sdf``            `environments.ros.gazebo`: boxes of a Gazebo world
-``FILE.xml``                            `environments.campus.floor_plans`: plans with rooms and doors
+``FILE.xml``                            `environments.campus.plan_floor`: plans with rooms and doors
 ======================================  ================================================================
 """
 
 from pathlib import Path
 
 from potlp_jax.environments.campus.floor_plan_xml import read_kinds, read_plan
-from potlp_jax.environments.campus.floor_plans import MOST_CELLS, rasterise
+from potlp_jax.environments.campus.plan_floor import MOST_CELLS, rasterise
 from potlp_jax.environments.ros.drawn_maps import MARGIN, drawn_map
 from potlp_jax.environments.ros.gazebo import read_world
 from potlp_jax.environments.ros.map_files import OccupancyMap, load_map, read_yaml

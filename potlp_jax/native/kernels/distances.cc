@@ -298,7 +298,9 @@ void ByPortals(const Moves& moves, const Product& product, const Letters& letter
           arrived = std::min(arrived, best[in * active + from] + from_active[from * ends + end]);
         }
         const int32_t next = entering(end, in);
-        if (next >= 0 && next < states) travel[target * states + next] = std::min(travel[target * states + next], arrived);
+        if (next >= 0 && next < states) {
+          travel[target * states + next] = std::min(travel[target * states + next], arrived);
+        }
       }
       // Arrivals are costs of entering, and a source that is its own target need not leave and come back.
       if (table.targets[target] == sources.cell[source]) travel[target * states + state] = 0;

@@ -272,7 +272,9 @@ class Search {
     for (int e = 0; e < E; ++e) edges += in_.edge_mask[e];
     const bool few = subgoals * edges + 1 <= settings_.few_actions;
     // Negative where the configuration names none.
-    optimism_ = settings_.optimism >= 0 ? settings_.optimism : few ? settings_.optimism_of_few : settings_.default_optimism;
+    optimism_ = settings_.optimism >= 0 ? settings_.optimism
+                : few                   ? settings_.optimism_of_few
+                                        : settings_.default_optimism;
     relate_states(subgoals > 0);
     list_conditions();
     list_actions();
@@ -682,8 +684,8 @@ class Search {
     }
   }
 
-  // guess._follow_chain: the action of least cost per chance, as long as all fail; `nested` of its successes in a row are
-  // valued by what has failed before.
+  // guess._follow_chain: the action of least cost per chance, as long as all fail; `nested` of its successes in a row
+  // are valued by what has failed before.
   void follow(Chain& chain, const Candidates& list, int product_state, float pending_cost, int nested) {
     StateActions& own = *list.actions;
     const int width = own.width, most = settings_.guess_failures;
@@ -1036,7 +1038,8 @@ class Search {
     history_.pending_cost = pending_cost;
     history_.holds.assign(holds_.begin() + int64_t{node} * S, holds_.begin() + (int64_t{node} + 1) * S);
     history_.fails.assign(fails_.begin() + int64_t{node} * S, fails_.begin() + (int64_t{node} + 1) * S);
-    history_.visited.assign(visited_.begin() + int64_t{node} * (S + 1), visited_.begin() + (int64_t{node} + 1) * (S + 1));
+    history_.visited.assign(visited_.begin() + int64_t{node} * (S + 1),
+                            visited_.begin() + (int64_t{node} + 1) * (S + 1));
   }
 
   // graph._key of `history_`.

@@ -74,8 +74,8 @@ class Sight {
   std::vector<uint8_t> occupied_, seen_;
 };
 
-ffi::Error Visible(ffi::Buffer<ffi::PRED> occupied, ffi::Buffer<ffi::S32> cell, double range, int64_t half, int64_t steps,
-                   ffi::ResultBuffer<ffi::PRED> out) {
+ffi::Error Visible(ffi::Buffer<ffi::PRED> occupied, ffi::Buffer<ffi::S32> cell, double range, int64_t half,
+                   int64_t steps, ffi::ResultBuffer<ffi::PRED> out) {
   const int64_t height = occupied.dimensions()[0], width = occupied.dimensions()[1];
   const int64_t row = cell.typed_data()[0], column = cell.typed_data()[1];
   bool* result = out->typed_data();

@@ -145,7 +145,10 @@ template <int kLanes>
 void Solve(Squares<kLanes> squares, float gain, const std::array<std::pair<const float*, int64_t>, 2>& costs) {
   std::array<std::vector<float>, 2> before;
   for (bool gained = true; gained;) {
-    for (size_t kind = 0; kind < 2; ++kind) before[kind].assign(costs[kind].first, costs[kind].first + costs[kind].second);
+    for (size_t kind = 0; kind < 2; ++kind) {
+      const auto& [values, count] = costs[kind];
+      before[kind].assign(values, values + count);
+    }
     squares.sweep();
     gained = false;
     for (size_t kind = 0; kind < 2; ++kind) {
