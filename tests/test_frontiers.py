@@ -297,7 +297,7 @@ def test_one_trace_for_all_maps():
         traced(belief_of(cells), jnp.ones((9, 9), bool), jnp.zeros((9, 9)), FrontierConfig())
 
 
-@pytest.mark.parametrize("config", [{"max_subgoals": 0}, {"min_size": 0}])
+@pytest.mark.parametrize("config", [{"max_subgoals": 0}, {"min_size": 0}, {"most_subgoals": 0}])
 def test_bad_configurations_are_refused(config):
     with pytest.raises(ValueError, match="at least 1"):
         FrontierConfig(**config)

@@ -264,7 +264,7 @@ def test_a_small_budget_ends_the_trial():
 
 def test_more_subgoals_than_the_array_holds_are_flagged_and_lose_nothing():
     config = dataclasses.replace(
-        CONFIG, decision=dataclasses.replace(CONFIG.decision, frontiers=FrontierConfig(max_subgoals=1))
+        CONFIG, decision=dataclasses.replace(CONFIG.decision, frontiers=FrontierConfig(max_subgoals=1, most_subgoals=1))
     )
     flagged = 0
     for number in range(3):

@@ -61,6 +61,11 @@ class DecisionConfig:
         """Moves in the path of one decision on a map of this size."""
         return self.path_horizon if self.path_horizon is not None else 4 * (height + width)
 
+    def grown(self) -> "DecisionConfig | None":
+        """With the next longer array of subgoals, None where it is as long as it may become."""
+        frontiers = self.frontiers.grown()
+        return None if frontiers is None else dataclasses.replace(self, frontiers=frontiers)
+
 
 @struct.dataclass(kw_only=True)
 class Situation:

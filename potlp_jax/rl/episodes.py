@@ -123,7 +123,8 @@ class TaskEnv:
     Attributes:
         worlds: stacked along a leading axis; an episode draws one.
         task: what is to be done.
-        config: settings of the trial; what concerns policies and cameras has no effect.
+        config: settings of the trial; what concerns policies and cameras has no effect. The array of subgoals does not
+            grow: of more frontiers than ``max_subgoals`` the nearest are actions.
         num_actions: S * E + 2.
     """
 

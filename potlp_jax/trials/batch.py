@@ -4,6 +4,9 @@ A slot holds one running trial. Whenever a trial ends, its slot is given the nex
 there is work; whatever their tasks and starts, trials of one policy, configuration and array shape share one
 compilation. A trial takes the decisions of ``loop.run_trial`` with the same arguments; what it leaves behind is its
 outcome and path, from which the rest can be made again. The step itself is in ``slots``.
+
+A trial that meets more frontiers than its array of subgoals holds leaves its slot. Once there are as many of these as
+slots, or no others, they go on from where they are in slots with longer arrays: one compilation more for each length.
 """
 
 import dataclasses
@@ -30,7 +33,7 @@ from potlp_jax.task.task import TaskArrays
 from potlp_jax.trials import rules
 from potlp_jax.trials.config import TrialConfig, config_in
 from potlp_jax.trials.record import Outcome
-from potlp_jax.trials.slots import EMPTY, Asked, Progress, Scene, Setup, begin, step
+from potlp_jax.trials.slots import EMPTY, OUTGROWN, Asked, Progress, Scene, Setup, begin, step
 from potlp_jax.world.grid import World
 from potlp_jax.world.moves import length_of
 
@@ -122,41 +125,93 @@ def run_batch(
     config = rules.config_of(policy, config_in(first.world, config))
     here = Domain.of_world(first.world, config.camera)
     asked = rules.estimator_of(policy, first.arrays.propositions, here, estimator)
-    yield from _run(first, starts, Setup(policy=policy, config=config), slots, asked)
+    shared = asked.start(*first.world.shape, config.panoramas) if isinstance(asked, TrainedEstimator) else asked
+
+    def checked(start: Start) -> Start:
+        _check_start(start, first)
+        return start
+
+    trials = map(checked, chain([first], starts))
+    yield from _run(trials, first, Setup(policy=policy, config=config), slots, shared)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Outgrown:
+    """A trial that waits for a longer array of subgoals.
+
+    Attributes:
+        start: its start.
+        content: of the slot that it has left, to be run again.
+        seconds: its share of the time so far.
+    """
+
+    start: Start
+    content: tuple[Scene, Progress]
+    seconds: float
 
 
 def _run(
-    first: Start, others: Iterator[Start], setup: Setup, count: int, asked: TrainedEstimator | Estimator | None
+    trials: Iterator[Start | _Outgrown], first: Start, setup: Setup, count: int, shared: Asked
 ) -> Iterator[Finished]:
-    starts = chain([first], others)
-    shared = asked.start(*first.world.shape, setup.config.panoramas) if isinstance(asked, TrainedEstimator) else asked
+    """Run trials in ``count`` slots, those that outgrow them in further slots of their own.
+
+    Args:
+        trials: asked for the next one whenever a slot is free.
+        first: of the batch; gives the shapes.
+        setup: of these slots.
+        count: number of slots.
+        shared: what the slots share of what the policy asks.
+
+    Returns:
+        The trials in the order in which they end.
+    """
     # Parameters are the same in all slots; what a robot has seen is its own.
     memory = shared.memory if isinstance(shared, ObservingEstimator) else None
     slots: tuple[Scene, Progress] = _empty_slots(first, memory, setup, count)
     # Which trial is in which slot is the host's matter; the device knows slots alone.
     held: list[Start | None] = [None] * count
     seconds = np.zeros(count)
+    waiting: list[_Outgrown] = []
     while True:
         for slot in range(count):
-            while held[slot] is None and (start := next(starts, None)) is not None:
-                _check_start(start, first)
-                slots = _fill(slots, jnp.int32(slot), start.world, start.arrays, start.key, memory, setup=setup)
-                held[slot], seconds[slot] = start, 0.0
+            while held[slot] is None and (trial := next(trials, None)) is not None:
+                slots, held[slot], seconds[slot] = _enter(slots, slot, trial, memory, setup)
         occupied = [slot for slot, start in enumerate(held) if start is not None]
+        # Not at the very end alone: trials that wait take memory as those in slots do.
+        if waiting and (len(waiting) >= count or not occupied):
+            grown = setup.grown()
+            assert grown is not None
+            yield from _run(iter(waiting), first, grown, count, shared)
+            waiting = []
         if not occupied:
             return
         # One call to the device runs all slots until one of them ends: as few round trips as there are trials.
         began = time.perf_counter()
         slots = _run_until_one_ends(slots, shared, setup=setup)
-        # The only thing read back in every round; the rest only of slots that have ended.
-        ended = ~np.asarray(slots[1].tally.running)
+        # The only things read back in every round; the rest only of slots that have ended.
+        tally = slots[1].tally
+        ended, outgrown = ~np.asarray(tally.running), np.asarray(tally.outcome) == OUTGROWN
         # Slots run in one program: each is charged an equal share.
         seconds[occupied] += (time.perf_counter() - began) / len(occupied)
         for slot in occupied:
             start = held[slot]
-            if ended[slot] and start is not None:
+            if start is None or not ended[slot]:
+                continue
+            held[slot] = None
+            if outgrown[slot]:
+                waiting.append(_Outgrown(start, _taken_out(slots, jnp.int32(slot)), float(seconds[slot])))
+            else:
                 yield _finished(start, slots[1], slot, float(seconds[slot]))
-                held[slot] = None
+
+
+def _enter(
+    slots: tuple[Scene, Progress], slot: int, trial: Start | _Outgrown, memory: Any, setup: Setup
+) -> tuple[tuple[Scene, Progress], Start, float]:
+    """The slots with a trial in one of them, its start, and its share of the time so far."""
+    if isinstance(trial, _Outgrown):
+        return _put_back(slots, jnp.int32(slot), trial.content), trial.start, trial.seconds
+    filled = _fill(slots, jnp.int32(slot), trial.world, trial.arrays, trial.key, memory, setup=setup)
+    return filled, trial, 0.0
 
 
 def _check_start(start: Start, first: Start) -> None:
@@ -224,8 +279,22 @@ def _fill(
     setup: Setup,
 ) -> tuple[Scene, Progress]:
     # Donated: the arrays of all slots are changed in place instead of copied for each new trial.
-    new = begin(world, arrays, key, memory, setup=setup)
-    return jax.tree.map(lambda leaf, entry: leaf.at[slot].set(entry), slots, new)
+    return _put_back(slots, slot, begin(world, arrays, key, memory, setup=setup))
+
+
+@jax.jit
+def _taken_out(slots: tuple[Scene, Progress], slot: Int32[Array, ""]) -> tuple[Scene, Progress]:
+    """The content of a slot whose trial has outgrown it; to be run again."""
+    scene, progress = jax.tree.map(lambda leaf: leaf[slot], slots)
+    tally = dataclasses.replace(progress.tally, outcome=jnp.int8(rules.RUNNING))
+    return scene, dataclasses.replace(progress, tally=tally)
+
+
+@partial(jax.jit, donate_argnums=0)
+def _put_back(
+    slots: tuple[Scene, Progress], slot: Int32[Array, ""], content: tuple[Scene, Progress]
+) -> tuple[Scene, Progress]:
+    return jax.tree.map(lambda leaf, entry: leaf.at[slot].set(entry), slots, content)
 
 
 @partial(jax.jit, static_argnames="setup", donate_argnums=0)

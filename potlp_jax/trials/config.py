@@ -60,8 +60,9 @@ def config_in(world: World, given: TrialConfig | None) -> TrialConfig:
     """The settings of a trial in a world: those given, by default what the world calls for.
 
     Warns:
-        PotlpWarning: the settings given have defaults where the world calls for something else. Twelve subgoals where
-            32 are needed end no trial and raise no error: they only make every planner worse.
+        PotlpWarning: the settings given have defaults where the world calls for something else. Too few panoramas,
+            or a least frontier that is wider than doors, end no trial and raise no error: they only make every planner
+            worse.
     """
     if given is None:
         return trial_config_for(world)

@@ -13,7 +13,7 @@ from typing import cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int32, PRNGKeyArray
+from jaxtyping import Array, Int32, PRNGKeyArray
 
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import TrainedEstimator, identity_of
@@ -42,7 +42,8 @@ from potlp_jax.world.moves import Cell, path_length
 
 logger = logging.getLogger(__name__)
 
-# Compiled once per policy, configuration and array shapes: no trial after the first compiles anything.
+# Compiled once per policy, configuration and array shapes: no trial after the first compiles anything, but for the
+# first that meets more frontiers than the array of subgoals holds.
 _decide = jax.jit(decide, static_argnames=("policy", "config"))
 _first_tally = jax.jit(rules.first_tally)
 _count_decision = jax.jit(rules.count_decision)
@@ -189,6 +190,8 @@ class _Loop:
     ) -> None:
         self._robot, self._dfa, self._arrays = robot, task.dfa, arrays
         self._policy, self._first_estimator, self._config = policy, first_estimator, config
+        # Apart from the trial's: only what depends on the array of subgoals is compiled anew when that grows.
+        self._decision_config = config.decision
         self._setbacks, self._listener = setbacks, listener
         self._key = rules.planning_key(key)
         self._path: list[Cell] = []
@@ -247,17 +250,7 @@ class _Loop:
         # The robot's own cell is free, whatever was set aside.
         closed = tuple(entry for entry in self._setbacks.closed_at(index, belief) if entry != cell)
         planned_on = with_closed(belief, closed)
-        move = _decide(
-            planned_on,
-            at,
-            self._tally.state,
-            self._arrays,
-            self._estimator,
-            key,
-            self._tally.intention,
-            policy=self._policy,
-            config=self._config.decision,
-        )
+        move = self._decide_on(planned_on, at, key)
         step, state = len(self._path) - 1, self._states[-1]
         decision = decision_of(move, self._estimator, key, index=index, step=step, cell=cell, state=state)
         self._decisions.append(dataclasses.replace(decision, set_aside=closed))
@@ -265,6 +258,27 @@ class _Loop:
         if self._listener is not None:
             self._listener(self._decisions[-1], planned_on)
         return move
+
+    def _decide_on(self, belief: BeliefMap, cell: Int32[Array, "2"], key: PRNGKeyArray) -> Move:
+        """Decide, with a longer array of subgoals where the frontiers are more than it holds."""
+        while True:
+            move = _decide(
+                belief,
+                cell,
+                self._tally.state,
+                self._arrays,
+                self._estimator,
+                key,
+                self._tally.intention,
+                policy=self._policy,
+                config=self._decision_config,
+            )
+            grown = self._decision_config.grown() if bool(rules.overflows(move)) else None
+            if grown is None:
+                return move
+            # Kept for the rest of the trial: where there were many frontiers once there are many again.
+            self._decision_config = grown
+            logger.debug("more frontiers than subgoals: deciding again with %d", grown.frontiers.max_subgoals)
 
     def _look_back(self, belief: BeliefMap) -> None:
         """Show the estimator what the camera saw on the way here from the decision before."""

@@ -73,7 +73,8 @@ def replay_decision(
         The planning problem of the decision, its plan and the searched tree.
 
     Raises:
-        RecordError: the trial has no such decision, or its policy does not search.
+        RecordError: the trial has no such decision, its policy does not search, or its settings are not those that it
+            was made with.
         EstimatorError: the estimator is not the trial's.
     """
     if not 0 <= index < len(trial.decisions):
@@ -84,19 +85,32 @@ def replay_decision(
     decision = trial.decisions[index]
     # From the automaton in the record: formulas need Spot, and a record is read without it.
     task = Task.from_hoa(trial.task_hoa, propositions=trial.propositions)
-    config = config_from_dict(TrialConfig, trial.config, "trial record")
+    config = _decision_config_at(trial, index)
     problem = _replayed_problem(
         trial.planned_on(decision),
         jnp.asarray(decision.cell, jnp.int32),
         jnp.int32(decision.state),
         task.arrays,
         estimator_at(trial, index, estimator),
-        config.decision,
+        config,
     )
     # The decision's own key: no need to know how it came from the trial's.
     key = jax.random.wrap_key_data(jnp.asarray(decision.key, jnp.uint32))
-    plan, tree = search_tree(problem, key, config.decision.search)
+    plan, tree = search_tree(problem, key, config.search)
     return problem, plan, tree
+
+
+def _decision_config_at(trial: Trial, index: int) -> DecisionConfig:
+    """What a decision of a trial was made with: the array of subgoals may have grown until then."""
+    config = config_from_dict(TrialConfig, trial.config, "trial record").decision
+    # An array that has grown stays long, so that the largest number up to here tells its length.
+    most = max(len(decision.subgoals) for decision in trial.decisions[: index + 1])
+    while config.frontiers.max_subgoals < most:
+        grown = config.grown()
+        if grown is None:
+            raise RecordError(f"a decision has {most} subgoals, more than the trial's settings allow")
+        config = grown
+    return config
 
 
 def estimator_at(trial: Trial, index: int, estimator: TrainedEstimator | Estimator | None = None) -> Estimator | None:

@@ -26,7 +26,7 @@ from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import Outcome
-from potlp_jax.types import status_array
+from potlp_jax.types import Status, status_array
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.moves import DIAGONAL, is_beside
 
@@ -242,6 +242,15 @@ def stop_of(move: Move, tally: "Tally", belief: BeliefMap, config: TrialConfig) 
         budget=budget(belief, config) - tally.travelled,
         is_frontier=is_frontier,
     )
+
+
+def overflows(move: Move) -> Bool[Array, "*batch"]:
+    """Whether there were more frontiers at a decision than its array of subgoals holds.
+
+    Such a decision is taken again with a longer array, if there may be one (``FrontierConfig.most_subgoals``).
+    """
+    # From the subgoals and not from the move's own bits, which a policy of the user's may set as it likes.
+    return (move.subgoals.status & np.uint32(int(Status.SUBGOAL_OVERFLOW))) != 0
 
 
 def budget(belief: BeliefMap, config: TrialConfig) -> Float32[Array, ""]:

@@ -42,6 +42,7 @@ from potlp_jax.trials.rules import (
     count_decision,
     decision_key,
     first_tally,
+    overflows,
     planning_key,
     sensing_key,
     stop_of,
@@ -57,6 +58,9 @@ LOCKSTEP: str = "POTLP_LOCKSTEP"
 
 EMPTY: int = -2
 """``Tally.outcome`` of a slot without a trial; neither running nor ended."""
+
+OUTGROWN: int = -3
+"""``Tally.outcome`` of a trial with more frontiers than its array of subgoals holds: it waits for a longer one."""
 
 Asked = ObservingEstimator | Estimator | None
 """What all slots share of what the policy asks: an estimator, whose memory is that of the beginning, or nothing."""
@@ -85,6 +89,8 @@ class Progress:
     Attributes:
         belief: what is known of the map.
         memory: of the estimator; None where the policy asks none that remembers.
+        looked: whether the memory has what the camera saw up to here: a decision that is taken again does not look
+            again.
         decided: cells entered until the last decision; -1 before the first.
         first_seen: step at which each cell was first observed.
         cell: where the robot is.
@@ -94,6 +100,7 @@ class Progress:
 
     belief: BeliefMap
     memory: Any
+    looked: Bool[Array, "*batch"]
     decided: Int32[Array, "*batch"]
     first_seen: Int32[Array, "*batch H W"]
     cell: Int32[Array, "*batch 2"]
@@ -124,6 +131,16 @@ class Setup:
         """Whether the policy is one of those whose searches run together over all slots."""
         return isinstance(self.policy, Policy) and self.policy.searches
 
+    def grown(self) -> "Setup | None":
+        """With the next longer array of subgoals, None where it is as long as it may become.
+
+        Nothing in ``Scene`` and ``Progress`` has its length: a trial goes on with either.
+        """
+        decision = self.config.decision.grown()
+        if decision is None:
+            return None
+        return dataclasses.replace(self, config=dataclasses.replace(self.config, decision=decision))
+
 
 @partial(jax.jit, static_argnames="setup")
 def begin(world: World, arrays: TaskArrays, key: PRNGKeyArray, memory: Any, *, setup: Setup) -> tuple[Scene, Progress]:
@@ -148,6 +165,7 @@ def begin(world: World, arrays: TaskArrays, key: PRNGKeyArray, memory: Any, *, s
     progress = Progress(
         belief=belief,
         memory=memory,
+        looked=jnp.bool_(False),
         decided=jnp.int32(-1),
         first_seen=first_seen_at_start(belief),
         cell=world.start,
@@ -173,7 +191,8 @@ def step(scene: Scene, asked: Asked, setup: Setup, progress: Progress) -> Progre
         progress: of all slots.
 
     Returns:
-        The progress; that of slots which are not running is unchanged.
+        The progress; that of slots which are not running is unchanged. A trial whose frontiers were too many for the
+        array of subgoals has not gone anywhere and is ``OUTGROWN``, if ``setup.grown()`` can take it.
     """
     # The library's searches have a kernel that takes all slots at once; any other policy is asked slot by slot.
     if setup.searches:
@@ -198,7 +217,7 @@ def _search_together(scene: Scene, asked: Asked, setup: Setup, progress: Progres
     def act(progress: Progress, scene: Scene, *considered: Any) -> Progress:
         tally = progress.tally
         move = _phase(tally.running, partial(planned_move, config=decision), *considered, tally.intention)
-        return advance(setup, progress, scene, move)
+        return _advance_unless_outgrown(setup, progress, scene, move)
 
     # Intentions come from the progress, not from the search: commitment is applied when the plan is carried out.
     return _each(setup, act, dataclasses.replace(progress, memory=memory), scene, situation, problem, plans)
@@ -213,7 +232,21 @@ def _decide_alone(setup: Setup, asked: Asked, progress: Progress, scene: Scene) 
         return policy_function(setup.policy)(situation, estimates, key, config, intention)
 
     move = _phase(tally.running, decide, situation, estimates, key, tally.intention)
-    return advance(setup, dataclasses.replace(progress, memory=memory), scene, move)
+    return _advance_unless_outgrown(setup, dataclasses.replace(progress, memory=memory), scene, move)
+
+
+def _advance_unless_outgrown(setup: Setup, progress: Progress, scene: Scene, move: Move) -> Progress:
+    """Go, but for trials whose decision is to be taken again with a longer array of subgoals."""
+    # Decided when tracing: where arrays cannot grow the decision stands as it is.
+    if setup.grown() is not None:
+        tally = progress.tally
+        outgrown = tally.running & overflows(move)
+        outcome = jnp.where(outgrown, OUTGROWN, tally.outcome).astype(jnp.int8)
+        # Not running any more, so that ``advance`` leaves it where it is.
+        progress = dataclasses.replace(
+            progress, looked=progress.looked | outgrown, tally=dataclasses.replace(tally, outcome=outcome)
+        )
+    return advance(setup, progress, scene, move)
 
 
 def _each(setup: Setup, function: Any, *batches: Any) -> Any:
@@ -296,8 +329,9 @@ def _memory_after_looking(setup: Setup, asked: Asked, progress: Progress, scene:
         seen = asked.encode(photograph(scene.world, cell, key, config.camera, config.disturbance))
         return with_memory(asked, memory).remember(seen, progress.belief, cell).memory
 
-    # A loop of no turns where the trial is not running: a branch would copy the memory.
-    return jax.lax.fori_loop(0, jnp.where(progress.tally.running, between + 1, 0), look, progress.memory)
+    # A loop of no turns where there is nothing to look at: a branch would copy the memory.
+    looks = progress.tally.running & ~progress.looked
+    return jax.lax.fori_loop(0, jnp.where(looks, between + 1, 0), look, progress.memory)
 
 
 def _estimator(setup: Setup, asked: Asked, memory: Any, scene: Scene) -> Estimator | None:
@@ -351,6 +385,7 @@ def _went(
     return dataclasses.replace(
         progress,
         belief=belief,
+        looked=jnp.bool_(False),
         decided=tally.steps,
         first_seen=first_seen,
         cell=cells[moved],

@@ -63,17 +63,28 @@ class FrontierConfig:
     """How frontiers become subgoals.
 
     Attributes:
-        max_subgoals: length of the array of subgoals.
+        max_subgoals: length of the array of subgoals. Where there are more components the nearest stay, and the
+            overflow is flagged.
         min_size: components of fewer cells are dropped while larger ones remain. Keep it below the narrowest passage:
             a passage whose whole frontier is smaller would be forgotten while anything else remains.
+        most_subgoals: where there are more components than ``max_subgoals`` a trial decides again with an array of
+            twice the length, and so on up to this many; only beyond that is it flagged. A length that is no more than
+            ``max_subgoals`` never grows. Programs of one fixed shape (``export``, ``rl``, recordings) do not grow.
     """
 
     max_subgoals: int = 12
     min_size: int = 2
+    most_subgoals: int = 512
 
     def __post_init__(self) -> None:
-        if self.max_subgoals < 1 or self.min_size < 1:
-            raise ValueError(f"max_subgoals and min_size must be at least 1, found {self}")
+        if min(self.max_subgoals, self.min_size, self.most_subgoals) < 1:
+            raise ValueError(f"max_subgoals, min_size and most_subgoals must be at least 1, found {self}")
+
+    def grown(self) -> "FrontierConfig | None":
+        """With an array of the next length, None where it is as long as it may become."""
+        # Doubled, so that few programs are compiled whatever a map asks for, and none is much larger than needed.
+        longer = min(2 * self.max_subgoals, self.most_subgoals)
+        return dataclasses.replace(self, max_subgoals=longer) if longer > self.max_subgoals else None
 
 
 @struct.dataclass(kw_only=True)
