@@ -70,8 +70,8 @@ def results_of(names: list[str], folder: Path) -> dict[str, Any]:
         {
             "group": group,
             "questions": int(chosen.sum()),
-            "doubt": float(np.mean((labels * (1 - labels))[chosen])),
-            "excess": {name: float(np.mean(values[chosen])) for name, values in excess.items()},
+            "doubt": _mean((labels * (1 - labels))[chosen]),
+            "excess": {name: _mean(values[chosen]) for name, values in excess.items()},
         }
         for group, chosen in groups(samples, moves_of(folder, samples))
     ]
@@ -83,14 +83,20 @@ def results_of(names: list[str], folder: Path) -> dict[str, Any]:
     }
 
 
+def _mean(values: Float64[np.ndarray, " N"]) -> float | None:
+    """None where there are no values."""
+    return float(np.mean(values)) if len(values) else None
+
+
 def markdown(results: dict[str, Any]) -> str:
     """The table of a page."""
     names = list(results["rows"][0]["excess"])
     lines = [f"| questions | number | doubt | {' | '.join(f'excess of {name}' for name in names)} |"]
     lines.append("|---" * (3 + len(names)) + "|")
     for row in results["rows"]:
-        shown = " | ".join(f"{row['excess'][name]:.4f}" for name in names)
-        lines.append(f"| {row['group']} | {row['questions']:,} | {row['doubt']:.4f} | {shown} |")
+        figures = [row["doubt"], *(row["excess"][name] for name in names)]
+        shown = " | ".join("-" if figure is None else f"{figure:.4f}" for figure in figures)
+        lines.append(f"| {row['group']} | {row['questions']:,} | {shown} |")
     return "\n".join(lines)
 
 
