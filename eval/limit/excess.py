@@ -6,7 +6,7 @@ takes away, and its excess over that: its mean squared distance from the observe
 
     potlp collect firefighting --split validation --worlds 40 --out data/means --set posterior=16 --set driver=potlp \
         --set estimator=firefighting --set drives=1 --set views_per_world=20 --set spacing=[4,40]
-    python -m eval.limit.excess firefighting --data data/means --report docs/results/estimator/excess
+    python -m eval.limit.excess firefighting --data data/means --report out/excess
 """
 
 import argparse
