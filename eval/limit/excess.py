@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float64, Int64
 from potlp_jax.errors import EvaluationError
 from potlp_jax.learning.dataset import Samples, finished_shards, views_file
 from potlp_jax.learning.dataset_reading import read_dataset
-from potlp_jax.learning.estimator import named_estimator
+from potlp_jax.learning.estimator import TrainedEstimator, named_estimator
 from potlp_jax.learning.learners import learner_of
 from potlp_jax.learning.predictions import predict
 from potlp_jax.sweep.rows import provenance
@@ -49,8 +49,10 @@ def groups(samples: Samples, moves: Int64[np.ndarray, " N"]) -> Iterator[tuple[s
 
 
 def excess_of(name: str, samples: Samples) -> Float64[np.ndarray, " N"]:
-    """The squared distance of an estimator from each label."""
+    """The squared distance of an estimator from each label. Raises EvaluationError for one that was not trained here."""
     estimator = named_estimator(name)
+    if not isinstance(estimator, TrainedEstimator):
+        raise EvaluationError(f"{name}: only estimators that were trained with this library answer data sets")
     answers = predict(learner_of(estimator.config), estimator.params, samples).success
     return (answers - np.asarray(samples.success, np.float64)) ** 2
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int32, PRNGKeyArray, UInt8
 
@@ -311,7 +312,7 @@ def _image(
     config: CollectConfig,
 ) -> UInt8[Array, "rows columns 3"]:
     # By world and step, so that a picture does not depend on how many were taken before it.
-    return disturb(render(world, cell, config.camera), jax.random.fold_in(key, step), config.disturbance)
+    return disturb(render(world, jnp.asarray(cell), config.camera), jax.random.fold_in(key, step), config.disturbance)
 
 
 def summary(samples: Samples) -> str:

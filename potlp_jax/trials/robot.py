@@ -165,11 +165,7 @@ _observe = jax.jit(observe, static_argnames=("config",))
 
 @partial(jax.jit, static_argnames=("camera", "disturbance"))
 def photograph(
-    world: World,
-    cell: Int32[Array | np.ndarray, "2"],
-    key: PRNGKeyArray,
-    camera: CameraConfig,
-    disturbance: Disturbance,
+    world: World, cell: Int32[Array, "2"], key: PRNGKeyArray, camera: CameraConfig, disturbance: Disturbance
 ) -> UInt8[Array, "rows columns 3"]:
     """What the camera sees from a cell.
 
@@ -199,7 +195,7 @@ def _photograph_after(
 ) -> UInt8[Array, "rows columns 3"]:
     """What the camera sees after so many moves."""
     # By the number of moves, as in a batch: a panorama depends on where it was taken, not on how many were.
-    return photograph(world, cell, jax.random.fold_in(key, step), camera, disturbance)
+    return photograph(world, jnp.asarray(cell), jax.random.fold_in(key, step), camera, disturbance)
 
 
 @partial(jax.jit, static_argnames=("config",))
