@@ -49,7 +49,7 @@ def groups(samples: Samples, moves: Int64[np.ndarray, " N"]) -> Iterator[tuple[s
 
 
 def excess_of(name: str, samples: Samples) -> Float64[np.ndarray, " N"]:
-    """The squared distance of an estimator from each label. Raises EvaluationError for one that was not trained here."""
+    """The squared distance of an estimator from each label. Raises EvaluationError where it was not trained here."""
     estimator = named_estimator(name)
     if not isinstance(estimator, TrainedEstimator):
         raise EvaluationError(f"{name}: only estimators that were trained with this library answer data sets")
