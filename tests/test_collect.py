@@ -27,7 +27,7 @@ from potlp_jax.errors import DatasetError, WorldError
 from potlp_jax.learning.dataset import decode, finished_shards, read_metadata, samples_file, views_file
 from potlp_jax.learning.dataset_reading import read_dataset
 from potlp_jax.learning.questions import TaskDistribution
-from potlp_jax.learning.recording import survey
+from potlp_jax.learning.scenes import survey
 from potlp_jax.recipes.collection import CollectConfig, collect, summary
 from potlp_jax.recipes.exploration import Explorer, ExplorerConfig
 from potlp_jax.task.task import Task

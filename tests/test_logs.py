@@ -18,8 +18,9 @@ from potlp_jax.errors import LogError, MapError, PropositionsError, RecordError
 from potlp_jax.learning.dataset import decode, encode, finished_shards, samples_file, views_file
 from potlp_jax.learning.dataset_reading import read_dataset
 from potlp_jax.learning.questions import TaskDistribution
-from potlp_jax.learning.recording import Pose, Recorder, RecordingConfig, is_answered, record_views, survey
+from potlp_jax.learning.recording import Recorder, RecordingConfig, record_views
 from potlp_jax.learning.sample_weights import WeightBounds
+from potlp_jax.learning.scenes import Pose, is_answered, survey
 from potlp_jax.logs import writing
 from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
 from potlp_jax.logs.drive import PanoramaReader

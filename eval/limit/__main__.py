@@ -21,6 +21,7 @@ from eval.limit.arms import REFERENCES, Arm, Experiment, key_of, missing_rows
 from eval.limit.report import markdown, page, results_of
 from eval.limit.rows import ROWS, append_row, read_rows
 from potlp_jax.cache import enable_compilation_cache
+from potlp_jax.environments.base import Generator
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
@@ -67,10 +68,12 @@ def main() -> None:
         given=None if options.estimator is None else named_estimator(options.estimator),
         buildings=options.buildings,
     )
-    known = [arm for arm in Arm if arm is not Arm.IDEAL_OBSERVER or isinstance(generator, Firefighting)]
+    # A family that does not say what its worlds can be has the method of the base class, which refuses.
+    says = type(generator).posterior is not Generator.posterior
+    known = [arm for arm in Arm if arm is not Arm.IDEAL_OBSERVER or says]
     chosen = known if options.arms is None else options.arms
     if not set(chosen) <= set(known):
-        parser.error(f"{generator.name}: only fire-fighting buildings have an ideal observer")
+        parser.error(f"{generator.name}: an ideal observer needs a family that says what its worlds can be")
     file, arms = options.out / ROWS, [arm for arm in Arm if arm in (*chosen, *REFERENCES)]
     if not options.as_it_is:
         run(file, experiment, arms, options.worlds)

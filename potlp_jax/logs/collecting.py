@@ -8,7 +8,7 @@ import numpy as np
 
 from potlp_jax.environments.ros.places import Places
 from potlp_jax.errors import DatasetError, LogError
-from potlp_jax.learning import recording
+from potlp_jax.learning import recording, scenes
 from potlp_jax.learning.dataset import finished_shards, write_shard
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.domain import LOGS
@@ -26,12 +26,12 @@ class LogCollectConfig(recording.RecordingConfig):
     views_per_world: int = 200
 
 
-def poses_of(drive: Drive) -> Iterator[recording.Pose]:
+def poses_of(drive: Drive) -> Iterator[scenes.Pose]:
     """The poses of a drive at which there is a picture."""
     travelled = np.cumsum([0.0, *step_lengths(drive.path)]).tolist()
     for step, cell in enumerate(drive.path):
         if step in drive.pictures:
-            yield recording.Pose(belief=drive.belief_at(step), cell=cell, step=step, travelled=travelled[step])
+            yield scenes.Pose(belief=drive.belief_at(step), cell=cell, step=step, travelled=travelled[step])
 
 
 def collect_drives(

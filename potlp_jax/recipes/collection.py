@@ -10,14 +10,12 @@ the split, the index of the world and the driver alone.
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int32, PRNGKeyArray, UInt8
+from jaxtyping import UInt8
 
 from potlp_jax.checks import AT_LEAST_ONE, require_fields
 from potlp_jax.codec import json_copy
@@ -39,7 +37,6 @@ from potlp_jax.learning.estimator import TrainedEstimator, identity_of, named_es
 from potlp_jax.learning.ideal_observer import IdealObserver, ideal_observer
 from potlp_jax.learning.questions import HELD_OUT, TaskDistribution
 from potlp_jax.learning.recording import (
-    Pose,
     Recorder,
     RecordingConfig,
     draws_of_world,
@@ -47,6 +44,7 @@ from potlp_jax.learning.recording import (
     recording_metadata,
 )
 from potlp_jax.learning.sample_weights import WeightBounds
+from potlp_jax.learning.scenes import Pose
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.recipes.exploration import Explorer, ExplorerConfig
@@ -54,10 +52,10 @@ from potlp_jax.recipes.policy_drives import policy_drives
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import trial_config_for
 from potlp_jax.trials.loop import versions
-from potlp_jax.world.camera import Disturbance, disturb
+from potlp_jax.trials.robot import photograph_after
+from potlp_jax.world.camera import Disturbance
 from potlp_jax.world.grid import World
 from potlp_jax.world.moves import Cell
-from potlp_jax.world.renderer import render
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -261,7 +259,8 @@ def _collect_world(recorder: Recorder, world: World, index: int, tasks: TaskDist
     rng, pool = draws_of_world(config, job.split, index, tasks)
 
     def photograph(cell: Cell, step: int) -> UInt8[np.ndarray, "rows columns 3"]:
-        return np.asarray(_image(world, np.asarray(cell, np.int32), key, np.int32(step), config))
+        at = np.asarray(cell, np.int32)
+        return np.asarray(photograph_after(world, at, key, np.int32(step), config.camera, config.disturbance))
 
     recorder.add_world(world, index)
     # Half of the questions are of the tasks that are pursued: they are asked in the states that pursuing them leads to.
@@ -301,18 +300,6 @@ def _drives(
         look_every=config.look_every,
     )
     return policy_drives(world, tasks, Policy(config.driver), job.estimator, settings, key), len(tasks)
-
-
-@partial(jax.jit, static_argnames="config")
-def _image(
-    world: World,
-    cell: Int32[Array | np.ndarray, "2"],
-    key: PRNGKeyArray,
-    step: Int32[Array, ""] | np.int32,
-    config: CollectConfig,
-) -> UInt8[Array, "rows columns 3"]:
-    # By world and step, so that a picture does not depend on how many were taken before it.
-    return disturb(render(world, jnp.asarray(cell), config.camera), jax.random.fold_in(key, step), config.disturbance)
 
 
 def summary(samples: Samples) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Int32
 
 from potlp_jax.learning.questions import LARGEST
-from potlp_jax.learning.recording import Pose
+from potlp_jax.learning.scenes import Pose
 from potlp_jax.planning.distances.paths import KnownPath, shortest_path
 from potlp_jax.planning.situation import Situation, assess
 from potlp_jax.task.propositions import require_same_propositions

@@ -14,7 +14,7 @@ from jaxtyping import PRNGKeyArray
 
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.questions import LARGEST
-from potlp_jax.learning.recording import Pose
+from potlp_jax.learning.scenes import Pose
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task

@@ -133,7 +133,7 @@ class SimulatedRobot:
 
     def _photograph(self, cell: Int32[Array | np.ndarray, "2"], step: int) -> UInt8[Array, "rows columns 3"]:
         config = self._config
-        return _photograph_after(self._world, cell, self._key, np.int32(step), config.camera, config.disturbance)
+        return photograph_after(self._world, cell, self._key, np.int32(step), config.camera, config.disturbance)
 
     def advance(self, path: KnownPath, stop: Stop) -> Leg:
         """Follow ``path`` through known space, observing at every cell, until it ends or ``stop.is_due``."""
@@ -185,7 +185,7 @@ def photograph(
 
 
 @partial(jax.jit, static_argnames=("camera", "disturbance"))
-def _photograph_after(
+def photograph_after(
     world: World,
     cell: Int32[Array | np.ndarray, "2"],
     key: PRNGKeyArray,
@@ -193,7 +193,16 @@ def _photograph_after(
     camera: CameraConfig,
     disturbance: Disturbance,
 ) -> UInt8[Array, "rows columns 3"]:
-    """What the camera sees after so many moves."""
+    """What the camera sees after so many moves, as ``photograph``.
+
+    Args:
+        world, cell, camera, disturbance: as there.
+        key: of all pictures of a trial or a drive.
+        step: number of moves made.
+
+    Returns:
+        RGB, the columns by bearing in the frame of the map.
+    """
     # By the number of moves, as in a batch: a panorama depends on where it was taken, not on how many were.
     return photograph(world, jnp.asarray(cell), jax.random.fold_in(key, step), camera, disturbance)
 

@@ -1,0 +1,41 @@
+"""What changed between two tables of trials."""
+
+import csv
+import gzip
+
+import pytest
+
+from eval.gains import changes, costs_of, gain
+
+
+def _table(file, potlp):
+    """Two worlds of a task: known map 10, baseline 30, and PO-TLP as given; one more world of another task."""
+    with gzip.open(file, "wt", newline="") as lines:
+        writer = csv.writer(lines)
+        writer.writerow(["task", "policy", "world", "cost"])
+        for world, cost in enumerate(potlp):
+            for policy, value in (("known-map", 10), ("baseline", 30), ("potlp", cost)):
+                writer.writerow(["F a", policy, world, value])
+        writer.writerow(["F b", "baseline", 0, 7])
+    return costs_of(file)
+
+
+@pytest.fixture
+def tables(tmp_path):
+    return _table(tmp_path / "before.csv.gz", (20, 30)), _table(tmp_path / "after.csv.gz", (22, 16, 5))
+
+
+def test_costs_are_compared_in_the_worlds_of_both(tables):
+    assert list(changes(*tables)) == [("baseline", 3, 0, 0), ("known-map", 2, 0, 0), ("potlp", 2, 1, 1)]
+
+
+def test_a_gain_is_of_what_can_be_saved(tables):
+    # 12 cells cheaper in all, of 2 times 20; a draw has one of the worlds twice, or both.
+    found, low, high = gain(*tables, "F a")
+    assert found == pytest.approx(12 / 40)
+    assert (low, high) == pytest.approx((-2 / 20, 14 / 20))
+
+
+def test_the_way_back_loses_what_was_gained(tables):
+    before, after = tables
+    assert gain(after, before, "F a")[0] == pytest.approx(-12 / 40)
