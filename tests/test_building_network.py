@@ -1,6 +1,7 @@
 """The building network: what its answers depend on and what they do not, and its operations as XLA counts them."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -14,11 +15,14 @@ from potlp_jax.learning.building_network import (
     BuildingNetwork,
     building_operations,
     channel_count,
+    compared,
     map_channels,
 )
+from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.imagined_paths import PROSPECTS, outlook, prospects, scenery
 from potlp_jax.learning.observing import ObservingEstimator, looks_on_the_way, observe_panorama
 from potlp_jax.learning.painting import blank_painting
+from potlp_jax.learning.serialization import load_estimator, save_estimator
 from potlp_jax.learning.squares import SQUARE
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.search.config import BestFirstConfig
@@ -45,6 +49,7 @@ CONFIG = BuildingConfig(
     decoder=8,
     head=16,
     condition=8,
+    contrast=4,
 )
 NETWORK = BuildingNetwork(CONFIG)
 SENSOR = SensorConfig(range_cells=5.0)
@@ -249,9 +254,45 @@ def test_trials_with_the_network_are_the_same_alone_and_in_a_batch(params):
         np.testing.assert_array_equal(trial.path, np.asarray(alone.path))
 
 
+def test_a_file_from_before_colours_were_compared_is_read(tmp_path):
+    config = dataclasses.replace(CONFIG, contrast=0)
+    params = BuildingNetwork(config).init(jax.random.key(0))
+    save_estimator(tmp_path / "now.npz", params, config, Domain("toy", CAMERA, "cells"), {})
+    arrays = dict(np.load(tmp_path / "now.npz"))
+    header = json.loads(arrays.pop("header").tobytes())
+    assert header["network"].pop("contrast") == 0
+    np.savez(tmp_path / "before.npz", header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
+    assert load_estimator(tmp_path / "before.npz")[1] == config
+
+
 def test_a_network_cannot_be_made_without_what_is_not_known():
     with pytest.raises(NetworkError, match="without has doors; known: painting, paths, position"):
         dataclasses.replace(CONFIG, without=("doors",))
+
+
+def test_squares_are_compared_with_the_mean_of_their_kind():
+    rng = np.random.default_rng(3)
+    value, weight = rng.normal(size=(2, 5, 7, 3)).astype(np.float32), rng.random((2, 5, 7, 3)).astype(np.float32)
+    weight[:, 2] = 0  # never painted
+    slow = np.zeros_like(value)
+    for building, channel in np.ndindex(2, 3):
+        cells = list(np.ndindex(5, 7))
+        total = sum(weight[building, *cell, channel] for cell in cells)
+        mean = sum(weight[building, *cell, channel] * value[building, *cell, channel] for cell in cells) / (total + 1)
+        for cell in cells:
+            slow[building, *cell, channel] = (value[building, *cell, channel] - mean) * weight[building, *cell, channel]
+    np.testing.assert_allclose(compared(jnp.asarray(value), jnp.asarray(weight)), slow, rtol=1e-5, atol=1e-6)
+
+
+def test_a_shade_in_one_corner_changes_what_is_said_of_another(params):
+    # Farther apart than any convolution of the first scale sees, and never painted cells take no part.
+    channels = np.zeros((64, 64, channel_count(CONFIG)), np.float32)
+    channels[:8, :8, 4] = channels[56:, 56:, 4] = 1
+    close = _encode(NETWORK, params, jnp.asarray(channels)).close
+    channels[56:, 56:, -1] = 1
+    other = _encode(NETWORK, params, jnp.asarray(channels)).close
+    assert np.abs(np.asarray(close - other))[:4, :4].max() > 1e-4
+    np.testing.assert_array_equal(np.asarray(close)[10:20, 10:20], np.asarray(other)[10:20, 10:20])
 
 
 def test_operations_are_about_those_that_xla_counts(params):
@@ -272,6 +313,7 @@ def test_operations_are_about_those_that_xla_counts(params):
         ("widths", (8, 8), "widths"),
         ("blocks", (1,), "blocks"),
         ("head", 0, "head"),
+        ("contrast", -1, "contrast"),
         ("far", float("nan"), "far"),
         ("exclusive_within", -1.0, "exclusive_within"),
     ],

@@ -29,6 +29,8 @@ class Architecture:
             they are done for.
         start: from parameters, configuration, rows and columns of the map's array, and panoramas that are remembered:
             the estimator for a new trial.
+        before: fields of the configuration that files lack which were written before the network had what they size,
+            and what such files stand for.
     """
 
     name: str
@@ -36,6 +38,7 @@ class Architecture:
     network: Callable[[Any], Any]
     operations: Callable[[Any, tuple[int, int]], dict[str, int]]
     start: Callable[[Params, Any, int, int, int], ObservingEstimator]
+    before: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
 def _panorama_operations(config: NetworkConfig, _: tuple[int, int]) -> dict[str, int]:
@@ -63,7 +66,14 @@ ARCHITECTURES: Mapping[str, Architecture] = MappingProxyType(
         architecture.name: architecture
         for architecture in (
             Architecture("panorama", NetworkConfig, EstimatorNetwork, _panorama_operations, _start_panorama),
-            Architecture("building", BuildingConfig, BuildingNetwork, _building_operations, _start_building),
+            Architecture(
+                "building",
+                BuildingConfig,
+                BuildingNetwork,
+                _building_operations,
+                _start_building,
+                before={"contrast": 0},
+            ),
         )
     }
 )

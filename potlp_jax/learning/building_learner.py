@@ -138,6 +138,7 @@ class BuildingOptions:
     decoder: int = BuildingConfig.decoder
     head: int = BuildingConfig.head
     condition: int = BuildingConfig.condition
+    contrast: int = BuildingConfig.contrast
     exclusive_within: float = BuildingConfig.exclusive_within
     without: tuple[str, ...] = BuildingConfig.without
 

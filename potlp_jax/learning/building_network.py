@@ -1,9 +1,10 @@
 """The building network: P_S, R_S and R_F from all that the robot has seen, the map and what is painted on it.
 
 The belief and the painting (``learning.painting``) are one picture of the building from above. A U-Net encodes it once
-a decision, for all frontiers and all classes (the first stage). What a subgoal is asked about is read off around its
-cell at every scale, together with one vector of the whole building; a small head per (subgoal, class) answers, its
-units scaled and shifted by phi (the second stage).
+a decision, for all frontiers and all classes (the first stage). Colours are compared across the building first: each
+building has its own shade of all of them, and thin smoke in one hallway shows beside the others. What a subgoal is
+asked about is read off around its cell at every scale, together with one vector of the whole building; a small head per
+(subgoal, class) answers, its units scaled and shifted by phi (the second stage).
 
 The first stage also says of every square of ``SQUARE`` cells how much of it is free, what lies in it and how one gets
 through it (``learning.squares``), also where nothing was observed: training asks for it, because the simulator knows it
@@ -74,6 +75,7 @@ class BuildingConfig:
         blocks: residual blocks of each scale.
         decoder: channels at least, on the way back to squares of ``SQUARE`` cells.
         head: units of each layer of the head; condition: of the layer that reads phi.
+        contrast: channels in which squares are compared with others of their kind in the building; 0 for none.
         success_cost_scale, failure_cost_scale: unit of the outputs R_S and R_F, and of their errors in the loss
             (standard deviations over the training data).
         step: the least R_S, one step of the grid, in the unit of cost.
@@ -92,6 +94,7 @@ class BuildingConfig:
     decoder: int = 48
     head: int = 128
     condition: int = 64
+    contrast: int = 24
     success_cost_scale: float = 30.0
     failure_cost_scale: float = 30.0
     step: float = 1.0
@@ -109,6 +112,8 @@ class BuildingConfig:
         for name in ("decoder", "head", "condition"):
             if getattr(self, name) < 1:
                 raise NetworkError(f"{name} is {getattr(self, name)}; give a positive number")
+        if self.contrast < 0:
+            raise NetworkError(f"contrast is {self.contrast}; give a number of channels, 0 for none")
         for name in ("success_cost_scale", "failure_cost_scale", "step", "far", "fold"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise NetworkError(f"{name} is {getattr(self, name)}; give a positive number")
@@ -179,6 +184,11 @@ def _convolution(width: int, gain: float) -> nn.Conv:
     return nn.Conv(width, (3, 3), kernel_init=nn.initializers.variance_scaling(gain, "fan_in", "normal"))
 
 
+def _painted_share(channels: Array) -> Array:
+    """Of each square of two by two, the share that was painted, ``[..., rows, columns, 1]``."""
+    return jnp.mean(_halved(channels[..., 4:5]), axis=-1, keepdims=True)
+
+
 def _activated(x: Array) -> Array:
     return nn.leaky_relu(x, _SLOPE)
 
@@ -202,6 +212,33 @@ class _Block(nn.Module):
     @nn.compact
     def __call__(self, x: Array) -> Array:
         return x + _convolution(self.width, 0.2)(_activated(_convolution(self.width, 2.0)(x)))
+
+
+class _Contrast(nn.Module):
+    """How much each square differs from the others of its kind in the same building.
+
+    A channel learns to weigh squares by their kind (the far floor of a hallway) and to take a value of each (how white
+    it is); the value less its weighted mean over all that was painted is passed on. ``compared`` is the arithmetic.
+    """
+
+    channels: int
+
+    @nn.compact
+    def __call__(self, x: Array, painted: Array) -> Array:
+        weight = nn.sigmoid(_dense(self.channels, 1.0)(x)) * painted
+        value = _dense(self.channels, 1.0)(x)
+        differs = jnp.concatenate([compared(value, weight), weight], axis=-1)
+        differs = _activated(_dense(self.channels, 2.0)(differs))
+        # Nothing at first: it corrects what the colours themselves say.
+        return nn.Dense(x.shape[-1], kernel_init=nn.initializers.zeros)(differs)
+
+
+def compared(value: Float32[Array, "*B h w C"], weight: Float32[Array, "*B h w C"]) -> Float32[Array, "*B h w C"]:
+    """Values less their mean by weight over rows and columns, times the weight."""
+    total = jnp.sum(weight, axis=(-3, -2), keepdims=True)
+    # One square's worth of weight on the value 0: where hardly anything was painted the mean says nothing.
+    mean = jnp.sum(weight * value, axis=(-3, -2), keepdims=True) / (total + 1)
+    return (value - mean) * weight
 
 
 class _Encoder(nn.Module):
@@ -230,9 +267,11 @@ class _Encoder(nn.Module):
         return EncodedMap(close=scales[0], scales=tuple(reversed(decoded)), whole=whole, squares=squares)
 
     def _down(self, x: Array) -> list[Array]:
-        scales = []
+        scales, painted = [], _painted_share(x)
         for level, (width, blocks) in enumerate(zip(self.config.widths, self.config.blocks, strict=True)):
             x = _activated(_dense(width, 2.0)(_halved(x)))
+            if level == 0 and self.config.contrast:
+                x = x + _Contrast(self.config.contrast)(x, painted)
             # The first scale is the largest array; a convolution there would be most of the work.
             if level > 0:
                 x = x + _activated(_convolution(width, 0.5)(x))
@@ -401,6 +440,8 @@ def building_operations(config: BuildingConfig, height: int, width: int) -> tupl
     areas = [rows * columns // 4 ** (level + 1) for level in range(len(config.widths))]
     inputs = [channel_count(config), *config.widths[:-1]]
     first = sum(2 * area * 4 * i * o for area, i, o in zip(areas, inputs, config.widths, strict=True))
+    contrast, widest = config.contrast, config.widths[0]
+    first += 2 * areas[0] * contrast * (2 * widest + 2 * contrast + widest)
     convolutions = [2 * blocks + (level > 0) for level, blocks in enumerate(config.blocks)]
     first += sum(2 * area * 9 * o * o * n for area, o, n in zip(areas, config.widths, convolutions, strict=True))
     decoded = [max(config.decoder, width * 3 // 4) for width in config.widths[1:-1]]

@@ -127,7 +127,10 @@ def _configuration(path: Path | str, header: Mapping[str, Any]) -> tuple[Estimat
             f"{path}: architecture {short(name)} is not known; this library has {', '.join(ARCHITECTURES)}"
         )
     try:
-        config = config_from_dict(ARCHITECTURES[name].config, header["network"], "network")
+        architecture, network = ARCHITECTURES[name], header["network"]
+        # What is no mapping is left to the reader, which says so.
+        network = {**architecture.before, **network} if isinstance(network, Mapping) else network
+        config = config_from_dict(architecture.config, network, "network")
         domain = config_from_dict(Domain, header["domain"], "domain")
     except (ConfigurationError, NetworkError) as error:
         raise EstimatorError(f"{path}: {error}") from error

@@ -1,0 +1,271 @@
+"""Every experiment behind docs/results, one after the other, on one commit.
+
+    python -m eval.all --list                                   # what there is, what it writes, how long it takes
+    python -m eval.all --out out/all --data DATA --processes 2
+    python -m eval.all --out out/all --data DATA --only table1 limit worst
+
+``DATA`` is the folder with the maps and floor plans of others; without it the experiments that read them are left out,
+and named. Each experiment is a command of its own, as its page quotes it, and has a log in ``--out``; those that work
+in steps keep them in a folder there. Killed, the same command goes on: what was finished at this commit is not run
+again, and what was begun goes on from its own folder. One that fails is named at the end, and does not stop the others.
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from potlp_jax.errors import ConfigurationError
+from potlp_jax.sweep.rows import source_commit
+
+# Those of this environment, whatever else is called so.
+_PROGRAMS = {"python": sys.executable, "potlp": str(Path(sys.executable).with_name("potlp"))}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """One command.
+
+    Attributes:
+        page: of docs/results, that shows what the command gives.
+        command: as its page has it; ``{out}`` is a folder of its own, ``{all}`` that of all experiments, ``{data}`` the
+            folder of others' data, ``{processes}`` how many there may be.
+        hours: on two cores that do nothing else; None where it was never run alone and whole.
+        one_core: whether it measures times, so that it is kept on one core.
+        variables: of the environment.
+    """
+
+    page: str
+    command: str
+    hours: float | None = None
+    one_core: bool = False
+    variables: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def needs_data(self) -> bool:
+        """Whether it reads maps or plans of others."""
+        return "{data}" in self.command or "{data}" in self.variables.values()
+
+
+_OTHERS = {"POTLP_EXTERNAL_DATA": "{data}"}
+
+EXPERIMENTS: dict[str, Experiment] = {
+    # First what tells the most and is quoted first.
+    "table1": Experiment(
+        page="table1",
+        command="python -m eval.table1 --out {out} --processes {processes} --report docs/results/table1/test",
+        hours=0.5,
+    ),
+    "limit": Experiment(
+        page="limit", command="python -m eval.limit --out {out} --worlds 60 --report docs/results/limit"
+    ),
+    "worst": Experiment(
+        page="worst",
+        command="python -m eval.limit.worst {all}/table1 --out {out} --trials 40 --report docs/results/worst",
+    ),
+    "held-out": Experiment(page="panorama", command="potlp sweep firefighting-held-out --out {out}"),
+    "panorama": Experiment(
+        page="panorama",
+        command="python -m eval.table1 --estimator firefighting-panorama --out {out} --processes {processes} "
+        "--report docs/results/panorama/test",
+    ),
+    "fair-settings": Experiment(
+        page="fair_settings",
+        command="python -m eval.fair_settings firefighting --out {out} --report docs/results/fair_settings",
+    ),
+    "calibration": Experiment(page="calibration", command="python -m eval.calibrate_firefighting --worlds 100"),
+    "delivery": Experiment(
+        page="delivery",
+        command="python -m eval.delivery --out {out} --plans {data}/floorplans --worlds 1000 --plan-worlds 80 "
+        "--formula-worlds 40 --processes {processes} --report docs/results/delivery/first1000",
+    ),
+    "real-maps": Experiment(
+        page="delivery",
+        command="python -m eval.real_maps --out {out} --maps {data}/maps --worlds 50 --processes {processes}",
+    ),
+    "floors": Experiment(page="floors", command="python -m eval.floor_statistics", variables=_OTHERS),
+    "commits": Experiment(
+        page="commits",
+        command="python -m eval.commits --pairs 500 --out {out}/rows.jsonl --report docs/results/commits.json",
+    ),
+    "trials": Experiment(
+        page="trials",
+        command="python -m eval.trials firefighting rooms maps revealed --processes {processes} --out {out}",
+        variables=_OTHERS,
+    ),
+    "live": Experiment(
+        page="live", command="python -m eval.live --streams 1000 --out docs/results/live.json", variables=_OTHERS
+    ),
+    "faults-files": Experiment(page="faults", command="python -m eval.faults files --cases 5000 --out {out}"),
+    "faults-texts": Experiment(page="faults", command="python -m eval.faults texts --cases 100000 --out {out}"),
+    "faults-formulas": Experiment(page="faults", command="python -m eval.faults formulas --cases 1000 --out {out}"),
+    "faults-kills": Experiment(page="faults", command="python -m eval.faults kills --cases 300 --out {out}"),
+    "scale-overhead": Experiment(
+        page="scale", command="python -m eval.scale overhead --out {out} --report docs/results/scale/overhead"
+    ),
+    "scale-store": Experiment(
+        page="scale", command="python -m eval.scale store --out {out} --report docs/results/scale/store"
+    ),
+    "scale-kills": Experiment(
+        page="scale", command="python -m eval.scale kills --out {out} --report docs/results/scale/kills"
+    ),
+    "scale-fits": Experiment(
+        page="scale", command="python -m eval.scale fits --out {out} --report docs/results/scale/fits"
+    ),
+    "mutants": Experiment(page="mutants", command="python -m eval.mutants --report docs/results/mutants"),
+    # Those that measure times come last: nothing else of this list runs beside them.
+    "decision": Experiment(
+        page="speed",
+        command="python -m eval.bench.decision --worlds 2 --out docs/results/speed/after.json",
+        one_core=True,
+    ),
+    "decision-twins": Experiment(
+        page="speed",
+        command="python -m eval.bench.decision --worlds 2 --out docs/results/speed/before.json",
+        one_core=True,
+        variables={"POTLP_NATIVE": "0"},
+    ),
+    "distances": Experiment(
+        page="planner",
+        command="python -m eval.bench.distances --repeats 3 --out docs/results/planner/distances.json "
+        "--plot docs/results/planner/distances.png",
+        one_core=True,
+    ),
+    "native": Experiment(page="planner", command="python -m eval.bench.native", one_core=True),
+    "ended": Experiment(
+        page="planner", command="python -m eval.bench.ended --instances 60 --simulations 500 --seconds 2 --out {out}"
+    ),
+    "regret": Experiment(
+        page="planner", command="python -m eval.bench.regret --instances 8 --seconds 10 --out {out}", one_core=True
+    ),
+    "throughput": Experiment(
+        page="planner",
+        command="python -m eval.bench.throughput --batches 1 64 --simulations 300 --repeats 3 --out {out}",
+        one_core=True,
+    ),
+}
+"""By the name that ``--only`` takes, in the order in which they run."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Run:
+    """What all experiments of one run share."""
+
+    out: Path
+    data: Path | None
+    processes: int
+    commit: str
+
+    def words(self, name: str) -> list[str]:
+        """The command of an experiment."""
+        return [self._filled(word, name) for word in shlex.split(EXPERIMENTS[name].command)]
+
+    def variables(self, name: str) -> dict[str, str]:
+        """What the experiment's environment has beside what is there."""
+        return {key: self._filled(value, name) for key, value in EXPERIMENTS[name].variables.items()}
+
+    def done_file(self, name: str) -> Path:
+        """Where it is written that an experiment is finished."""
+        return self.out / f"{name}.json"
+
+    def is_done(self, name: str) -> bool:
+        """Whether it was finished at this commit, by this command."""
+        file = self.done_file(name)
+        if not file.exists():
+            return False
+        done = json.loads(file.read_text("utf-8"))
+        return (done["commit"], done["words"]) == (self.commit, self.words(name))
+
+    def _filled(self, text: str, name: str) -> str:
+        return text.format(out=self.out / name, all=self.out, data=self.data, processes=self.processes)
+
+
+def left_out(run: Run, names: Iterable[str]) -> dict[str, str]:
+    """The experiments that cannot run here, and why."""
+    return {
+        name: "it reads maps or plans of others: name their folder with --data"
+        for name in names
+        if EXPERIMENTS[name].needs_data and run.data is None
+    }
+
+
+def perform(run: Run, names: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Run what is not done, one after the other; gives the name of each and what is written down of it.
+
+    Output goes to a log for each. Only what ended well is written down as done.
+    """
+    run.out.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        if run.is_done(name):
+            continue
+        (run.out / name).mkdir(exist_ok=True)
+        began, words = time.monotonic(), run.words(name)
+        with (run.out / f"{name}.log").open("a", encoding="utf-8") as log:
+            code = subprocess.run(
+                [_PROGRAMS[words[0]], *words[1:]],
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, **run.variables(name)},
+                preexec_fn=_keep_to_one_core if EXPERIMENTS[name].one_core else None,
+                check=False,
+            ).returncode
+        ended = {"words": words, "commit": run.commit, "seconds": round(time.monotonic() - began, 1), "code": code}
+        if code == 0:
+            run.done_file(name).write_text(json.dumps(ended, indent=1) + "\n", "utf-8")
+        yield name, ended
+
+
+def _keep_to_one_core() -> None:
+    # Only Linux can; elsewhere the system places the process.
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+
+def listing() -> str:
+    """The table of ``--list``."""
+    lines = [f"{'experiment':16s}{'page':16s}{'hours':>6s}  command"]
+    for name, experiment in EXPERIMENTS.items():
+        hours = "?" if experiment.hours is None else f"{experiment.hours:.1f}"
+        lines.append(f"{name:16s}{experiment.page:16s}{hours:>6s}  {experiment.command}")
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Command line; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--list", action="store_true", help="print what there is and stop")
+    parser.add_argument("--out", type=Path, help="folder of logs and of what the experiments keep")
+    parser.add_argument("--data", type=Path, help="folder with maps/ and floorplans/ of others")
+    parser.add_argument("--only", nargs="+", choices=list(EXPERIMENTS), default=list(EXPERIMENTS), metavar="NAME")
+    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    arguments = parser.parse_args()
+    if arguments.list:
+        print(listing())
+        return 0
+    if arguments.out is None:
+        parser.error("name a folder with --out, or use --list")
+    # As they were typed: results hold the command that made them, and no folder of one machine.
+    data = arguments.data
+    if data is not None and not (data / "maps").is_dir():
+        raise ConfigurationError(f"{data} has no folder maps; name the folder with maps/ and floorplans/ in it")
+    run = Run(out=arguments.out, data=data, processes=arguments.processes, commit=source_commit())
+    missing = left_out(run, arguments.only)
+    for name, why in missing.items():
+        print(f"{name}: left out: {why}", flush=True)
+    failed = []
+    for name, ended in perform(run, [name for name in arguments.only if name not in missing]):
+        how = "done" if ended["code"] == 0 else f"failed with exit code {ended['code']}: see {run.out / name}.log"
+        print(f"{name}: {how}, {ended['seconds'] / 60:.1f} minutes", flush=True)
+        failed += [name] if ended["code"] else []
+    return int(bool(failed or missing))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

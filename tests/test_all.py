@@ -1,0 +1,101 @@
+"""One command for every experiment: its commands are real, every page has one, and a run that is killed goes on."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from eval import all as everything
+from eval.all import EXPERIMENTS, Experiment, Run, left_out, perform
+from tests.reference.mentions import parse_module, parse_potlp
+
+RESULTS = Path(__file__).parents[1] / "docs" / "results"
+WITHOUT = {
+    "index": "it quotes the others",
+    "dropped": "what was tried once and is gone",
+    "estimator": "its commands need data sets that are collected first, and stand on the page",
+}
+"""Pages of results that no experiment makes."""
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_commands_are_read_by_their_programs(name, tmp_path):
+    program, *words = Run(out=tmp_path, data=tmp_path, processes=2, commit="").words(name)
+    wrong = parse_potlp(words) if program == "potlp" else parse_module(words[1], words[2:])
+    assert wrong is None
+
+
+def test_every_page_of_results_has_an_experiment():
+    pages = {experiment.page for experiment in EXPERIMENTS.values()}
+    assert pages | set(WITHOUT) == {file.stem for file in RESULTS.glob("*.md")}
+    assert not pages & set(WITHOUT)
+
+
+@pytest.fixture
+def small(monkeypatch, tmp_path):
+    """Three experiments that count how often they run; the second ends well only where a file is."""
+    counts = "import sys, pathlib; file = pathlib.Path(sys.argv[1]); file.open('a').write('x')"
+    fails = f"{counts}; sys.exit(0 if pathlib.Path(sys.argv[2]).exists() else 3)"
+    mended = tmp_path / "mended"
+    experiments = {
+        "first": Experiment(page="index", command=f'python -c "{counts}" {{out}}/count'),
+        "second": Experiment(page="index", command=f'python -c "{fails}" {{out}}/count {mended}'),
+        "third": Experiment(
+            page="index", command=f'python -c "{counts}" {{out}}/count', variables={"POTLP_X": "{all}"}
+        ),
+    }
+    monkeypatch.setattr(everything, "EXPERIMENTS", experiments)
+    return Run(out=tmp_path / "out", data=None, processes=1, commit="abc"), mended
+
+
+def _counts(run):
+    return [len((run.out / name / "count").read_text()) for name in ("first", "second", "third")]
+
+
+def test_what_is_done_is_not_run_again_and_a_failure_stops_nothing(small):
+    run, mended = small
+    names = ["first", "second", "third"]
+    assert [(name, ended["code"]) for name, ended in perform(run, names)] == [("first", 0), ("second", 3), ("third", 0)]
+    mended.touch()
+    assert [(name, ended["code"]) for name, ended in perform(run, names)] == [("second", 0)]
+    assert _counts(run) == [1, 2, 1]
+    assert not list(perform(run, names))
+
+
+def test_another_commit_or_command_is_run(small):
+    run, mended = small
+    mended.touch()
+    assert len(list(perform(run, ["first", "third"]))) == 2
+    other = Run(out=run.out, data=None, processes=1, commit="def")
+    assert [name for name, _ in perform(other, ["first", "third"])] == ["first", "third"]
+    everything.EXPERIMENTS["first"] = Experiment(page="index", command='python -c "pass"')
+    assert [name for name, _ in perform(other, ["first", "third"])] == ["first"]
+
+
+def test_it_goes_on_after_a_kill(small):
+    run, mended = small
+    mended.touch()
+    for name, _ in perform(run, ["first", "second", "third"]):
+        if name == "first":
+            break  # as if the process had ended here
+    assert [name for name, _ in perform(run, ["first", "second", "third"])] == ["second", "third"]
+
+
+def test_what_reads_others_data_is_left_out_by_name(tmp_path):
+    without = left_out(Run(out=tmp_path, data=None, processes=1, commit=""), EXPERIMENTS)
+    assert {"delivery", "real-maps", "floors"} <= without.keys()
+    assert "table1" not in without
+    assert not left_out(Run(out=tmp_path, data=tmp_path, processes=1, commit=""), EXPERIMENTS)
+
+
+def test_the_command_says_what_failed_and_what_was_left_out(small, monkeypatch, capsys):
+    run, _ = small
+    everything.EXPERIMENTS["maps"] = Experiment(page="index", command='python -c "pass" {data}')
+    monkeypatch.setattr(sys, "argv", ["all", "--out", str(run.out), "--only", "first", "second", "maps"])
+    assert everything.main() == 1
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].startswith("maps: left out: ")
+    assert said[1].startswith("first: done, ")
+    assert said[2].startswith(f"second: failed with exit code 3: see {run.out / 'second'}.log")
+    assert json.loads((run.out / "first.json").read_text())["code"] == 0
