@@ -8,6 +8,7 @@ tries ``z' -> z''`` in the unknown space beyond; the last action, ``S * E``, fin
 import dataclasses
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -119,8 +120,9 @@ class PlanningProblem:
         """
         # Shapes first: the masks of values below rely on them.
         check_shapes(self)
-        for name, wrong in _wrong_entries(self).items():
-            _refuse(name, np.asarray(getattr(self, name)), np.asarray(wrong))
+        wrong = _wrong_entries_of_one(self)
+        for name in _RULES:
+            _refuse(name, np.asarray(getattr(self, name)), np.asarray(wrong[name]))
 
 
 def screen(problem: PlanningProblem) -> tuple[PlanningProblem, Bool[Array, ""]]:
@@ -282,6 +284,10 @@ def _wrong_entries(problem: PlanningProblem) -> dict[str, Bool[Array, "..."]]:
     }
     present = _present_entries(problem)
     return {name: present[name] & ~entries for name, entries in right.items()}
+
+
+# One program: operation by operation a host would compile some twenty.
+_wrong_entries_of_one = jax.jit(_wrong_entries)
 
 
 def _is_path_cost(values: Float32[Array, "*N"]) -> Bool[Array, "*N"]:
