@@ -138,9 +138,9 @@ def test_agrees_with_sampled_search():
 
 @pytest.fixture(scope="module")
 def rare_successes():
-    """256 problems in which attempts mostly fail, so that the guess at what follows matters."""
+    """Attempts mostly fail, so that the guess at what follows matters. `eval.bench.ended` has many more problems."""
     made = []
-    for i in range(256):
+    for i in range(96):
         task = task_of(FORMULAS[i % len(FORMULAS)])
         fields = random_fields(task, SUBGOALS, 1000 + i, finish_chance=0.1)
         chances = np.random.default_rng(i).choice([0.0, 0.05, 0.1, 0.2, 0.5], fields["success_probability"].shape)
@@ -166,7 +166,7 @@ def assert_ended_searches_are_exact(plans, solutions):
 
 def test_an_ended_search_is_exact(rare_successes, rare_solutions):
     plans = plan_many(rare_successes, keys(len(rare_successes)), BestFirstConfig(simulations=400))
-    assert assert_ended_searches_are_exact(plans, rare_solutions) > 100
+    assert assert_ended_searches_are_exact(plans, rare_solutions) > 36
 
 
 @pytest.mark.parametrize("family", ["rare", "shared"])
