@@ -107,9 +107,11 @@ def test_answers_equal_the_network_asked_pair_by_pair(world, task, trained, reso
     belief = observe(BeliefMap.unobserved(world), world, world.start, NEAR.sensor)
     subgoals = find_subgoals(belief, belief.free, jnp.zeros(world.shape), FrontierConfig())
     eyes = observe_panorama(trained.start(*world.shape, 4), render(world, world.start), belief, world.start)
-    estimates = eyes(belief, subgoals, task.arrays)
+    estimates = jax.jit(lambda eyes, *asked: eyes(*asked))(eyes, belief, subgoals, task.arrays)
     network = EstimatorNetwork(trained.config)
-    features = network.encode(trained.params, render(world, world.start))
+    # Operation by operation they would be hundreds of programs.
+    encode, centre, answer_of = jax.jit(network.encode), jax.jit(network.centre), jax.jit(network.answer)
+    features = encode(trained.params, render(world, world.start))
     start = tuple(world.start.tolist())
     count = int(subgoals.mask.sum())
     assert count > 0
@@ -121,9 +123,9 @@ def test_answers_equal_the_network_asked_pair_by_pair(world, task, trained, reso
         row, column = subgoals.cells[s].tolist()
         angle = jnp.float32(math.atan2(row - start[0], column - start[1]))
         distance = jnp.float32(resolution * distances[((row, column), 0)])
-        centred = network.centre(features, angle[None], distance[None])
+        centred = centre(features, angle[None], distance[None])
         for c, (stay, go) in enumerate(task.classes):
-            answer = network.answer(trained.params, centred, jnp.asarray([stay], jnp.int8), jnp.asarray([go], jnp.int8))
+            answer = answer_of(trained.params, centred, jnp.asarray([stay], jnp.int8), jnp.asarray([go], jnp.int8))
             chances[s, c] = answer.success_probability[0]
             pair = (estimates.success_cost, estimates.failure_cost)
             expected = (answer.success_cost, answer.failure_cost)

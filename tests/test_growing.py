@@ -1,6 +1,7 @@
 """Arrays of subgoals that grow: a trial that begins with a short one is that which had a long one from the start."""
 
 import dataclasses
+import functools
 import itertools
 from types import SimpleNamespace
 
@@ -91,6 +92,7 @@ class Counter:
 COUNTER = Counter(memory=jnp.int32(0))
 
 
+@functools.cache
 def _trial(number, policy, config):
     return run_trial(_world(number), TASK, policy, jax.random.key(number), config, estimator=COUNTER)
 

@@ -22,6 +22,7 @@ from potlp_jax.learning.imagined_paths import (
 from potlp_jax.learning.squares import EAST, NORTH, PASSAGES, SOUTH, SQUARE, WEST, true_squares
 from potlp_jax.world.grid import BeliefMap
 
+_outlook = jax.jit(outlook)
 NAMES = ("goal", "hazard")
 SHARE, DISTANCE, SEEN = 2, 4, 5
 
@@ -135,7 +136,7 @@ def test_the_first_lanes_have_the_outlook_that_they_have_together(count) -> None
     cells, letters = house()
     scene, subgoals, stay = asked(cells, letters, left_part(cells), [(row % 18 + 1, 9) for row in range(20)])
     found = jax.jit(outlook_of_first)(jnp.int32(count), scene, subgoals, stay)
-    for some, every in zip(jax.tree.leaves(found), jax.tree.leaves(outlook(scene, subgoals, stay)), strict=True):
+    for some, every in zip(jax.tree.leaves(found), jax.tree.leaves(_outlook(scene, subgoals, stay)), strict=True):
         assert np.any(np.asarray(every) != 0, axis=tuple(range(1, every.ndim))).all()
         np.testing.assert_allclose(some[:count], every[:count], rtol=1e-5, atol=1e-5)
         assert not np.asarray(some[count:]).any()

@@ -30,6 +30,9 @@ from potlp_jax.world.grid import make_world
 from potlp_jax.world.renderer import render
 from potlp_jax.world.sensing import SensorConfig
 
+# Operation by operation they would be hundreds of programs.
+_render = jax.jit(render, static_argnums=2)
+_paint = jax.jit(paint, static_argnums=4)
 NAMES = ("goal", "hazard")
 CONFIG = TrialConfig(
     sensor=SensorConfig(range_cells=3.0),
@@ -168,7 +171,7 @@ def test_pictures_of_the_way_are_those_of_its_cells():
     between = [step for step in _looks(run, 1) if step not in {decision.step for decision in run.decisions}]
     assert len(between) == len(seen_before)
     for step, image in zip(between, seen_before, strict=True):
-        own = np.asarray(render(WORLD, jnp.asarray(run.path[step], jnp.int32), config.camera)).astype(int)
+        own = np.asarray(_render(WORLD, jnp.asarray(run.path[step], jnp.int32), config.camera)).astype(int)
         # The noise has a mean of 0; another cell's picture differs by much more.
         assert np.abs(image - own).mean() < 12
     assert len({image.tobytes() for image in seen_before}) == len(seen_before)
@@ -190,7 +193,7 @@ def test_a_collection_paints_what_the_camera_sees_on_the_way(every):
     def photograph(cell, step):
         asked.append(step)
         assert cell == trial.path[step]
-        return np.asarray(render(WORLD, jnp.asarray(cell, jnp.int32), config.camera))
+        return np.asarray(_render(WORLD, jnp.asarray(cell, jnp.int32), config.camera))
 
     keeping = Keeping(0, config, WeightBounds.of_map(*WORLD.shape, 1.0))
     recording.record_views(keeping, WORLD, poses, [TASK], np.random.default_rng(0), photograph, most=100)
@@ -202,7 +205,7 @@ def test_a_collection_paints_what_the_camera_sees_on_the_way(every):
         while number < len(steps) and steps[number] <= decision.step:
             cell = jnp.asarray(trial.path[steps[number]], jnp.int32)
             belief = trial.belief_at(decision.step)
-            expected = paint(expected, render(WORLD, cell, config.camera), belief, cell, config.camera)
+            expected = _paint(expected, _render(WORLD, cell, config.camera), belief, cell, config.camera)
             number += 1
         # Where no subgoal is left nothing is recorded.
         if decision.step in painted:

@@ -24,9 +24,15 @@ NETWORK = EstimatorNetwork(CONFIG)
 COLUMNS = CONFIG.feature_shape[1]
 
 
+# Operation by operation they would be hundreds of programs.
+_init = jax.jit(EstimatorNetwork.init, static_argnums=0)
+_encode = jax.jit(EstimatorNetwork.encode, static_argnums=0)
+_answer = jax.jit(EstimatorNetwork.answer, static_argnums=0)
+
+
 @pytest.fixture(scope="module")
 def params():
-    return NETWORK.init(jax.random.key(3))
+    return _init(NETWORK, jax.random.key(3))
 
 
 def _images(count, seed=0):
@@ -45,11 +51,11 @@ def _questions(shape, seed=1):
 def _centred(network, params, image, bearing, distance):
     """Of one image toward subgoals, or of several, each toward its own."""
     centre = network.centre if image.ndim == 3 else jax.vmap(network.centre)
-    return centre(network.encode(params, image), bearing, distance)
+    return jax.jit(centre)(_encode(network, params, image), bearing, distance)
 
 
 def _answers(params, image, bearing, distance, phi_stay, phi_go):
-    return NETWORK.answer(params, _centred(NETWORK, params, image, bearing, distance), phi_stay, phi_go)
+    return _answer(NETWORK, params, _centred(NETWORK, params, image, bearing, distance), phi_stay, phi_go)
 
 
 @pytest.mark.parametrize("columns", [1, 3, -2])
@@ -98,27 +104,27 @@ def test_centring_brings_the_bearing_into_the_centre():
 
 def test_the_fovea_changes_answers_and_nothing_of_a_network_without_it(params):
     network = EstimatorNetwork(dataclasses.replace(CONFIG, fovea=5))
-    keen = network.init(jax.random.key(3))
+    keen = _init(network, jax.random.key(3))
     image, (bearing, distance, *phi) = _images(1), _questions((1,))
     centred = _centred(network, keen, image, bearing, distance)
     without = _centred(NETWORK, params | {"first": keen["first"]}, image, bearing, distance)
     np.testing.assert_array_equal(centred.features, without.features)
     assert without.fovea is None
-    answer = network.answer(keen, centred, *phi)
-    blind = network.answer(keen, dataclasses.replace(centred, fovea=jnp.zeros_like(centred.fovea)), *phi)
+    answer = _answer(network, keen, centred, *phi)
+    blind = _answer(network, keen, dataclasses.replace(centred, fovea=jnp.zeros_like(centred.fovea)), *phi)
     assert float(answer.success_logit[0]) != float(blind.success_logit[0])
 
 
 def test_what_the_fovea_says_depends_on_who_is_looked_for(params):
     """Two patches differ by one amount for one phi and by another for another: the condition does more than add."""
     network = EstimatorNetwork(dataclasses.replace(CONFIG, fovea=5))
-    keen = network.init(jax.random.key(3))
+    keen = _init(network, jax.random.key(3))
     bearing, distance, stay, go = _questions((1,))
     centred = _centred(network, keen, _images(1), bearing, distance)
     other = dataclasses.replace(centred, fovea=-centred.fovea)
 
     def difference(go):
-        pair = [network.answer(keen, seen, stay, go).success_logit[0] for seen in (centred, other)]
+        pair = [_answer(network, keen, seen, stay, go).success_logit[0] for seen in (centred, other)]
         return float(pair[0] - pair[1])
 
     assert difference(go) != pytest.approx(difference(-go), rel=1e-2)
@@ -170,7 +176,7 @@ def test_gradients_reach_every_parameter(fovea):
         answers = network.answer(params, _centred(network, params, image, bearing, distance), stay, go)
         return jnp.sum(answers.success_logit + answers.success_cost + answers.failure_cost)
 
-    gradients = jax.tree_util.tree_leaves_with_path(jax.grad(total)(network.init(jax.random.key(3))))
+    gradients = jax.tree_util.tree_leaves_with_path(jax.jit(jax.grad(total))(_init(network, jax.random.key(3))))
     assert [jax.tree_util.keystr(path) for path, leaf in gradients if not np.any(leaf)] == []
     assert all(np.all(np.isfinite(leaf)) for _, leaf in gradients)
 

@@ -260,7 +260,7 @@ def test_the_optimism_gap_says_what_its_description_says(rare_successes, rare_so
     gap, value, optimum = np.asarray(plans.optimism_gap), np.asarray(plans.value), [x.value for x in solutions]
     chooses = np.asarray(plans.action) != NO_ACTION
     closed = chooses & (gap == 0)
-    assert closed.sum() > 100
+    assert closed.sum() > 36
     for i in np.flatnonzero(closed):
         assert value[i] >= solutions[i].q_values[int(plans.action[i])] * (1 - 1e-5)
     # Values that are too low, by more than the gap: what it measures lies on the other side.
