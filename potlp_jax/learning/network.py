@@ -271,10 +271,11 @@ class EstimatorNetwork:
 
     def init(self, key: PRNGKeyArray) -> Params:
         """New parameters: normal with the standard deviations of the modules' initialisers, biases 0."""
-        # Shapes alone decide the deviations: they are computed once, without a draw.
-        # One random vector for all: drawn leaf by leaf, the generator is compiled once for each.
-        deviations = jax.jit(self._deviations)()
-        leaves, structure = jax.tree.flatten(deviations)
+        # One program, and one random vector for all: drawn leaf by leaf, the generator is compiled once for each.
+        return jax.jit(self._drawn)(key)
+
+    def _drawn(self, key: PRNGKeyArray) -> Params:
+        leaves, structure = jax.tree.flatten(self._deviations())
         noise = jax.random.normal(key, (sum(leaf.size for leaf in leaves),))
         ends = np.cumsum([leaf.size for leaf in leaves]).tolist()
         parts = [noise[end - leaf.size : end].reshape(leaf.shape) for end, leaf in zip(ends, leaves, strict=True)]

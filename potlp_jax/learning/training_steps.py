@@ -77,7 +77,8 @@ def initial_state(learner: Learner, config: TrainingConfig, params: Any = None) 
         step=jnp.int32(0),
         key=jax.random.key_data(of_augmentation),
         params=params,
-        optimizer=make_optimizer(config).init(params),
+        # One program: operation by operation there would be one for each shape of a parameter.
+        optimizer=jax.jit(make_optimizer(config).init)(params),
         average=params,
         # Until the first evaluation; its infinite loss is beaten by any.
         best=params,
