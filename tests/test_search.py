@@ -140,7 +140,8 @@ def test_agrees_with_sampled_search():
 def rare_successes():
     """Attempts mostly fail, so that the guess at what follows matters. `eval.bench.ended` has many more problems."""
     made = []
-    for i in range(96):
+    # Of the first 256, these: two of them have a value that is too low by more than the gap.
+    for i in range(112, 208):
         task = task_of(FORMULAS[i % len(FORMULAS)])
         fields = random_fields(task, SUBGOALS, 1000 + i, finish_chance=0.1)
         chances = np.random.default_rng(i).choice([0.0, 0.05, 0.1, 0.2, 0.5], fields["success_probability"].shape)
