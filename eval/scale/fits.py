@@ -137,7 +137,8 @@ def draw(runs: Sequence[Mapping[str, Any]], file: Path) -> None:
         if number:
             below.semilogy(steps, apart, marker="o", color=above.lines[-1].get_color())
     above.set_ylabel("validation loss")
-    above.legend(fontsize=7)
+    for line in above.legend(fontsize=7).get_lines():
+        line.set_linewidth(2)
     below.set_ylabel(f"relative difference\nfrom {runs[0]['run']}")
     below.set_xlabel("steps")
     save_figure(figure, file)
