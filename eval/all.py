@@ -1,4 +1,4 @@
-"""Every experiment behind docs/results, one after the other, on one commit.
+"""The experiments behind docs/results, one after the other, on one commit.
 
     python -m eval.all --list                                   # what there is, what it writes, how long it takes
     python -m eval.all --out out/all --data DATA --processes 2
@@ -8,10 +8,13 @@
 and named. Each experiment is a command of its own, as its page quotes it, and has a log in ``--out``; those that work
 in steps keep them in a folder there. Killed, the same command goes on: what was finished at this commit is not run
 again, and what was begun goes on from its own folder. One that fails is named at the end, and does not stop the others.
+Some commands write their page's data, others print tables: those are in the log, and are carried to the page by hand.
+The page of the fire-fighting estimator needs data sets that are collected first, and is not among them.
 """
 
 import argparse
 import dataclasses
+import fcntl
 import json
 import os
 import shlex
@@ -20,7 +23,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from potlp_jax.errors import ConfigurationError
 from potlp_jax.sweep.rows import source_commit
@@ -200,6 +203,9 @@ def perform(run: Run, names: Sequence[str]) -> Iterator[tuple[str, dict[str, Any
     """Run what is not done, one after the other; gives the name of each and what is written down of it.
 
     Output goes to a log for each. Only what ended well is written down as done.
+
+    Raises:
+        ConfigurationError: an experiment still runs that an earlier call began, which was killed.
     """
     run.out.mkdir(parents=True, exist_ok=True)
     for name in names:
@@ -208,24 +214,42 @@ def perform(run: Run, names: Sequence[str]) -> Iterator[tuple[str, dict[str, Any
         (run.out / name).mkdir(exist_ok=True)
         began, words = time.monotonic(), run.words(name)
         with (run.out / f"{name}.log").open("a", encoding="utf-8") as log:
-            code = subprocess.run(
-                [_PROGRAMS[words[0]], *words[1:]],
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env={**os.environ, **run.variables(name)},
-                preexec_fn=_keep_to_one_core if EXPERIMENTS[name].one_core else None,
-                check=False,
-            ).returncode
+            _lock(log)
+            code = _run(run, name, log)
         ended = {"words": words, "commit": run.commit, "seconds": round(time.monotonic() - began, 1), "code": code}
         if code == 0:
-            run.done_file(name).write_text(json.dumps(ended, indent=1) + "\n", "utf-8")
+            written = run.done_file(name).with_suffix(".tmp")
+            written.write_text(json.dumps(ended, indent=1) + "\n", "utf-8")
+            # A call that is killed leaves the whole file or none.
+            written.replace(run.done_file(name))
         yield name, ended
 
 
-def _keep_to_one_core() -> None:
-    # Only Linux can; elsewhere the system places the process.
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+def _lock(log: TextIO) -> None:
+    # The experiment has the log as its output and so holds the lock, too, as long as it lives.
+    try:
+        fcntl.flock(log, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise ConfigurationError(f"{log.name}: the experiment still runs; wait for its end, or end it") from None
+
+
+def _run(run: Run, name: str, log: TextIO) -> int:
+    """Run an experiment to its end; returns its exit code."""
+    program, *words = run.words(name)
+    process = subprocess.Popen(
+        [_PROGRAMS[program], *words],
+        stdout=log,
+        stderr=subprocess.STDOUT,
+        env={**os.environ, **run.variables(name)},
+    )
+    # Its threads come later and inherit this. Only Linux can; elsewhere the system places the process.
+    if EXPERIMENTS[name].one_core and hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(process.pid, {min(os.sched_getaffinity(0))})
+    try:
+        return process.wait()
+    except BaseException:
+        process.kill()
+        raise
 
 
 def listing() -> str:
@@ -254,17 +278,26 @@ def main() -> int:
     # As they were typed: results hold the command that made them, and no folder of one machine.
     data = arguments.data
     if data is not None and not (data / "maps").is_dir():
-        raise ConfigurationError(f"{data} has no folder maps; name the folder with maps/ and floorplans/ in it")
+        parser.error(f"{data} has no folder maps; name the folder with maps/ and floorplans/ in it")
     run = Run(out=arguments.out, data=data, processes=arguments.processes, commit=source_commit())
     missing = left_out(run, arguments.only)
     for name, why in missing.items():
         print(f"{name}: left out: {why}", flush=True)
+    try:
+        failed = _told(run, [name for name in arguments.only if name not in missing])
+    except ConfigurationError as error:
+        parser.error(str(error))
+    return int(bool(failed or missing))
+
+
+def _told(run: Run, names: Sequence[str]) -> list[str]:
+    """Run experiments, with a line for each; returns those that failed."""
     failed = []
-    for name, ended in perform(run, [name for name in arguments.only if name not in missing]):
+    for name, ended in perform(run, names):
         how = "done" if ended["code"] == 0 else f"failed with exit code {ended['code']}: see {run.out / name}.log"
         print(f"{name}: {how}, {ended['seconds'] / 60:.1f} minutes", flush=True)
         failed += [name] if ended["code"] else []
-    return int(bool(failed or missing))
+    return failed
 
 
 if __name__ == "__main__":

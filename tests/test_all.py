@@ -1,13 +1,18 @@
 """One command for every experiment: its commands are real, every page has one, and a run that is killed goes on."""
 
 import json
+import os
+import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from eval import all as everything
 from eval.all import EXPERIMENTS, Experiment, Run, left_out, perform
+from potlp_jax.errors import ConfigurationError
 from tests.reference.mentions import parse_module, parse_potlp
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
@@ -36,21 +41,20 @@ def test_every_page_of_results_has_an_experiment():
 def small(monkeypatch, tmp_path):
     """Three experiments that count how often they run; the second ends well only where a file is."""
     counts = "import sys, pathlib; file = pathlib.Path(sys.argv[1]); file.open('a').write('x')"
+    told = "import os, sys, pathlib; pathlib.Path(sys.argv[1]).write_text(os.environ['X'])"
     fails = f"{counts}; sys.exit(0 if pathlib.Path(sys.argv[2]).exists() else 3)"
     mended = tmp_path / "mended"
     experiments = {
         "first": Experiment(page="index", command=f'python -c "{counts}" {{out}}/count'),
         "second": Experiment(page="index", command=f'python -c "{fails}" {{out}}/count {mended}'),
-        "third": Experiment(
-            page="index", command=f'python -c "{counts}" {{out}}/count', variables={"POTLP_X": "{all}"}
-        ),
+        "third": Experiment(page="index", command=f'python -c "{told}" {{out}}/count', variables={"X": "{all}"}),
     }
     monkeypatch.setattr(everything, "EXPERIMENTS", experiments)
     return Run(out=tmp_path / "out", data=None, processes=1, commit="abc"), mended
 
 
 def _counts(run):
-    return [len((run.out / name / "count").read_text()) for name in ("first", "second", "third")]
+    return [len((run.out / name / "count").read_text()) for name in ("first", "second")]
 
 
 def test_what_is_done_is_not_run_again_and_a_failure_stops_nothing(small):
@@ -59,7 +63,8 @@ def test_what_is_done_is_not_run_again_and_a_failure_stops_nothing(small):
     assert [(name, ended["code"]) for name, ended in perform(run, names)] == [("first", 0), ("second", 3), ("third", 0)]
     mended.touch()
     assert [(name, ended["code"]) for name, ended in perform(run, names)] == [("second", 0)]
-    assert _counts(run) == [1, 2, 1]
+    assert _counts(run) == [1, 2]
+    assert (run.out / "third" / "count").read_text() == str(run.out)
     assert not list(perform(run, names))
 
 
@@ -73,13 +78,40 @@ def test_another_commit_or_command_is_run(small):
     assert [name for name, _ in perform(other, ["first", "third"])] == ["first"]
 
 
-def test_it_goes_on_after_a_kill(small):
-    run, mended = small
-    mended.touch()
-    for name, _ in perform(run, ["first", "second", "third"]):
-        if name == "first":
-            break  # as if the process had ended here
-    assert [name for name, _ in perform(run, ["first", "second", "third"])] == ["second", "third"]
+DRIVER = """
+import sys
+from pathlib import Path
+from eval import all as everything
+from eval.all import Experiment, Run, perform
+waits = "import os, pathlib, sys, time; pathlib.Path(sys.argv[1]).write_text(str(os.getpid())); time.sleep(600)"
+everything.EXPERIMENTS = {
+    "first": Experiment(page="index", command='python -c "pass"'),
+    "second": Experiment(page="index", command=f'python -c "{waits}" {{out}}/pid'),
+}
+list(perform(Run(out=Path(sys.argv[1]), data=None, processes=1, commit="abc"), ["first", "second"]))
+"""
+
+
+def test_it_goes_on_after_a_kill_once_what_it_had_begun_has_ended(monkeypatch, tmp_path):
+    run, names = Run(out=tmp_path / "out", data=None, processes=1, commit="abc"), ["first", "second"]
+    driver = subprocess.Popen([sys.executable, "-c", DRIVER, str(run.out)], cwd=RESULTS.parents[1])
+    pid = run.out / "second" / "pid"
+    while not (pid.exists() and pid.read_text()):
+        assert driver.poll() is None
+        time.sleep(0.05)
+    driver.kill()
+    driver.wait()
+    experiments = {name: Experiment(page="index", command='python -c "pass"') for name in names}
+    monkeypatch.setattr(everything, "EXPERIMENTS", experiments)
+    with pytest.raises(ConfigurationError, match=r"second.log: the experiment still runs"):
+        list(perform(run, names))
+    os.kill(int(pid.read_text()), signal.SIGKILL)
+    while True:
+        try:
+            assert [name for name, _ in perform(run, names)] == ["second"]
+            break
+        except ConfigurationError:
+            time.sleep(0.05)
 
 
 def test_what_reads_others_data_is_left_out_by_name(tmp_path):
