@@ -128,8 +128,9 @@ def _forget_programs() -> None:
 
 # Two workers and the processes that they start then fit into a small machine. A test adds up to half a gigabyte.
 _MOST_RESIDENT = 1.25e9
-# What forgetting did not give back stays: without room above it every test would begin without programs.
-_ROOM = 0.3e9
+# What forgetting did not give back stays: without room above it every test would begin without programs. But a process
+# may have 2 GB at most, with what one test adds.
+_ROOM, _LIMIT = 0.3e9, 1.6e9
 _STATM = Path("/proc/self/statm")
 _kept = 0.0
 
@@ -142,7 +143,7 @@ def _resident() -> float:
 def pytest_runtest_teardown() -> None:
     """A module with programs of many shapes begins anew where they take too much memory."""
     global _kept
-    if _resident() > max(_MOST_RESIDENT, _kept + _ROOM):
+    if _resident() > min(max(_MOST_RESIDENT, _kept + _ROOM), _LIMIT):
         _forget_programs()
         _kept = _resident()
 

@@ -68,8 +68,8 @@ def test_plans_and_trees_of_both_are_equal_to_the_bit(family, monkeypatch):
     if family in OF_ONE_SHAPE:
         larger = dataclasses.replace(FAMILIES[family], sizes=COMMON)
         monkeypatch.setattr(problems_module, "FAMILIES", {**FAMILIES, family: larger})
-    # The twin takes long where many actions are coupled, and what is coupled is the same to all of a program.
-    problems, config = _problems(family, 3, 6), BestFirstConfig(simulations=60)
+    # The twin takes long where many actions are coupled.
+    problems, config = _problems(family, 3 if family == "shared-joint" else 4, 6), BestFirstConfig(simulations=60)
     plans, trees = _search(problems, _keys(6), config)
     with twin_only():
         expected_plans, expected_trees = _search(problems, _keys(6), config)
