@@ -59,6 +59,8 @@ _SLOPE = 0.1
 _CLOSE, _NEAR = 2, 1
 # Cells over which the weight of what was seen from afar falls by a factor of e; not tuned.
 _PAINT_REACH = 20.0
+# The channel of ``map_channels`` that says whether a cell was painted.
+_PAINTED = 4
 # A coordinate of 100 cells enters the head as 1.
 _COORDINATE = 100.0
 
@@ -173,7 +175,7 @@ def channel_count(config: BuildingConfig) -> int:
 def _of_painting(channels: int) -> Bool[np.ndarray, " K"]:
     """Which of the channels of ``map_channels`` hold what was painted: a flag, the nearness and the colours."""
     index = np.arange(channels)
-    return (index == 4) | (index >= channels - 7)
+    return (index == _PAINTED) | (index >= channels - 7)
 
 
 def _dense(width: int, gain: float) -> nn.Dense:
@@ -186,7 +188,7 @@ def _convolution(width: int, gain: float) -> nn.Conv:
 
 def _painted_share(channels: Array) -> Array:
     """Of each square of two by two, the share that was painted, ``[..., rows, columns, 1]``."""
-    return jnp.mean(_halved(channels[..., 4:5]), axis=-1, keepdims=True)
+    return jnp.mean(_halved(channels[..., _PAINTED, None]), axis=-1, keepdims=True)
 
 
 def _activated(x: Array) -> Array:
