@@ -212,7 +212,7 @@ def test_every_instance_is_answered_by_its_own_row():
         _, actions = regret._in_batches(
             lambda batch, keys: np.asarray(batch.dead_end_cost) + keys, numbered, np.arange(5), rows
         )
-        assert actions == [cost + index for index, cost in enumerate(costs)]
+        assert actions.tolist() == [cost + index for index, cost in enumerate(costs)]
     answers = list(regret.numba_pouct(problems, [10, 3000]))
     assert [(name, budget) for name, budget, *_ in answers][:2] == [("po-uct-numba", 10), ("po-uct-numba", 3000)]
     assert answers[1][3] == [

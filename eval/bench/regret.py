@@ -44,17 +44,14 @@ from potlp_jax.errors import ProblemTooLargeError
 from potlp_jax.planning.exact.api import bound_exact, solve_exact
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions
-from potlp_jax.planning.search.best_first import BEST_FIRST
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
-from potlp_jax.planning.search.lockstep import SearchMethod
-from potlp_jax.planning.search.uct import UCT
 from potlp_jax.sweep.rows import provenance
-from potlp_jax.types import NO_ACTION
+from potlp_jax.types import NO_ACTION, Status
 
 TREE_BYTES = 1_000_000_000
 """Memory for trees: as many of our searches as fit run in one batch."""
 
-BEST_KNOWN = 10_000
+BEST_KNOWN = 100_000
 """Simulations that stand in for the exact solution where that is out of reach."""
 
 
@@ -125,59 +122,29 @@ def _long_search(problem: PlanningProblem, key: Any) -> Any:
 
 
 def ours(
-    name: str,
-    search: SearchMethod = BEST_FIRST,
-    kind: type[BestFirstConfig | UctConfig] = BestFirstConfig,
-    **settings: Any,
+    name: str, kind: type[BestFirstConfig | UctConfig] = BestFirstConfig, **settings: Any
 ) -> Callable[..., Iterator[Answer]]:
-    """One of our searches on all instances, in batches whose trees fit ``TREE_BYTES``; every budget goes on from the
-    one before."""
+    """One of our searches on all instances, compiled as users compile it, in batches whose trees fit ``TREE_BYTES``;
+    every budget begins anew."""
 
     def run(problems: Sequence[PlanningProblem], budgets: Sequence[int]) -> Iterator[Answer]:
-        config = kind(simulations=max(budgets), **settings)
-        rows = min(len(problems), max(1, TREE_BYTES // tree_memory(problems[0], config).total))
-        # The last rows are filled up from the front, so that every batch has the compiled shape.
-        firsts = [min(first, len(problems) - rows) for first in range(0, len(problems), rows)]
-        seeds = jax.vmap(lambda key: jax.random.bits(key, (2,), jnp.uint32))(
-            jax.random.split(jax.random.key(0), len(problems))
-        )
-
-        @jax.jit
-        def begin(problems: PlanningProblem, seeds: Any) -> tuple[Any, Any]:
-            context = search.prepare(problems, seeds, config)
-            return context, search.plant(context, config)
-
-        def unfinished(context: Any, carry: tuple[Any, Any]) -> Any:
-            return (carry[0] > 0) & jnp.any(search.is_open(context, carry[1]))
-
-        @jax.jit
-        def advance(context: Any, tree: Any, count: Any) -> tuple[Any, Any]:
-            def step(carry: tuple[Any, Any]) -> tuple[Any, Any]:
-                return carry[0] - 1, search.simulate(context, carry[1], config)
-
-            tree = jax.lax.while_loop(functools.partial(unfinished, context), step, (count, tree))[1]
-            return tree, (search.choose(context, tree).action, ~search.is_open(context, tree))
-
-        jax.block_until_ready(advance(*begin(_stack(problems[:rows]), seeds[:rows]), jnp.int32(1)))
-        seconds = np.zeros(len(budgets))
-        actions, ended = (np.zeros((len(budgets), len(problems)), dtype) for dtype in (np.int64, np.bool_))
-        for first in firsts:
-            own = slice(first, first + rows)
-            stacked = _stack(problems[own])
-            start = time.process_time()
-            context, tree = jax.block_until_ready(begin(stacked, seeds[own]))
-            spent, before = time.process_time() - start, 0
-            for level, budget in enumerate(budgets):
-                start = time.process_time()
-                tree, answer = jax.block_until_ready(advance(context, tree, jnp.int32(budget - before)))
-                spent, before = spent + time.process_time() - start, budget
-                seconds[level] += spent
-                actions[level, own], ended[level, own] = answer
-        for level, budget in enumerate(budgets):
-            time_of_one = float(seconds[level]) / (len(firsts) * rows)
-            yield name, budget, time_of_one, actions[level].tolist(), ended[level].tolist()
+        keys = jax.random.split(jax.random.key(0), len(problems))
+        for budget in budgets:
+            config = kind(simulations=budget, **settings)
+            rows = min(len(problems), max(1, TREE_BYTES // tree_memory(problems[0], config).total))
+            compiled = jax.jit(jax.vmap(functools.partial(_choice, config=config)))
+            jax.block_until_ready(compiled(_stack(problems[:rows]), keys[:rows]))
+            seconds, (actions, ended) = _in_batches(compiled, problems, keys, rows)
+            yield name, budget, seconds, actions.tolist(), ended.tolist()
 
     return run
+
+
+def _choice(problem: PlanningProblem, key: Any, config: BestFirstConfig | UctConfig) -> tuple[Any, Any]:
+    """The chosen action, and whether the search ended by itself."""
+    plan = plan_actions(problem, key, config)
+    overflows = plan.status & jnp.uint32(int(Status.DEPTH_OVERFLOW | Status.TREE_OVERFLOW))
+    return plan.action, (plan.lower_bound >= plan.value) & (overflows == 0)
 
 
 def numba_pouct(problems: Sequence[PlanningProblem], budgets: Sequence[int]) -> Iterator[Answer]:
@@ -208,28 +175,28 @@ def mctx(problems: Sequence[PlanningProblem], budgets: Sequence[int]) -> Iterato
         seconds, actions = _in_batches(
             lambda batch, _, compiled=compiled: compiled(batch, key).action, problems, np.arange(len(problems)), rows
         )
-        yield "mctx", budget, seconds, actions, [False] * len(problems)
+        yield "mctx", budget, seconds, actions.tolist(), [False] * len(problems)
 
 
 def _in_batches(
     run: Callable[[PlanningProblem, Any], Any], problems: Sequence[PlanningProblem], keys: Any, rows: int
-) -> tuple[float, list[int]]:
-    """Run so many rows at once; returns CPU seconds per row and the action of every problem."""
-    seconds, actions = 0.0, []
+) -> tuple[float, Any]:
+    """Run so many rows at once; returns CPU seconds per row and the arrays that ``run`` gives, a row a problem."""
+    seconds, parts = 0.0, []
     for first in range(0, len(problems), rows):
         # The last rows are filled up from the front, so that every call has the compiled shape.
-        first = min(first, len(problems) - rows)
-        batch = _stack(problems[first : first + rows])
+        start_row = min(first, len(problems) - rows)
+        batch = _stack(problems[start_row : start_row + rows])
         start = time.process_time()
-        answers = np.asarray(run(batch, keys[first : first + rows]))
+        answers = jax.block_until_ready(run(batch, keys[start_row : start_row + rows]))
         seconds += time.process_time() - start
-        actions[first:] = answers.tolist()
-    return seconds / (-(-len(problems) // rows) * rows), actions
+        parts.append(jax.tree.map(lambda leaf, known=first - start_row: np.asarray(leaf)[known:], answers))
+    return seconds / (len(parts) * rows), jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
 PLANNERS: dict[str, Callable[..., Iterator[Answer]]] = {
     "best-first": ours("best-first"),
-    "po-uct": ours("po-uct", UCT, UctConfig),
+    "po-uct": ours("po-uct", UctConfig),
     "po-uct-numba": numba_pouct,
     "po-uct-pomdp-py": pomdp_py,
     "mctx": mctx,
