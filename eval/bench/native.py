@@ -121,7 +121,7 @@ def measure(family: str, batch: int, simulations: int, repeats: int) -> Row:
 
 
 def fresh_process_seconds(repeats: int) -> float:
-    """Wall seconds from the start of a process to the end of its first decision; the least, after one to fill caches."""
+    """Wall seconds from the start of a process to its first decision; the least, after one that fills caches."""
     seconds = []
     for _ in range(1 + repeats):
         began = time.perf_counter()
