@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from potlp_jax.cli.output import fail
 
 if TYPE_CHECKING:
-    from potlp_jax.environments.ros.map_files import OccupancyMap
+    from potlp_jax.environments.ros.occupancy_map import OccupancyMap
     from potlp_jax.environments.ros.places import Disc, Places, Point, Polygon, Region
 
 PLACE_RADIUS: float = 0.5

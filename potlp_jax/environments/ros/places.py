@@ -25,7 +25,8 @@ import yaml
 from jaxtyping import Bool, Float64, Int32
 from scipy import ndimage
 
-from potlp_jax.environments.ros.map_files import GridFrame, parse_number, parse_numbers, read_yaml
+from potlp_jax.environments.ros.grid_frame import GridFrame
+from potlp_jax.environments.ros.map_settings import parse_number, parse_numbers, read_yaml
 from potlp_jax.errors import MapError
 from potlp_jax.files import short
 

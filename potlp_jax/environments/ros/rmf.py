@@ -24,7 +24,8 @@ from pathlib import Path
 from typing import Any
 
 from potlp_jax.environments.ros.drawn_maps import Wall, draw_areas, drawn_map, enclosed, frame_around
-from potlp_jax.environments.ros.map_files import OccupancyMap, parse_number, read_yaml
+from potlp_jax.environments.ros.map_settings import parse_number, read_yaml
+from potlp_jax.environments.ros.occupancy_map import OccupancyMap
 from potlp_jax.environments.ros.places import Disc, Places, Point
 from potlp_jax.errors import MapError, MapWarning
 from potlp_jax.files import short
