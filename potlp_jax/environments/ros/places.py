@@ -33,6 +33,9 @@ from potlp_jax.files import short
 MAX_PROPOSITIONS = 16
 """As many as a letter has bits."""
 
+PLACE_RADIUS = 0.5
+"""Metres around a point that count as being there, where nothing gives a radius."""
+
 Point = tuple[float | int, float | int]
 """Metres (x, y) in the map's frame."""
 
