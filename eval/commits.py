@@ -31,7 +31,7 @@ from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.situation import DecisionConfig
-from potlp_jax.sweep.rows import provenance
+from potlp_jax.sweep.rows import provenance, source_commit
 from potlp_jax.task.task import Task, TaskArrays, TaskSizes
 from potlp_jax.trials.batch import Finished, Start, run_batch
 from potlp_jax.trials.config import TrialConfig
@@ -228,6 +228,7 @@ def _row(finished: Finished, task: Task, world: World, policy: Policy, config: T
         "outcome": str(finished.outcome),
         "cost": finished.cost,
         "status": finished.status,
+        "commit": source_commit(),
     }
     if finished.outcome is not Outcome.SATISFIED:
         # A batch keeps no decisions; the trial is the same alone.
@@ -239,7 +240,7 @@ def _row(finished: Finished, task: Task, world: World, policy: Policy, config: T
 
 
 def report(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Counts and costs by policy and rule."""
+    """Counts and costs by policy and rule, with the commits that the trials were run at."""
     table = []
     costs = {(row["policy"], row["irrevocable_last"], row["pair"]): row for row in rows}
     for policy in POLICIES:
@@ -266,7 +267,13 @@ def report(rows: list[dict[str, Any]]) -> dict[str, Any]:
                     "pairs where both rules satisfy": len(both),
                 }
             )
-    return {"provenance": provenance(), "pairs": len({row["pair"] for row in rows}), "policies": table}
+    return {
+        "provenance": provenance(),
+        # Chunks may have been run at other commits than the one that reports them.
+        "commits": sorted({row["commit"] for row in rows}),
+        "pairs": len({row["pair"] for row in rows}),
+        "policies": table,
+    }
 
 
 def _read(path: Path) -> list[dict[str, Any]]:

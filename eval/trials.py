@@ -34,7 +34,7 @@ from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.ros.cleaning import clean_map
-from potlp_jax.environments.ros.map_files import load_map
+from potlp_jax.environments.ros.occupancy_map import load_map
 from potlp_jax.environments.ros.places import Disc, Places
 from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig
 from potlp_jax.environments.splits import Split, world_key

@@ -20,7 +20,7 @@ from potlp_jax.drive.inbox import Inbox
 from potlp_jax.drive.lattice import Lattice, LatticeConfig, Scan, bucket
 from potlp_jax.drive.messages import make_path, make_pose, picture_of, pose_of, regions_of, scan_of, stamp_of
 from potlp_jax.drive.rosbridge import RosbridgeLink, parse_url
-from potlp_jax.environments.ros.map_files import GridFrame
+from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.places import Disc, Polygon
 from potlp_jax.errors import RobotError
 from potlp_jax.task.task import Task

@@ -33,7 +33,8 @@ from eval.faults.worker import Ending, _Clock, judged
 from eval.provenance import RESULTS
 from potlp_jax.codec import read_settings, settings_from_words
 from potlp_jax.environments.campus.floor_plan_xml import read_plan
-from potlp_jax.environments.ros.map_files import load_map, load_settings, parse_number
+from potlp_jax.environments.ros.map_settings import load_settings, parse_number
+from potlp_jax.environments.ros.occupancy_map import load_map
 from potlp_jax.environments.ros.places import load_places
 from potlp_jax.errors import CheckpointError, ConfigurationError, LogError, MapError, PotlpError, TaskError
 from potlp_jax.files import (

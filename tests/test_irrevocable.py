@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from eval.commits import CONFIG, POLICIES, SIZES, irrevocable_steps, pair, prior, run_chunk
+from eval.commits import CONFIG, POLICIES, SIZES, irrevocable_steps, pair, prior, report, run_chunk
 from eval.formulas import random_tasks
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.toy import Toy
 from potlp_jax.errors import TaskWarning
 from potlp_jax.planning.policies import Policy, decide
 from potlp_jax.planning.situation import assess
+from potlp_jax.sweep.rows import source_commit
 from potlp_jax.task import irrevocable
 from potlp_jax.task.irrevocable import inclusion, irrevocable_moves
 from potlp_jax.task.task import Task, TaskSizes
@@ -252,6 +253,11 @@ def test_random_pairs_end_satisfied_unless_a_move_was_forced():
         assert row["outcome"] == Outcome.SATISFIED or (moves.get("forced") and not moves.get("free")), row
     # The pairs are such that the rule matters.
     assert any(row["outcome"] == Outcome.INFEASIBLE for row in rows if not row["irrevocable_last"])
+    # A file of rows may have been continued at another commit.
+    others = [row | {"pair": 24 + row["pair"], "commit": "another"} for row in rows]
+    found = report(rows + others)
+    assert found["commits"] == sorted({source_commit(), "another"})
+    assert found["pairs"] == 48
 
 
 def test_under_vmap_each_map_has_its_own_moves():

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 from potlp_jax.cli import app
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.ros.cleaning import Cause, clean_map
-from potlp_jax.environments.ros.map_files import load_map
 from potlp_jax.environments.ros.map_writer import save_map
+from potlp_jax.environments.ros.occupancy_map import load_map
 from potlp_jax.environments.ros.places import Disc, Places, Polygon, load_places, save_places
 from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig
 from potlp_jax.environments.ros.survey import find_passages, survey_map

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from potlp_jax.environments.ros.map_files import GridFrame, load_map
+from potlp_jax.environments.ros.grid_frame import GridFrame
+from potlp_jax.environments.ros.occupancy_map import load_map
 from potlp_jax.errors import MapError, MapWarning
 from tests.reference.map_files import p2, p5, png, write_map
 
@@ -39,7 +40,7 @@ def test_every_image_format_gives_the_same_map(tmp_path, content):
     assert loaded.occupied.tolist() == [[True, False, False], [False, True, False]]
 
 
-@pytest.mark.filterwarnings("ignore::potlp_jax.environments.ros.map_files.MapWarning")
+@pytest.mark.filterwarnings("ignore::potlp_jax.errors.MapWarning")
 def test_thresholds_are_exact(tmp_path):
     """50/255 = 0.19608 is not below 0.196, 51/255 = 0.2 is neither above nor below 0.2."""
     content = p5([[0, 203, 204, 205, 206, 255]])
@@ -77,7 +78,7 @@ def test_every_grey_by_the_definition(tmp_path_factory, thresholds, negate, mode
     assert loaded.occupied.tolist() == [[occupancy > high for occupancy in occupancies]]
 
 
-@pytest.mark.filterwarnings("ignore::potlp_jax.environments.ros.map_files.MapWarning")
+@pytest.mark.filterwarnings("ignore::potlp_jax.errors.MapWarning")
 def test_alpha_is_averaged_in_trinary_mode_and_means_unknown_in_scale_mode(tmp_path):
     # blue, green, red, alpha; black and opaque has the mean 63.75 (occupancy 0.75), black and clear 0.
     pixels = np.array([[[0, 0, 0, 255], [0, 0, 0, 0], [255] * 4, [255, 255, 255, 100], [120] * 3 + [255]]], np.uint8)

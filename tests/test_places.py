@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from potlp_jax.environments.ros.map_files import GridFrame
+from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.places import Disc, Places, Polygon, load_places, place_letters
 from potlp_jax.errors import MapError
 from tests.reference.map_files import PLACES, TWO_ROOMS, occupancy_map

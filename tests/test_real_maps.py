@@ -11,7 +11,8 @@ import yaml
 from matplotlib.path import Path as Outline
 
 from potlp_jax.environments.ros.cleaning import clean_map
-from potlp_jax.environments.ros.map_files import GridFrame, load_map
+from potlp_jax.environments.ros.grid_frame import GridFrame
+from potlp_jax.environments.ros.occupancy_map import load_map
 from potlp_jax.environments.ros.places import Disc, Places
 from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig
 from potlp_jax.errors import MapError, MapWarning
@@ -77,7 +78,7 @@ def test_rooms_of_plans_stay_connected(external_data, name, rooms, reached):
     assert len(large & found) == reached
 
 
-@pytest.mark.filterwarnings("ignore:.*cut off:potlp_jax.environments.ros.map_files.MapWarning")
+@pytest.mark.filterwarnings("ignore:.*cut off:potlp_jax.errors.MapWarning")
 @pytest.mark.parametrize(
     ("name", "resolution", "radius", "shape"),
     [

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from potlp_jax.environments.ros.cleaning import clean_map
-from potlp_jax.environments.ros.map_files import load_map
+from potlp_jax.environments.ros.occupancy_map import load_map
 from potlp_jax.environments.ros.places import Disc, Places
 from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig, parse_spec
 from potlp_jax.errors import MapError

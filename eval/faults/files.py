@@ -20,7 +20,8 @@ from eval.faults import Kind, WrongAnswerError, seeds
 from eval.faults.mutations import damaged, pick
 from eval.faults.seeds import Tree, kept, write_tree
 from potlp_jax.environments.campus.floor_plan_xml import read_plan
-from potlp_jax.environments.ros.map_files import load_map, load_settings
+from potlp_jax.environments.ros.map_settings import load_settings
+from potlp_jax.environments.ros.occupancy_map import load_map
 from potlp_jax.environments.ros.places import load_places, load_regions
 from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig
 from potlp_jax.errors import PotlpError

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from potlp_jax.environments.ros.map_files import GridFrame
+from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.places import Disc, Places, Polygon, save_places
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy, make_world
 

@@ -18,7 +18,7 @@ from eval.faults.seeds import kept, write_tree
 from potlp_jax.codec import settings_from_words, with_settings
 from potlp_jax.environments.campus.floor_plan_xml import read_kinds, read_plan
 from potlp_jax.environments.campus.plan_floor import rasterise
-from potlp_jax.environments.ros.map_files import load_settings
+from potlp_jax.environments.ros.map_settings import load_settings
 from potlp_jax.environments.ros.places import load_places, load_regions, place_letters
 from potlp_jax.learning.serialization import load_estimator
 from potlp_jax.sweep.specification import read_specification

@@ -15,7 +15,7 @@ import numpy as np
 from eval.live.perturbation import Network
 from potlp_jax.drive.inbox import Inbox
 from potlp_jax.drive.messages import Message, make_pose, pose_of
-from potlp_jax.environments.ros.map_files import GridFrame
+from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.logs.poses import shortest
 from potlp_jax.world.moves import Cell
 

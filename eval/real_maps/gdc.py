@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from potlp_jax.environments.ros.map_files import load_map
+from potlp_jax.environments.ros.occupancy_map import load_map
 
 HALLWAYS = {
     "gdc_3ne": {"l3_200", "l3_250", "l3_300", "l3_400", "l3_434", "l3_500", "l3_520"},

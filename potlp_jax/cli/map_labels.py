@@ -8,11 +8,8 @@ from typing import TYPE_CHECKING
 from potlp_jax.cli.output import fail
 
 if TYPE_CHECKING:
-    from potlp_jax.environments.ros.map_files import OccupancyMap
+    from potlp_jax.environments.ros.occupancy_map import OccupancyMap
     from potlp_jax.environments.ros.places import Disc, Places, Point, Polygon, Region
-
-PLACE_RADIUS: float = 0.5
-"""Metres around a point where its proposition is true, unless a radius is given."""
 
 
 def named_places(file: Path, image_map: "OccupancyMap", names: Sequence[str]) -> "dict[str, tuple[Region, ...]]":
@@ -104,7 +101,7 @@ def _named(option: str, text: str, form: str) -> tuple[str, str]:
 
 
 def _read_disc(option: str, text: str) -> "Disc":
-    from potlp_jax.environments.ros.places import Disc
+    from potlp_jax.environments.ros.places import PLACE_RADIUS, Disc
 
     numbers = _read_numbers(f"--place {option}", text)
     if len(numbers) not in (2, 3):

@@ -10,7 +10,7 @@ from rich.table import Table
 
 if TYPE_CHECKING:
     from potlp_jax.environments.ros.cleaning import CleanMap
-    from potlp_jax.environments.ros.map_files import OccupancyMap
+    from potlp_jax.environments.ros.occupancy_map import OccupancyMap
     from potlp_jax.environments.ros.survey import MapSurvey, Passage
 
 # What fits on a screen beside the rest; passages come narrowest first.
@@ -59,7 +59,7 @@ def clean_facts(clean: "CleanMap", radius: float) -> dict[str, Any]:
 
 def map_lines(image_map: "OccupancyMap", survey: "MapSurvey") -> Iterator[tuple[str, str]]:
     """Names and texts of the lines about the map."""
-    from potlp_jax.environments.ros.map_files import ROS_MAP
+    from potlp_jax.environments.ros.occupancy_map import ROS_MAP
 
     settings, frame = image_map.settings, image_map.frame
     metres = f"{frame.width * frame.resolution:.2f} x {frame.height * frame.resolution:.2f} m"

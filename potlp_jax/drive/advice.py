@@ -10,7 +10,7 @@ from jaxtyping import Int
 from potlp_jax.codec import finite_or_null
 from potlp_jax.drive.link import Link
 from potlp_jax.drive.messages import make_path, make_pose
-from potlp_jax.environments.ros.map_files import GridFrame
+from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.task.task import Task
 from potlp_jax.task.words import state_words
 from potlp_jax.trials.record import Decision

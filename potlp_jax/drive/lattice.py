@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int8, Int64
 
 from potlp_jax.environments.ros.cleaning import inflate
-from potlp_jax.environments.ros.map_files import GridFrame
+from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.errors import RobotError
 from potlp_jax.world.grid import BeliefMap
 from potlp_jax.world.moves import Cell

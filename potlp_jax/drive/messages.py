@@ -17,7 +17,9 @@ import numpy as np
 from jaxtyping import Float64, Int8, UInt8
 
 from potlp_jax.drive.lattice import Scan
-from potlp_jax.environments.ros.map_files import LARGEST_PIXEL, OCCUPIED, SMALLEST_PIXEL, GridFrame
+from potlp_jax.environments.ros.grid_frame import GridFrame
+from potlp_jax.environments.ros.map_settings import LARGEST_PIXEL, SMALLEST_PIXEL
+from potlp_jax.environments.ros.occupancy_map import OCCUPIED
 from potlp_jax.environments.ros.places import Disc, Polygon, Region
 from potlp_jax.errors import PotlpError, RobotError
 from potlp_jax.files import short

@@ -13,7 +13,7 @@ from potlp_jax.drive.config import DriveConfig, Mode
 from potlp_jax.drive.inbox import Heard, Inbox, Pose
 from potlp_jax.drive.lattice import Lattice, LatticeConfig
 from potlp_jax.drive.movers import Mover
-from potlp_jax.environments.ros.map_files import GridFrame
+from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.places import Places, Region
 from potlp_jax.errors import RobotError
 from potlp_jax.logs.poses import FARTHEST_SNAP, shortest

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Int8, Int32, Int64, UInt8
 from scipy import ndimage
 
-from potlp_jax.environments.ros.map_files import GridFrame
+from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.places import Places, place_letters
 from potlp_jax.errors import LogError
 from potlp_jax.learning.domain import LOGS

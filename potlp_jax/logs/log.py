@@ -18,7 +18,9 @@ from jaxtyping import Bool, Int8, UInt8
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from potlp_jax.environments.ros.map_files import LARGEST_NUMBER, LARGEST_PIXEL, OCCUPIED, SMALLEST_PIXEL, GridFrame
+from potlp_jax.environments.ros.grid_frame import GridFrame
+from potlp_jax.environments.ros.map_settings import LARGEST_NUMBER, LARGEST_PIXEL, SMALLEST_PIXEL
+from potlp_jax.environments.ros.occupancy_map import OCCUPIED
 from potlp_jax.errors import LogError
 from potlp_jax.files import reading, short
 from potlp_jax.images import decode_image, image_size

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from potlp_jax.environments.ros.map_files import GridFrame
+from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.errors import LogError
 from potlp_jax.logs.log import SECOND, Log, Picture
 from potlp_jax.logs.poses import Poses

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Int32, Shaped
 from scipy import ndimage
 
 from potlp_jax.environments.ros.cleaning import inflate, resample
-from potlp_jax.environments.ros.map_files import BOUNDARY_DECIMALS, GridFrame
+from potlp_jax.environments.ros.grid_frame import BOUNDARY_DECIMALS, GridFrame
 from potlp_jax.errors import LogError
 from potlp_jax.logs.log import Log, MapMessage
 

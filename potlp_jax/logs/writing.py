@@ -19,7 +19,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
 from potlp_jax.codec import config_from_dict
-from potlp_jax.environments.ros.map_files import FREE, OCCUPIED, UNKNOWN, GridFrame
+from potlp_jax.environments.ros.grid_frame import GridFrame
+from potlp_jax.environments.ros.occupancy_map import FREE, OCCUPIED, UNKNOWN
 from potlp_jax.errors import LogError
 from potlp_jax.logs.log import FIXED_TOPIC, IMAGE_TYPE, MAP_TYPE, ODOMETRY_TYPE, SECOND, TRANSFORM_TYPES, typestore
 from potlp_jax.logs.transforms import Quaternion, quaternion_of

@@ -12,7 +12,8 @@ from matplotlib.patches import Patch
 from matplotlib.transforms import Affine2D, blended_transform_factory
 
 from potlp_jax.environments.ros.cleaning import CleanMap
-from potlp_jax.environments.ros.map_files import GridFrame, OccupancyMap
+from potlp_jax.environments.ros.grid_frame import GridFrame
+from potlp_jax.environments.ros.occupancy_map import OccupancyMap
 from potlp_jax.environments.ros.places import component_labels
 from potlp_jax.environments.ros.ros_map import RosMap
 from potlp_jax.environments.ros.survey import SPECK

@@ -6,7 +6,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from potlp_jax.environments.ros.map_files import GridFrame, MapSettings, OccupancyMap
+from potlp_jax.environments.ros.grid_frame import GridFrame
+from potlp_jax.environments.ros.map_settings import MapSettings
+from potlp_jax.environments.ros.occupancy_map import OccupancyMap
 
 FIELDS = {
     "image": "map.pgm",

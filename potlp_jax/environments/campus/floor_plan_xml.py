@@ -20,7 +20,7 @@ from importlib import resources
 from pathlib import Path
 
 from potlp_jax.environments.campus.furnishing import Kind
-from potlp_jax.environments.ros.map_files import LARGEST_NUMBER, read_yaml
+from potlp_jax.environments.ros.map_settings import LARGEST_NUMBER, read_yaml
 from potlp_jax.environments.ros.places import Point
 from potlp_jax.errors import MapError
 from potlp_jax.files import one_line, read_xml, short

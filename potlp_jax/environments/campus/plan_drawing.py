@@ -8,7 +8,7 @@ from jaxtyping import Int, Int32
 
 from potlp_jax.environments.campus.floor_plan_xml import PlanDoor, PlanRoom
 from potlp_jax.environments.campus.furnishing import NO_ROOM, Kind
-from potlp_jax.environments.ros.map_files import GridFrame
+from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.places import Polygon, component_labels
 
 DOOR_WIDTH = 0.9

@@ -20,7 +20,7 @@ import numpy as np
 from potlp_jax.environments.campus.floor_plan_xml import FloorPlan
 from potlp_jax.environments.campus.furnishing import NO_ROOM, PEOPLE, Floor, Kind, absent_propositions
 from potlp_jax.environments.campus.plan_drawing import Drawing
-from potlp_jax.environments.ros.map_files import GridFrame
+from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.errors import MapError
 
 MOST_CELLS = 1000

@@ -1,7 +1,7 @@
 """Maps of buildings in every format that is read, by what the file is: one reader for commands and worlds.
 
 ======================================  ================================================================
-``FILE.yaml`` with an image             `environments.ros.map_files`: ROS ``map_server``
+``FILE.yaml`` with an image             `environments.ros.occupancy_map`: ROS ``map_server``
 ``FILE.yaml`` with levels               `environments.ros.rmf`: a level of Open-RMF's ``building.yaml``
 ``FILE.world``, ``FILE.sdf``            `environments.ros.gazebo`: boxes of a Gazebo world
 ``FILE.xml``                            `environments.campus.plan_floor`: plans with rooms and doors
@@ -14,7 +14,8 @@ from potlp_jax.environments.campus.floor_plan_xml import read_kinds, read_plan
 from potlp_jax.environments.campus.plan_floor import MOST_CELLS, rasterise
 from potlp_jax.environments.ros.drawn_maps import MARGIN, drawn_map
 from potlp_jax.environments.ros.gazebo import read_world
-from potlp_jax.environments.ros.map_files import OccupancyMap, load_map, read_yaml
+from potlp_jax.environments.ros.map_settings import read_yaml
+from potlp_jax.environments.ros.occupancy_map import OccupancyMap, load_map
 from potlp_jax.environments.ros.places import Places, Polygon
 from potlp_jax.environments.ros.rmf import is_building, read_level
 from potlp_jax.errors import MapError

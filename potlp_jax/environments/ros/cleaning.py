@@ -26,7 +26,8 @@ import numpy as np
 from jaxtyping import Bool, Int, Shaped
 from scipy import ndimage
 
-from potlp_jax.environments.ros.map_files import GridFrame, OccupancyMap
+from potlp_jax.environments.ros.grid_frame import GridFrame
+from potlp_jax.environments.ros.occupancy_map import OccupancyMap
 from potlp_jax.environments.ros.places import Point, component_labels, nearest_free
 from potlp_jax.environments.ros.working_grid import choose_cell
 from potlp_jax.errors import MapError, MapWarning

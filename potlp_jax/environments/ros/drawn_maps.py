@@ -21,7 +21,9 @@ import numpy as np
 from jaxtyping import Bool, Int32
 from scipy import ndimage
 
-from potlp_jax.environments.ros.map_files import FREE, OCCUPIED, UNKNOWN, GridFrame, MapSettings, OccupancyMap
+from potlp_jax.environments.ros.grid_frame import GridFrame
+from potlp_jax.environments.ros.map_settings import MapSettings
+from potlp_jax.environments.ros.occupancy_map import FREE, OCCUPIED, UNKNOWN, OccupancyMap
 from potlp_jax.environments.ros.places import Places, Point, component_labels
 from potlp_jax.environments.ros.working_grid import require_memory
 from potlp_jax.errors import MapError

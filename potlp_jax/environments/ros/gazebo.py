@@ -19,7 +19,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from potlp_jax.environments.ros.drawn_maps import Wall, close_outer_walls, drawn_map, frame_around
-from potlp_jax.environments.ros.map_files import LARGEST_NUMBER, OccupancyMap
+from potlp_jax.environments.ros.map_settings import LARGEST_NUMBER
+from potlp_jax.environments.ros.occupancy_map import OccupancyMap
 from potlp_jax.errors import MapError, MapWarning
 from potlp_jax.files import one_line, read_xml, short
 

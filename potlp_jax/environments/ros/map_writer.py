@@ -1,11 +1,12 @@
-"""Writes occupancy maps in the format that `potlp_jax.environments.ros.map_files` reads."""
+"""Writes occupancy maps in the format that `potlp_jax.environments.ros.occupancy_map` reads."""
 
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool
 
-from potlp_jax.environments.ros.map_files import DEFAULT_FREE_THRESH, DEFAULT_OCCUPIED_THRESH, GridFrame
+from potlp_jax.environments.ros.grid_frame import GridFrame
+from potlp_jax.environments.ros.map_settings import DEFAULT_FREE_THRESH, DEFAULT_OCCUPIED_THRESH
 from potlp_jax.errors import MapError
 
 FREE_GREY = 254

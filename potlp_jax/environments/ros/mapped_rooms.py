@@ -36,7 +36,7 @@ from potlp_jax.environments.campus.furnishing import (
 )
 from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.ros.cleaning import CleanMap, clean_map, warn_of_cut_off
-from potlp_jax.environments.ros.map_files import load_map
+from potlp_jax.environments.ros.occupancy_map import load_map
 from potlp_jax.environments.ros.places import Region, load_regions
 from potlp_jax.environments.splits import PARCELS_PREFIX
 from potlp_jax.errors import MapError, MapWarning

@@ -25,12 +25,16 @@ import yaml
 from jaxtyping import Bool, Float64, Int32
 from scipy import ndimage
 
-from potlp_jax.environments.ros.map_files import GridFrame, parse_number, parse_numbers, read_yaml
+from potlp_jax.environments.ros.grid_frame import GridFrame
+from potlp_jax.environments.ros.map_settings import parse_number, parse_numbers, read_yaml
 from potlp_jax.errors import MapError
 from potlp_jax.files import short
 
 MAX_PROPOSITIONS = 16
 """As many as a letter has bits."""
+
+PLACE_RADIUS = 0.5
+"""Metres around a point that count as being there, where nothing gives a radius."""
 
 Point = tuple[float | int, float | int]
 """Metres (x, y) in the map's frame."""

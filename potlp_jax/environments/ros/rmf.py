@@ -24,8 +24,9 @@ from pathlib import Path
 from typing import Any
 
 from potlp_jax.environments.ros.drawn_maps import Wall, draw_areas, drawn_map, enclosed, frame_around
-from potlp_jax.environments.ros.map_files import OccupancyMap, parse_number, read_yaml
-from potlp_jax.environments.ros.places import Disc, Places, Point
+from potlp_jax.environments.ros.map_settings import parse_number, read_yaml
+from potlp_jax.environments.ros.occupancy_map import OccupancyMap
+from potlp_jax.environments.ros.places import PLACE_RADIUS, Disc, Places, Point
 from potlp_jax.errors import MapError, MapWarning
 from potlp_jax.files import short
 
@@ -37,9 +38,6 @@ WALL_THICKNESS = 0.1
 
 DOOR_THICKNESS = 0.3
 """Metres across a wall that an open door cuts away: walls on either side of it may not quite meet."""
-
-PLACE_RADIUS = 0.5
-"""Metres around a named vertex that count as being there."""
 
 
 def read_level(file: Path, level: str | None = None) -> OccupancyMap:

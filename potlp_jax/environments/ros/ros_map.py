@@ -19,7 +19,7 @@ from potlp_jax.environments.campus.furnishing import NARROW_DOORS
 from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.ros.buildings import load_building
 from potlp_jax.environments.ros.cleaning import CleanMap, clean_map, warn_of_cut_off
-from potlp_jax.environments.ros.map_files import OccupancyMap
+from potlp_jax.environments.ros.occupancy_map import OccupancyMap
 from potlp_jax.environments.ros.places import MAX_PROPOSITIONS, Places, load_places, place_letters
 from potlp_jax.errors import MapError
 from potlp_jax.world.grid import World, make_world

@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float64, Int32
 from scipy import ndimage
 
 from potlp_jax.environments.ros.cleaning import CleanMap
-from potlp_jax.environments.ros.map_files import GridFrame, OccupancyMap
+from potlp_jax.environments.ros.grid_frame import GridFrame
+from potlp_jax.environments.ros.occupancy_map import OccupancyMap
 from potlp_jax.environments.ros.places import Point, component_labels
 
 WIDEST = 1.5
