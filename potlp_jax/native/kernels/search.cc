@@ -36,7 +36,7 @@ constexpr int kNone = -1;              // NO_STATE, NO_SUBGOAL, NO_ACTION, NO_CL
 constexpr uint32_t kTreeOverflow = 2, kDepthOverflow = 4, kDeadEnd = 8, kAcceptingRoot = 16, kInvalid = 512;
 constexpr size_t kKeptEntries = size_t{1} << 20;  // Memory that a thread keeps from one search to the next.
 
-// best_first.OPTIMISM, FEW_ACTIONS, OPTIMISM_OF_FEW come as attributes, so that they are written once.
+// optimism.OPTIMISM, FEW_ACTIONS, OPTIMISM_OF_FEW come as attributes, so that they are written once.
 struct Settings {
   int64_t simulations, max_depth, capacity, slots, guess_failures, few_actions;
   float optimism, optimism_of_few, default_optimism;

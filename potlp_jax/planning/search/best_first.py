@@ -74,22 +74,11 @@ from potlp_jax.planning.search.guess import Rule, guess_outcomes, make_rule, val
 from potlp_jax.planning.search.lockstep import SearchKernel, SearchMethod
 from potlp_jax.planning.search.model import FAILURE, SUCCESS, Model, make_model
 from potlp_jax.planning.search.native import LIBRARY, fits_kernel, search_natively
+from potlp_jax.planning.search.optimism import optimism_of
 from potlp_jax.planning.search.plan import Plan, plan_of_least_score
 from potlp_jax.planning.sharding import vary_alike
 from potlp_jax.task.relations import transitive_closure
 from potlp_jax.types import Status
-
-OPTIMISM: float = 0.3
-"""Optimism of problems of more than ``FEW_ACTIONS`` where the configuration names none. Tuned on the split ``tuning``
-of the families of problems (docs/results/planner.md, "How optimistic?")."""
-
-FEW_ACTIONS: int = 41
-"""Actions up to which a problem counts as small: 8 subgoals with 5 attempts each, and finish. One wrong guess then ends
-the search too early. Tuned as ``OPTIMISM``."""
-
-OPTIMISM_OF_FEW: float = 0.7
-"""Optimism of small problems. Tuned as ``OPTIMISM``: the mean regret over 12 rows of problems falls from 0.08 to 0.06 %
-and the worst from 5.9 to 4.1 %."""
 
 LEAST_GUESS: float = 1e-4
 """Guesses at outcomes that do not satisfy the task are at least this share of the dead-end cost, so that an outcome
@@ -239,7 +228,7 @@ def prepare(problems: PlanningProblem, seeds: UInt32[Array, "B 2"], config: Best
         model=model,
         rule=rule,
         relevant=jax.vmap(_relevant_conditions)(model.tables, reach),
-        optimism=_optimism(problems, config),
+        optimism=optimism_of(problems, config),
     )
 
 
@@ -673,17 +662,6 @@ def _count(tree: Tree, descent: Descent) -> Tree:
         simulations=tree.simulations + moved.astype(jnp.int32),
         steps=tree.steps + jnp.sum(descent.path.nodes < tree.capacity, axis=0, dtype=jnp.int32),
     )
-
-
-def _optimism(problems: PlanningProblem, config: BestFirstConfig) -> Float32[Array, "B"]:
-    """``BestFirstConfig.optimism`` of each problem; by its number of actions where the configuration names none."""
-    # A Python value of the configuration is known when the search is compiled.
-    subgoals = jnp.sum(problems.subgoal_mask, axis=1, dtype=jnp.int32)
-    if config.optimism is not None:
-        return jnp.full(subgoals.shape, config.optimism, jnp.float32)
-    # Real actions, so that padding does not change the optimism.
-    actions = subgoals * jnp.sum(problems.task.edge_mask, axis=1, dtype=jnp.int32) + 1
-    return jnp.where(actions <= FEW_ACTIONS, OPTIMISM_OF_FEW, OPTIMISM).astype(jnp.float32)
 
 
 def _reachable_states(tables: ActionTables) -> Bool[Array, "Z Z"]:

@@ -18,6 +18,7 @@ from potlp_jax.planning.history import WORD_BITS
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.search.graph import KEY_WORDS, PROBES, VALUE_COLUMNS, Tree
+from potlp_jax.planning.search.optimism import FEW_ACTIONS, OPTIMISM, OPTIMISM_OF_FEW
 from potlp_jax.planning.search.plan import Plan
 from potlp_jax.planning.sharding import vary_alike
 
@@ -69,9 +70,6 @@ def search_natively(
       Plans, and trees or None. In trees, actions that are not available at a node have costs of inf, and nothing else
       of them is kept.
     """
-    # Imported here: that module names this one as its kernel.
-    from potlp_jax.planning.search.best_first import FEW_ACTIONS, OPTIMISM, OPTIMISM_OF_FEW
-
     arrays = [getattr(problems.task, name) for name in _TASK_FIELDS]
     arrays += [getattr(problems, name) for name in _PROBLEM_FIELDS]
     batch = problems.dfa_state.shape[0]
