@@ -311,6 +311,12 @@ def test_a_place_that_a_turned_map_walls_in_is_reached():
     assert run_stream(749, {})["end"] == "satisfied"
 
 
+@pytest.mark.parametrize("seed", [341, 603])
+def test_a_map_that_says_the_same_is_no_reason_to_give_up(seed):
+    # All is seen, the map turns on, and the message that says where the exit is was lost or is late.
+    assert run_stream(seed, {})["end"] == "satisfied"
+
+
 # Drives, in the simulation's time.
 
 

@@ -232,9 +232,10 @@ class RemoteRobot:
         return "Refused: " + "; ".join(f"{text} ({count} times)" for text, count in refused) if refused else ""
 
     def _await_map(self) -> Leg:
-        """Stand until the map changes, for there is nowhere to go."""
-        begun, maps = self._clock(), self._laid
-        while self._inbox.heard.maps == maps and self._clock() - begun < self._config.patience:
+        """Stand until more or something else is known, for there is nowhere to go."""
+        begun, known = self._clock(), self._known()
+        # A map that came anew, or turned a little, may say the same once more: what is missing may still be on its way.
+        while self._clock() - begun < self._config.patience and not self._has_changed(known):
             if self._interrupted():
                 return Leg((), ended=True)
             self._inbox.wait(POLL)
@@ -243,6 +244,14 @@ class RemoteRobot:
             if self._entered:
                 break
         return Leg(tuple(self._entered))
+
+    def _known(self) -> tuple[Int8[np.ndarray, "H W"], Int32[np.ndarray, "H W"]]:
+        values = self._shown()
+        return values, self._letters(values)
+
+    def _has_changed(self, known: tuple[Int8[np.ndarray, "H W"], Int32[np.ndarray, "H W"]]) -> bool:
+        """Whether the newest map or places say something else than was known."""
+        return self._lay(self._inbox.heard) and not all(map(np.array_equal, known, self._known()))
 
     def _first_cell(self) -> Cell:
         """Where the robot is at first. A pose that is not on the map may be an error of localisation: it waits."""
@@ -321,8 +330,7 @@ class RemoteRobot:
         return values
 
     def _belief(self) -> BeliefMap:
-        values = self._shown()
-        letters = self._letters(values)
+        values, letters = self._known()
         return belief_from_numpy(values, letters, self._config.resolution, propositions=self._propositions)
 
     def _letters(self, values: Int8[np.ndarray, "H W"]) -> Int32[np.ndarray, "H W"]:
