@@ -106,6 +106,10 @@ EXPERIMENTS: dict[str, Experiment] = {
     "live": Experiment(
         page="live", command="python -m eval.live --streams 1000 --out docs/results/live.json", variables=_OTHERS
     ),
+    "live-recorded": Experiment(
+        page="live",
+        command="python -m eval.live.recorded --out {out} --maps {data}/maps --report docs/results/live/recorded",
+    ),
     "faults-files": Experiment(page="faults", command="python -m eval.faults files --cases 5000 --out {out}"),
     "faults-texts": Experiment(page="faults", command="python -m eval.faults texts --cases 100000 --out {out}"),
     "faults-formulas": Experiment(page="faults", command="python -m eval.faults formulas --cases 1000 --out {out}"),

@@ -19,6 +19,8 @@ from potlp_jax.drive.driving import drive_robot
 from potlp_jax.drive.inbox import Inbox
 from potlp_jax.drive.lattice import Lattice, LatticeConfig, Scan, bucket
 from potlp_jax.drive.messages import make_path, make_pose, picture_of, pose_of, regions_of, scan_of, stamp_of
+from potlp_jax.drive.movers import Adviser
+from potlp_jax.drive.robot import RemoteRobot
 from potlp_jax.drive.rosbridge import RosbridgeLink, parse_url
 from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.places import Disc, Polygon
@@ -266,6 +268,53 @@ def test_what_cannot_be_read_is_counted_and_changes_nothing():
             inbox.handle(topic, message)
     assert inbox.heard is before
     assert sum(inbox.refused.values()) == 4 * len(inbox.handlers)
+
+
+# Where places are.
+
+
+def letters_of(rows, exit_at):
+    """Where a robot takes the exit to be, in text: on a map of ``#`` walls, ``.`` floor and ``?`` unseen cells."""
+    inbox, said = Inbox(CONFIG, FLOOR.propositions), []
+    inbox.handle("/map", grid(1, [[{"#": 100, ".": 0, "?": -1}[cell] for cell in row] for row in rows]))
+    inbox.handle("/tf", {"transforms": [transform(1, "map", "base_link", 0.6)]})
+    place = {"exit": [{"point": list(exit_at), "radius": 0.1}]}
+    inbox.handle("/potlp/places", {"data": json.dumps(place)})
+    robot = RemoteRobot(inbox, Adviser(), CONFIG, FLOOR.propositions, say=said.append)
+    belief, _ = robot.observe()
+    belief, _ = robot.observe()
+    assert list(robot.noticed) == said
+    row, column = np.argwhere(np.asarray(belief.cells) != BeliefMap.UNKNOWN).min(axis=0)
+    shown = np.asarray(belief.letters)[row : row + len(rows), column : column + len(rows[0])]
+    return ["".join("e" if letter else "." for letter in line) for line in shown], said
+
+
+def test_a_place_in_a_wall_is_beside_it_and_that_is_said_once():
+    rows = ["......", "......", ".#####", "......"]
+    # In the wall's third cell, nearer to its upper edge.
+    found, said = letters_of(rows, (1.4, 0.65))
+    assert found == ["......", "...e..", "......", "......"]
+    assert said == [
+        "exit: point [1.40, 0.65] with radius 0.1 lies in an obstacle of the map; it is taken to be at [1.40, 1.00]"
+    ]
+
+
+@pytest.mark.parametrize("rows", [["......", "......", ".##?##", "......"], ["####", "####", "####", "...."]])
+def test_a_place_in_what_is_unseen_or_deep_in_a_wall_is_nowhere(rows):
+    found, said = letters_of(rows, (1.4, 0.65) if "?" in rows[2] else (1.0, 1.4))
+    assert not any("e" in line for line in found)
+    assert not said
+
+
+def test_a_place_that_a_turned_map_walls_in_is_reached():
+    # The exit is in a corner of the last room, and the map turns by up to 0.03 radians.
+    assert run_stream(749, {})["end"] == "satisfied"
+
+
+@pytest.mark.parametrize("seed", [341, 603])
+def test_a_map_that_says_the_same_is_no_reason_to_give_up(seed):
+    # All is seen, the map turns on, and the message that says where the exit is was lost or is late.
+    assert run_stream(seed, {})["end"] == "satisfied"
 
 
 # Drives, in the simulation's time.

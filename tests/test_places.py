@@ -9,7 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from potlp_jax.environments.ros.grid_frame import GridFrame
-from potlp_jax.environments.ros.places import Disc, Places, Polygon, load_places, place_letters
+from potlp_jax.environments.ros.places import (
+    Disc,
+    Places,
+    Polygon,
+    free_cell_beside,
+    load_places,
+    place_letters,
+)
 from potlp_jax.errors import MapError
 from tests.reference.map_files import PLACES, TWO_ROOMS, occupancy_map
 
@@ -108,3 +115,38 @@ def test_bad_places_are_named(tmp_path, text, message):
     with pytest.raises(MapError, match=message) as caught:
         load_places(tmp_path / "bad.places.yaml")
     assert "bad.places.yaml" in str(caught.value)
+
+
+UNSEEN, OPEN, WALL = -1, 0, 1
+
+
+def rough_beside(region, middle, cells, frame):
+    """Free cells beside a region in walls, with their distances in metres: the slow twin of ``free_cell_beside``."""
+    every = itertools.product(range(cells.shape[0]), range(cells.shape[1]))
+    own = set(map(tuple, np.argwhere(region.covers(np.ones(cells.shape, bool), frame)).tolist()))
+    if not own or any(cells[cell] != WALL for cell in own):
+        return {}
+    return {
+        (row, column): math.dist(middle, frame.cell_to_metres(row, column))
+        for row, column in every
+        if cells[row, column] == OPEN and any(max(abs(row - r), abs(column - c)) == 1 for r, c in own)
+    }
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=200, deadline=None)
+def test_a_region_in_walls_is_met_in_the_nearest_free_cell_beside_it(seed):
+    random = np.random.default_rng(seed)
+    frame = GridFrame(7, 8, 0.4, *random.uniform(-1, 1, 2).tolist(), float(random.uniform(-3, 3)))
+    cells = random.choice([UNSEEN, OPEN, WALL, WALL, WALL, WALL, WALL, WALL], (7, 8))
+    inside = frame.cell_to_metres(*random.integers(-1, 8, 2).tolist())
+    x, y = (value + float(random.uniform(-0.2, 0.2)) for value in inside)
+    size = float(random.choice([0.1, 0.5]))
+    corners = ((x, y), (x + size, y), (x, y + size))
+    regions = ((Disc((x, y), size), (x, y)), (Polygon(corners), tuple(np.mean(corners, axis=0).tolist())))
+    for region, middle in regions:
+        wanted = rough_beside(region, middle, cells, frame)
+        found = free_cell_beside(region, cells == OPEN, cells == WALL, frame)
+        assert (found is None) == (not wanted)
+        # Of two that are equally far either will do.
+        assert found is None or wanted[found] <= min(wanted.values()) + 1e-6

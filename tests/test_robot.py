@@ -301,6 +301,13 @@ def test_a_late_leg_is_noted():
     assert not driven(Rover())[0].notes
 
 
+def test_what_a_robot_notices_is_noted():
+    class Doubtful(Rover):
+        noticed = ("exit: in a wall",)
+
+    assert driven(Doubtful())[0].notes == ("exit: in a wall",)
+
+
 def test_another_map_is_no_reason_to_give_up():
     """A robot that knows no move stands, and its map arrives a moment later."""
 

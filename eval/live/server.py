@@ -1,6 +1,7 @@
 """A rosbridge of one's own: the simulated robot behind a websocket that speaks the rosbridge protocol.
 
     python -m eval.live.server --port 9090     # then: potlp drive localhost --task '!fire U exit' ...
+    python -m eval.live.server --environment parcels:FILE.yaml --world 3     # in a building, with a camera
 
 Only what ``potlp drive`` uses is spoken: subscribe, advertise, publish, and the goals of actions.
 """
@@ -15,8 +16,10 @@ import numpy as np
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import Server, ServerConnection, serve
 
+from eval.live.building import REACH, Building
 from eval.live.perturbation import Network, Perturbation
-from eval.live.simulator import FLOOR, STEP, Behaviour, SimulatedLink
+from eval.live.simulator import FLOOR, STEP, Behaviour, Ground, SimulatedLink
+from potlp_jax.cache import enable_compilation_cache
 
 _SUCCEEDED, _CANCELED, _ABORTED = 4, 5, 6
 """Of action_msgs/GoalStatus."""
@@ -25,9 +28,9 @@ _SUCCEEDED, _CANCELED, _ABORTED = 4, 5, 6
 class RosbridgeServer:
     """Serves one robot to whoever connects. ``speed``: seconds of the simulation in one of the clock."""
 
-    def __init__(self, behaviour: Behaviour, port: int = 0, speed: float = 1.0) -> None:
+    def __init__(self, behaviour: Behaviour, port: int = 0, speed: float = 1.0, ground: Ground = FLOOR) -> None:
         network = Network(Perturbation(), np.random.default_rng(0))
-        self.link = SimulatedLink(FLOOR, behaviour, network)
+        self.link = SimulatedLink(ground, behaviour, network)
         self.advertised: dict[str, str] = {}
         self._speed, self._lock, self._closed = speed, threading.Lock(), threading.Event()
         self._names: dict[str, str] = {}
@@ -96,9 +99,19 @@ def main() -> None:
     )
     parser.add_argument("--port", type=int, default=9090)
     parser.add_argument("--speed", type=float, default=1.0, help="seconds of the simulation in a second")
+    parser.add_argument("--environment", help="parcels:FILE.yaml, a real map; default: two rooms of text")
+    parser.add_argument("--world", type=int, default=0, help="number of the building's test world")
     arguments = parser.parse_args()
-    server = RosbridgeServer(Behaviour(), arguments.port, arguments.speed)
-    print(f"rosbridge at localhost:{server.port}; propositions {','.join(FLOOR.propositions)}; Ctrl-C ends it")
+    enable_compilation_cache()
+    ground, behaviour = FLOOR, Behaviour()
+    if arguments.environment is not None:
+        ground = Building.from_spec(arguments.environment, arguments.world)
+        behaviour = Behaviour(pixels=1, reach=REACH)
+    server = RosbridgeServer(behaviour, arguments.port, arguments.speed, ground)
+    print(
+        f"rosbridge at localhost:{server.port}; propositions {','.join(ground.propositions)}; Ctrl-C ends it",
+        flush=True,
+    )
     threading.Event().wait()
 
 

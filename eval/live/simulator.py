@@ -1,16 +1,20 @@
 """A robot that is simulated behind a ``Link``: it says what a robot on ROS says, and goes where it is told.
 
-Time is its own, so that a drive of minutes takes no longer than its decisions. It maps all within its reach, through
-walls too, and its map grows, shifts its origin and, if wished, is turned and comes in parts.
+Time is its own, so that a drive of minutes takes no longer than its decisions. Its map grows, shifts its origin and, if
+wished, is turned and comes in parts. On a ``Floor`` of text it maps all within its reach, through walls too; in a
+``eval.live.building.Building`` it maps what it sees, and has a camera.
 """
 
+import base64
 import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
+import cv2
 import numpy as np
+from jaxtyping import Bool, UInt8
 
 from eval.live.perturbation import Network
 from potlp_jax.drive.inbox import Inbox
@@ -29,9 +33,44 @@ WHOLE_SECONDS = 5.0
 """Between whole maps where updates are sent: a map that was lost is not lost for ever, as a latched one is not."""
 
 
+PICTURES = "/panorama/compressed"
+"""Topic of the panoramas, where there is a camera."""
+
+
+class Ground(Protocol):
+    """Where the robot drives."""
+
+    @property
+    def frame(self) -> GridFrame:
+        """Where its cells lie in metres, without a turn."""
+        ...
+
+    @property
+    def walls(self) -> Bool[np.ndarray, "H W"]:
+        """True on walls."""
+        ...
+
+    @property
+    def start(self) -> Cell:
+        """Row and column."""
+        ...
+
+    def places(self, seen: Bool[np.ndarray, "H W"]) -> dict[str, list[dict[str, Any]]]:
+        """Where propositions hold among the cells that were seen, as ``Topics.places`` has them."""
+        ...
+
+    def seen_from(self, cell: Cell, reach: int) -> Bool[np.ndarray, "H W"]:
+        """What the robot maps from a cell, up to so many cells away."""
+        ...
+
+    def picture_from(self, cell: Cell) -> UInt8[np.ndarray, "h w 3"] | None:
+        """An equirectangular panorama, RGB, its middle along growing columns; None without a camera."""
+        ...
+
+
 @dataclass(frozen=True)
 class Floor:
-    """Where the robot drives.
+    """A ``Ground`` of text.
 
     Attributes:
         rows: of text: ``#`` walls, ``.`` floor, a letter where the proposition that begins with it holds.
@@ -66,14 +105,23 @@ class Floor:
                     found.setdefault(name, []).append({"point": point, "radius": self.resolution / 4})
         return found
 
+    def seen_from(self, cell: Cell, reach: int) -> Bool[np.ndarray, "H W"]:
+        """All within reach, through walls too."""
+        (row, column), seen = cell, np.zeros(self.walls.shape, bool)
+        seen[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1] = True
+        return seen
+
+    def picture_from(self, cell: Cell) -> None:
+        """There is no camera."""
+
 
 @dataclass(frozen=True)
 class Behaviour:
     """What kind of robot it is.
 
     Attributes:
-        pixels: of its map, along each side of a character.
-        reach: characters that it maps around it.
+        pixels: of its map, along each side of a cell of the ground.
+        reach: cells that it maps around it.
         speed: metres a second.
         turns: radians by which its map is turned, growing with each map up to this.
         updates: whether it sends updates after the first map of a size, in place of whole maps.
@@ -95,10 +143,11 @@ class Behaviour:
 class SimulatedLink:
     """A ``Link`` to the simulated robot. ``step`` lets time pass."""
 
-    def __init__(self, floor: Floor, behaviour: Behaviour, network: Network) -> None:
+    def __init__(self, floor: Ground, behaviour: Behaviour, network: Network) -> None:
         self._floor, self._behaviour, self._network = floor, behaviour, network
         self._walls = floor.walls
         self._seen = np.zeros(self._walls.shape, bool)
+        self._mapped_from: Cell | None = None
         self._x, self._y = floor.frame.cell_to_metres(*floor.start)
         self._way: list[tuple[float, float]] = []
         self._done: Callable[[bool, str], None] | None = None
@@ -194,9 +243,11 @@ class SimulatedLink:
         return [frame.cell_to_metres(*cell) for cell in shortest(~self._walls, here, there)] if here != there else []
 
     def _map(self) -> None:
-        row, column = self._floor.frame.metres_to_cell(self._x, self._y)
-        reach = self._behaviour.reach
-        self._seen[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1] = True
+        cell = self._floor.frame.metres_to_cell(self._x, self._y)
+        # From one cell the same is seen all the time.
+        if cell != self._mapped_from:
+            self._seen |= self._floor.seen_from(cell, self._behaviour.reach)
+            self._mapped_from = cell
 
     def _tell(self) -> None:
         header = {"stamp": self._network.stamp(self.time), "frame_id": "map"}
@@ -210,6 +261,16 @@ class SimulatedLink:
             self._tell_map(header)
             places = {"data": json.dumps(self._floor.places(self._seen))}
             self._network.send(self.time, "/potlp/places", places)
+            # Pictures are large: a robot takes none that nobody asked for.
+            if PICTURES in self._subscribers:
+                self._tell_picture(header)
+
+    def _tell_picture(self, header: dict[str, Any]) -> None:
+        picture = self._floor.picture_from(self._floor.frame.metres_to_cell(self._x, self._y))
+        if picture is not None:
+            _, encoded = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 95])
+            data = base64.b64encode(encoded.tobytes()).decode()
+            self._network.send(self.time, PICTURES, {"header": header, "format": "jpeg", "data": data})
 
     def _tell_map(self, header: dict[str, Any]) -> None:
         known = np.argwhere(self._seen)
@@ -217,8 +278,8 @@ class SimulatedLink:
         cells = np.where(self._walls, 100, 0)
         shown = np.where(self._seen, cells, -1)[top : bottom + 1, left : right + 1]
         pixels = np.kron(shown, np.ones((self._behaviour.pixels, self._behaviour.pixels), int))
-        size = self._floor.resolution / self._behaviour.pixels
-        x, y = left * self._floor.resolution, (len(self._floor.rows) - 1 - bottom) * self._floor.resolution
+        part = self._floor.frame.window(int(top), int(left), int(bottom - top) + 1, int(right - left) + 1)
+        size = part.resolution / self._behaviour.pixels
         box = (int(top), int(left), int(bottom), int(right))
         if self._behaviour.updates and box == self._sent and self.time < self._next_whole:
             height, width = pixels.shape
@@ -228,7 +289,12 @@ class SimulatedLink:
         self._sent, self._next_whole = box, self.time + WHOLE_SECONDS
         # A little turned about its own corner: pixels then say what lies up to some centimetres beside them.
         yaw = self._behaviour.turns * min(1.0, self.time / 20)
-        info = {"height": pixels.shape[0], "width": pixels.shape[1], "resolution": size, "origin": make_pose(x, y, yaw)}
+        info = {
+            "height": pixels.shape[0],
+            "width": pixels.shape[1],
+            "resolution": size,
+            "origin": make_pose(part.x, part.y, yaw),
+        }
         self._network.send(self.time, "/map", {"header": header, "info": info, "data": _flat(pixels)})
 
 

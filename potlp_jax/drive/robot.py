@@ -14,7 +14,7 @@ from potlp_jax.drive.inbox import Heard, Inbox, Pose
 from potlp_jax.drive.lattice import Lattice, LatticeConfig
 from potlp_jax.drive.movers import Mover
 from potlp_jax.environments.ros.grid_frame import GridFrame
-from potlp_jax.environments.ros.places import Places, Region
+from potlp_jax.environments.ros.places import Places, Region, free_cell_beside
 from potlp_jax.errors import RobotError
 from potlp_jax.logs.poses import FARTHEST_SNAP, shortest
 from potlp_jax.planning.distances.paths import KnownPath
@@ -83,6 +83,7 @@ class RemoteRobot:
         self._entered: list[Cell] = []
         self._sure: list[Cell] = []
         self._laid = -1
+        self._noticed: list[str] = []
         self._cell = self._first_cell()
         self._sure.append(self._cell)
         self._inbox.take_poses()
@@ -93,6 +94,11 @@ class RemoteRobot:
     def origin(self) -> Cell:
         """Of the map that was observed last."""
         return self._reported
+
+    @property
+    def noticed(self) -> tuple[str, ...]:
+        """What was doubtful about its map and places, in words."""
+        return tuple(self._noticed)
 
     @property
     def frame(self) -> GridFrame:
@@ -226,9 +232,10 @@ class RemoteRobot:
         return "Refused: " + "; ".join(f"{text} ({count} times)" for text, count in refused) if refused else ""
 
     def _await_map(self) -> Leg:
-        """Stand until the map changes, for there is nowhere to go."""
-        begun, maps = self._clock(), self._laid
-        while self._inbox.heard.maps == maps and self._clock() - begun < self._config.patience:
+        """Stand until more or something else is known, for there is nowhere to go."""
+        begun, known = self._clock(), self._known()
+        # A map that came anew, or turned a little, may say the same once more: what is missing may still be on its way.
+        while self._clock() - begun < self._config.patience and not self._has_changed(known):
             if self._interrupted():
                 return Leg((), ended=True)
             self._inbox.wait(POLL)
@@ -237,6 +244,14 @@ class RemoteRobot:
             if self._entered:
                 break
         return Leg(tuple(self._entered))
+
+    def _known(self) -> tuple[Int8[np.ndarray, "H W"], Int32[np.ndarray, "H W"]]:
+        values = self._shown()
+        return values, self._letters(values)
+
+    def _has_changed(self, known: tuple[Int8[np.ndarray, "H W"], Int32[np.ndarray, "H W"]]) -> bool:
+        """Whether the newest map or places say something else than was known."""
+        return self._lay(self._inbox.heard) and not all(map(np.array_equal, known, self._known()))
 
     def _first_cell(self) -> Cell:
         """Where the robot is at first. A pose that is not on the map may be an error of localisation: it waits."""
@@ -315,15 +330,34 @@ class RemoteRobot:
         return values
 
     def _belief(self) -> BeliefMap:
-        values = self._shown()
-        letters = self._letters(values == BeliefMap.FREE)
+        values, letters = self._known()
         return belief_from_numpy(values, letters, self._config.resolution, propositions=self._propositions)
 
-    def _letters(self, free: Bool[np.ndarray, "H W"]) -> Int32[np.ndarray, "H W"]:
-        letters = np.zeros(free.shape, np.int32)
+    def _letters(self, values: Int8[np.ndarray, "H W"]) -> Int32[np.ndarray, "H W"]:
+        letters, free = np.zeros(values.shape, np.int32), values == BeliefMap.FREE
         for name, region in (*self._known_regions(), *self._regions):
-            letters[region.covers(free, self._lattice.frame)] |= 1 << self._propositions.index(name)
+            covered = region.covers(free, self._lattice.frame)
+            if not covered.any():
+                covered = self._moved(name, region, values)
+            letters[covered] |= 1 << self._propositions.index(name)
         return letters
+
+    def _moved(self, name: str, region: Region, values: Int8[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+        """The cell beside a place that lies in obstacles, where there is one, and a word on it."""
+        free, obstacle = values == BeliefMap.FREE, values == BeliefMap.OCCUPIED
+        cell, covered = free_cell_beside(region, free, obstacle, self._lattice.frame), np.zeros_like(free)
+        if cell is not None:
+            covered[cell] = True
+            x, y = self._lattice.frame.cell_to_metres(*cell)
+            # Places keep their metres where a map that turns does not: one that was nowhere would end the task.
+            self._notice(f"{name}: {region} lies in an obstacle of the map; it is taken to be at [{x:.2f}, {y:.2f}]")
+        return covered
+
+    def _notice(self, text: str) -> None:
+        """Say something doubtful, once."""
+        if text not in self._noticed:
+            self._noticed.append(text)
+            self._say(text)
 
     def _known_regions(self) -> list[tuple[str, Region]]:
         named = () if self._places is None else self._places.propositions

@@ -131,7 +131,7 @@ def _recorded(
         world_number=None,
     )
     corrections = watched.history.corrections(world, first_seen, origin, steps)
-    return dataclasses.replace(trial, corrections=corrections, notes=tuple(watched.notes))
+    return dataclasses.replace(trial, corrections=corrections, notes=watched.notes)
 
 
 def _world_of(belief: BeliefMap, run: RunRecord) -> World:

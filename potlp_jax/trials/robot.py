@@ -6,6 +6,7 @@ robot of somebody else's says.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from functools import partial
 from typing import Protocol, runtime_checkable
 
@@ -90,6 +91,16 @@ class RemembersItsWay(Protocol):
         Asked before ``panorama``, from the first cell to the last, and only by policies whose estimator
         ``LooksOnTheWay``.
         """
+        ...
+
+
+@runtime_checkable
+class NoticesDoubts(Protocol):
+    """A robot that notices what is doubtful about its map or its places, for the record."""
+
+    @property
+    def noticed(self) -> Sequence[str]:
+        """All of it so far, in words."""
         ...
 
 

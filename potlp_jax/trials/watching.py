@@ -14,7 +14,7 @@ from jaxtyping import Array, Int32, UInt8
 from potlp_jax.errors import RobotError
 from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.trials.record import NEVER_SEEN, Correction, belief_seen_by
-from potlp_jax.trials.robot import GrowingRobot, Leg, RemembersItsWay, Robot
+from potlp_jax.trials.robot import GrowingRobot, Leg, NoticesDoubts, RemembersItsWay, Robot
 from potlp_jax.trials.rules import Stop
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.moves import Cell
@@ -45,11 +45,16 @@ class WatchedRobot:
             raise RobotError(f"{type(robot).__name__} is no robot: it needs the methods observe, panorama and advance")
         self._robot, self._seconds_per_cell, self._clock = robot, seconds_per_cell, clock
         self.history = MapHistory()
-        self.notes: list[str] = []
+        self._late: list[str] = []
         self._belief: BeliefMap | None = None
         self._expected: Cell | None = None
         # Where the last leg led, in the lattice that never moves.
         self._leg: tuple[Cell, ...] = ()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was noticed, here and by the robot itself."""
+        return (*self._late, *(self._robot.noticed if isinstance(self._robot, NoticesDoubts) else ()))
 
     @property
     def last_map(self) -> BeliefMap:
@@ -154,7 +159,7 @@ class WatchedRobot:
     def _note_late(self, seconds: float, length: int) -> None:
         limit = None if self._seconds_per_cell is None else self._seconds_per_cell * max(length, 1)
         if limit is not None and seconds > limit:
-            self.notes.append(
+            self._late.append(
                 f"a leg of {length} cells took {seconds:.1f} s, more than {limit:.1f} s: the robot is late"
             )
 

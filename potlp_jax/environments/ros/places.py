@@ -235,6 +235,29 @@ def component_labels(free: Bool[np.ndarray, "H W"]) -> Int32[np.ndarray, "H W"]:
     return labels
 
 
+def free_cell_beside(
+    region: Region, free: Bool[np.ndarray, "H W"], obstacle: Bool[np.ndarray, "H W"], frame: GridFrame
+) -> tuple[int, int] | None:
+    """Where a region is met that lies in obstacles, as where a map has turned a little since the region was named.
+
+    Args:
+        region: one that covers no free cell.
+        free: True on free cells.
+        obstacle: True on cells that are known to be obstacles.
+        frame: metres to cells.
+
+    Returns:
+        Of the free cells that touch a cell of the region, also at a corner, the one nearest to the region's middle; of
+        those at the same distance the first in row-major order. None where there is none, or where a cell of the region
+        is no obstacle: what was not seen yet may turn out to be free.
+    """
+    own = region.covers(np.ones_like(free), frame)
+    if not own.any() or not obstacle[own].all():
+        return None
+    beside = free & ndimage.binary_dilation(own, np.ones((3, 3), bool))
+    return frame.metres_to_cell(*nearest_free(_middle(region), beside, frame)) if beside.any() else None
+
+
 def nearest_free(point: Point, free: Bool[np.ndarray, "H W"], frame: GridFrame) -> Point:
     """The free cell nearest to a point.
 
@@ -252,12 +275,15 @@ def nearest_free(point: Point, free: Bool[np.ndarray, "H W"], frame: GridFrame) 
 
 
 def _why_nowhere(region: Region, reachable: Bool[np.ndarray, "H W"], frame: GridFrame) -> str:
-    points = np.array([region.centre] if isinstance(region, Disc) else region.vertices)
-    centre = (float(points[:, 0].mean()), float(points[:, 1].mean()))
     # On a map without walls: tells a region beyond the map from one inside of a wall.
     everywhere = region.covers(np.ones_like(reachable), frame)
     what = "covers no cell that the robot can reach" if everywhere.any() else "lies outside of the map's reachable part"
-    return f"{what}; the nearest cell it can reach is at {_text(nearest_free(centre, reachable, frame))}"
+    return f"{what}; the nearest cell it can reach is at {_text(nearest_free(_middle(region), reachable, frame))}"
+
+
+def _middle(region: Region) -> Point:
+    points = np.array([region.centre] if isinstance(region, Disc) else region.vertices)
+    return float(points[:, 0].mean()), float(points[:, 1].mean())
 
 
 def _distances(point: Point, frame: GridFrame) -> Float64[np.ndarray, "H W"]:
