@@ -10,14 +10,14 @@ test world 0 of each map. Each drive gets a folder in ``--out``, MAP-POLICY, wit
 
 Afterwards an evaluator that shares no code with the planner judges each path in the true building: moves, cost, letters
 and how the task ended. Exit code 1 where it finds a fault. What costs were to be expected say the same world without a
-network, and its true map. ``--report`` writes NAME.json, and into its folder a picture of each map and the pages.
+network, and its true map. ``--report`` writes NAME.json, and beside it a picture of each map; the pages hold the maps
+cell by cell, which are others', and stay in ``--out``.
 """
 
 import argparse
 import contextlib
 import dataclasses
 import json
-import shutil
 import subprocess
 import sys
 import time
@@ -217,7 +217,7 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", choices=MAPS, default=list(MAPS), metavar="MAP")
     parser.add_argument("--policies", nargs="+", choices=POLICIES, default=list(POLICIES))
     parser.add_argument("--speed", type=float, default=1.0, help="seconds of the simulation in a second")
-    parser.add_argument("--report", type=Path, help="without suffix: where figures go, and beside it the pictures")
+    parser.add_argument("--report", type=Path, help="without suffix: where figures go; pictures beside it")
     options = parser.parse_args()
     enable_compilation_cache()
     options.out.mkdir(parents=True, exist_ok=True)
@@ -230,9 +230,7 @@ def main() -> int:
             begun = time.monotonic()
             trial, seconds = drive_live(name, environment, building, policy, options.speed)
             wall = time.monotonic() - begun
-            page = write(trial, options.out / f"{name}-{policy}")
-            if options.report is not None:
-                shutil.copy(page, options.report.with_name(f"{name}-{policy}.html"))
+            write(trial, options.out / f"{name}-{policy}")
             drawn.append(on_true_map(trial, building.world))
             rows.append(row_of(name, drawn[-1], seconds, wall, building, task))
             print(json.dumps(rows[-1]), flush=True)
@@ -244,13 +242,11 @@ def main() -> int:
     return int(any(row["problems"] for row in rows))
 
 
-def write(trial: Trial, folder: Path) -> Path:
-    """Write record and page of a drive, as ``potlp drive --out`` does; returns the page."""
+def write(trial: Trial, folder: Path) -> None:
+    """Write record and page of a drive, as ``potlp drive --out`` does."""
     folder.mkdir(exist_ok=True)
     trial.save(folder / "trial.json")
-    page = folder / "replay.html"
-    page.write_text(replay_page(trial, Views()), "utf-8")
-    return page
+    (folder / "replay.html").write_text(replay_page(trial, Views()), "utf-8")
 
 
 if __name__ == "__main__":
