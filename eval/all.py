@@ -9,7 +9,7 @@ and named. Each experiment is a command of its own, as its page quotes it, and h
 in steps keep them in a folder there. Killed, the same command goes on: what was finished at this commit is not run
 again, and what was begun goes on from its own folder. One that fails is named at the end, and does not stop the others.
 Some commands write their page's data, others print tables: those are in the log, and are carried to the page by hand.
-The page of the fire-fighting estimator needs data sets that are collected first, and is not among them.
+Experiments that read what another one has written come after it in the list.
 """
 
 import argparse
@@ -59,6 +59,10 @@ class Experiment:
 
 _OTHERS = {"POTLP_EXTERNAL_DATA": "{data}"}
 
+_COLLECTED = "potlp collect firefighting --split validation --out {out} --set staying_sets=3 --set worlds_per_shard=20"
+_DRIVEN = "--set driver=potlp --set estimator=firefighting --set drives=1 --set first_world=5000"
+_SHIPPED = "potlp_jax/learning/data/"
+
 EXPERIMENTS: dict[str, Experiment] = {
     # First what tells the most and is quoted first.
     "table1": Experiment(
@@ -72,6 +76,40 @@ EXPERIMENTS: dict[str, Experiment] = {
     "worst": Experiment(
         page="worst",
         command="python -m eval.limit.worst {all}/table1 --out {out} --trials 40 --report docs/results/worst",
+    ),
+    # The estimator on what it meets itself and on what the explorer meets, in buildings that chose nothing.
+    "own": Experiment(
+        page="estimator",
+        command=f"{_COLLECTED} {_DRIVEN} --worlds 40 --set views_per_world=10 --set spacing=[10,120]",
+    ),
+    "explored": Experiment(
+        page="estimator",
+        command=f"{_COLLECTED} --worlds 60 --set first_world=3100 --set views_per_world=5 --set spacing=[10,120] "
+        "--set pursued=2",
+    ),
+    "means": Experiment(
+        page="estimator",
+        command=f"{_COLLECTED} {_DRIVEN} --worlds 40 --set views_per_world=20 --set spacing=[4,40] --set posterior=16",
+    ),
+    "f-own": Experiment(
+        page="estimator",
+        command=f"potlp estimator evaluate {_SHIPPED}firefighting.npz {{all}}/own --ablate all --out {{out}}",
+    ),
+    "f-explored": Experiment(
+        page="estimator",
+        command=f"potlp estimator evaluate {_SHIPPED}firefighting.npz {{all}}/explored --out {{out}}",
+    ),
+    "p-own": Experiment(
+        page="estimator",
+        command=f"potlp estimator evaluate {_SHIPPED}firefighting-panorama.npz {{all}}/own --out {{out}}",
+    ),
+    "p-explored": Experiment(
+        page="estimator",
+        command=f"potlp estimator evaluate {_SHIPPED}firefighting-panorama.npz {{all}}/explored --out {{out}}",
+    ),
+    "excess": Experiment(
+        page="estimator",
+        command="python -m eval.limit.excess firefighting --data {all}/means --report docs/results/estimator/excess",
     ),
     "held-out": Experiment(page="panorama", command="potlp sweep firefighting-held-out --out {out}"),
     "panorama": Experiment(

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -19,7 +20,6 @@ RESULTS = Path(__file__).parents[1] / "docs" / "results"
 WITHOUT = {
     "index": "it quotes the others",
     "dropped": "what was tried once and is gone",
-    "estimator": "its commands need data sets that are collected first, and stand on the page",
 }
 """Pages of results that no experiment makes."""
 
@@ -112,6 +112,16 @@ def test_it_goes_on_after_a_kill_once_what_it_had_begun_has_ended(monkeypatch, t
             break
         except ConfigurationError:
             time.sleep(0.05)
+
+
+def test_what_reads_from_another_comes_after_it():
+    """The folders below ``{all}`` are those of experiments that are earlier in the list."""
+    names = list(EXPERIMENTS)
+    read = [(name, part) for name in names for part in re.findall(r"\{all\}/([\w-]+)", EXPERIMENTS[name].command)]
+    assert ("worst", "table1") in read
+    assert ("f-own", "own") in read
+    for name, part in read:
+        assert part in names[: names.index(name)], f"{name} reads {part}"
 
 
 def test_what_reads_others_data_is_left_out_by_name(tmp_path):
