@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from eval.bench import regret
 from potlp_jax.bench.memory import tree_memory
 from potlp_jax.bench.perception import measure_perception
 from potlp_jax.bench.planner import as_dict, make_scene, mean_depth, measure_distances
@@ -24,6 +25,7 @@ from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.environments.toy import Toy
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
+from potlp_jax.planning.exact.api import solve_exact
 from potlp_jax.planning.search.api import search_tree
 from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.situation import DecisionConfig
@@ -300,3 +302,18 @@ def test_what_a_processor_can_do_decides_on_its_folder(tmp_path, monkeypatch):
     assert fingerprint((2600, "fpu avx avx2 avx512f")) != known
     told = told.replace("143", "85")
     assert fingerprint((2600, "fpu avx avx2")) != known
+
+
+def test_the_regret_of_our_search_is_of_its_own_choices_and_ends():
+    """In groups of one and of two rows, the last one not full: all end at the optimum, and few simulations end none."""
+    problems = [family_problem("two", 2, "tuning", index) for index in range(3)]
+    optima = [solve_exact(problem).q_values for problem in problems]
+    for most_bytes in (1, 2 * tree_memory(problems[0], BestFirstConfig(simulations=3000)).total):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(regret, "TREE_BYTES", most_bytes)
+            few, many = regret.ours("best-first")(problems, [1, 3000])
+        assert (few[:2], many[:2]) == (("best-first", 1), ("best-first", 3000))
+        assert not any(few[4])
+        assert all(many[4])
+        for action, q_values in zip(many[3], optima, strict=True):
+            np.testing.assert_allclose(q_values[action], q_values.min(), rtol=1e-5)
