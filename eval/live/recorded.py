@@ -18,6 +18,7 @@ import argparse
 import contextlib
 import dataclasses
 import json
+import shlex
 import subprocess
 import sys
 import time
@@ -58,6 +59,7 @@ FORMULA = PARCELS.tasks["1"]
 WORLD = 0
 
 COMMAND = "python -m eval.live.recorded --out out/recorded --maps MAPS"
+"""As results name it: without the folders of one machine."""
 
 
 class _TimedInbox(Inbox):
@@ -207,6 +209,13 @@ def row_of(
     }
 
 
+def write(trial: Trial, folder: Path) -> None:
+    """Write record and page of a drive, as ``potlp drive --out`` does."""
+    folder.mkdir(exist_ok=True)
+    trial.save(folder / "trial.json")
+    (folder / "replay.html").write_text(replay_page(trial, Views()), "utf-8")
+
+
 def main() -> int:
     """Entry point."""
     parser = argparse.ArgumentParser(
@@ -237,16 +246,11 @@ def main() -> int:
         if options.report is not None:
             save_figure(draw_side_by_side(drawn), options.report.with_name(f"{name}.png"))
     if options.report is not None:
-        data = {"provenance": provenance() | {"command": COMMAND}, "world": WORLD, "speed": options.speed, "rows": rows}
+        chosen = ["--only", *options.only, "--policies", *options.policies, "--speed", f"{options.speed:g}"]
+        command = shlex.join([*COMMAND.split(), *chosen])
+        data = {"provenance": provenance() | {"command": command}, "world": WORLD, "speed": options.speed, "rows": rows}
         options.report.with_suffix(".json").write_text(json.dumps(data, indent=1) + "\n", "utf-8")
     return int(any(row["problems"] for row in rows))
-
-
-def write(trial: Trial, folder: Path) -> None:
-    """Write record and page of a drive, as ``potlp drive --out`` does."""
-    folder.mkdir(exist_ok=True)
-    trial.save(folder / "trial.json")
-    (folder / "replay.html").write_text(replay_page(trial, Views()), "utf-8")
 
 
 if __name__ == "__main__":
