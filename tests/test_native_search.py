@@ -138,6 +138,33 @@ def test_plans_are_the_same_alone_in_vmap_and_in_scan():
     _assert_equal_plans(alone, jax.tree.map(lambda leaf: leaf[1], expected))
 
 
+def test_a_budget_is_an_argument_of_the_compiled_program():
+    """What another configuration would give, row by row, in one program of the kernel and one of the twin."""
+    problems, config, most = _problems("two", 4, 5), BestFirstConfig(simulations=60), 60
+    budgets = jnp.asarray([0, 1, 20, most, most + 40])
+    traced = []
+
+    @jax.jit
+    def plan(problems, budgets):
+        traced.append(1)
+        return jax.vmap(lambda problem, budget: plan_actions(problem, jax.random.key(0), config, budget))(
+            problems, budgets
+        )
+
+    plans = plan(problems, budgets)
+    plan(problems, budgets + 1)
+    assert len(traced) == 1
+    with twin_only():
+        _assert_equal_plans(plan(problems, budgets), plans)
+    for row, budget in enumerate([1, 1, 20, most, most]):
+        alone = _plan(jax.tree.map(lambda leaf, row=row: leaf[row], problems), jax.random.key(0), _of(budget))
+        _assert_equal_plans(jax.tree.map(lambda leaf, row=row: leaf[row], plans), alone)
+
+
+def _of(budget: int) -> BestFirstConfig:
+    return BestFirstConfig(simulations=budget)
+
+
 def test_no_twin_is_compiled_into_a_program_for_the_cpu():
     leaves, structure = jax.tree.flatten(_problems("find", 2, 2))
 

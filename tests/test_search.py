@@ -519,9 +519,8 @@ def test_a_search_is_its_verbs():
     problems = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(shared_shape("F g", seed) for seed in range(3)))
     limits = jnp.asarray([3, 1, 2])
 
-    def simulate(context, tree, config):
-        going = jnp.sum(tree.pulls, axis=1) < context
-        return Bandit(tree.pulls.at[:, 1].add(going.astype(jnp.int32)))
+    def simulate(context, tree, active, config):
+        return Bandit(tree.pulls.at[:, 1].add(active.astype(jnp.int32)))
 
     bandit = SearchMethod(
         tree=Bandit,
@@ -543,6 +542,10 @@ def test_a_search_is_its_verbs():
     np.testing.assert_array_equal(more.pulls[:, 1], limits + 2)
     _, capped = run_search(bandit, BestFirstConfig(simulations=2), problems, seeds, None)
     np.testing.assert_array_equal(capped.pulls[:, 1], np.minimum(limits, 2))
+    # Each row its own budget, and none more than the configuration allows or less than 1.
+    budgets = jnp.asarray([9, 0, 1])
+    _, own = run_search(bandit, BestFirstConfig(simulations=2), problems, seeds, None, budgets=budgets)
+    np.testing.assert_array_equal(own.pulls[:, 1], [2, 1, 1])
 
 
 def plan_of_pulls(pulls):

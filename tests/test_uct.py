@@ -187,6 +187,14 @@ def test_each_action_is_tried_once_first():
     assert np.isfinite(fewer.q_values[fewer.action])
 
 
+def test_each_row_has_its_own_budget():
+    problem, budgets = shared_shape("F a & F b", 3, unreachable=0.0), [1, 7, 40]
+    plan = jax.jit(jax.vmap(lambda budget: plan_actions(problem, jax.random.key(0), QUICK, budget)))
+    for row, budget in enumerate(budgets):
+        alone = plan_actions(problem, jax.random.key(0), UctConfig(simulations=budget))
+        np.testing.assert_array_equal(plan(jnp.asarray(budgets)).q_values[row], alone.q_values)
+
+
 def test_satisfied_and_boxed_in():
     task = task_of("F a & F b")
     fields = random_fields(task, 2, 0)

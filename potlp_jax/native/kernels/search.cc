@@ -38,7 +38,7 @@ constexpr size_t kKeptEntries = size_t{1} << 20;  // Memory that a thread keeps 
 
 // optimism.OPTIMISM, FEW_ACTIONS, OPTIMISM_OF_FEW come as attributes, so that they are written once.
 struct Settings {
-  int64_t simulations, max_depth, capacity, slots, guess_failures, few_actions;
+  int64_t max_depth, capacity, slots, guess_failures, few_actions;
   float optimism, optimism_of_few, default_optimism;
 };
 
@@ -59,6 +59,7 @@ struct Arrays {
   int32_t dfa_state;
   const bool* subgoal_mask;
   float dead_end_cost;
+  int32_t simulations;  // at most
 };
 
 // One row of the arrays of a tree (graph.Tree); holds, fails and visited have one word.
@@ -194,6 +195,9 @@ struct Node {
   int location, state, product_state;
   bool whole;                   // Entries of what is not available have chances and costs too.
   NodeValues values;
+  // The entry that a descent left by last, and the least costs of the others that leave, which have not changed since.
+  int left_by;
+  Costs rival;
 };
 
 struct History {
@@ -251,7 +255,7 @@ class Search {
     } else {
       plant();
     }
-    for (int64_t count = 0; count < settings_.simulations && is_open(); ++count) simulate();
+    for (int64_t count = 0; count < in_.simulations && is_open(); ++count) simulate();
     choose(plan);
     if (tree != nullptr) write_tree(*tree);
     forget();
@@ -835,6 +839,7 @@ class Search {
   // best_first._new_node: the entries of `history_` behind all others; `parent` is where it comes from, or kNone.
   Node new_node(int parent) {
     Node node{};
+    node.left_by = kNone;
     node.first = entries_;
     node.location = history_.location;
     node.state = history_.state;
@@ -1102,8 +1107,8 @@ class Search {
   int action_of(const Node& node, int entry) const { return state_actions_[node.state].action[entry]; }
 
   void descend_once(Descent& descent, bool certifies, bool is_last) {
-    const Node& node = nodes_[descent.node];
-    const int entry = select(node, (certifies ? floor_ : bound_).data() + node.first, descent.pending_cost);
+    Node& node = nodes_[descent.node];
+    const int entry = select_again(node, certifies, descent.pending_cost);
     if (entry == kNone) {
       // A dead end.
       descent.active = false;
@@ -1116,7 +1121,7 @@ class Search {
     level.entry = entry;
     level.inside = entry >= node.stay_begin && entry < node.stay_end;
     level.before = node.values;
-    level.rival = level.inside ? least_staying(node, entry) : least_leaving(node, entry);
+    level.rival = level.inside ? least_staying(node, entry) : least_but(node, entry);
     level.pending_cost = descent.pending_cost;
     const float path_cost = path_costs(state_actions_[node.state], node.product_state)[entry];
     // Follow the outcome that contributes more to the gap.
@@ -1142,6 +1147,25 @@ class Search {
     descent.active = !descent.accepted && child >= 0;
     if (!descent.accepted) descent.pending_cost = success ? success_cost : failure_cost;
     if (descent.active) descent.node = child;
+  }
+
+  // The entry of least bound or floor: most often the one of the last descent, which is seen without looking at all.
+  int select_again(const Node& node, bool certifies, float pending_cost) const {
+    const float* low = (certifies ? floor_ : bound_).data() + node.first;
+    if (node.left_by != kNone) {
+      const float own = pending_cost + low[node.left_by];
+      if (own < pending_cost + node.rival.low(certifies) && own < node.values.stay.low(certifies)) return node.left_by;
+    }
+    return select(node, low, pending_cost);
+  }
+
+  // Least costs of the entries that leave, but for one that a descent leaves by now.
+  const Costs& least_but(Node& node, int entry) const {
+    if (node.left_by != entry) {
+      node.left_by = entry;
+      node.rival = least_leaving(node, entry);
+    }
+    return node.rival;
   }
 
   // The entry of least bound or floor, ties by lowest index; only actions that leave pay the pending cost.
@@ -1314,6 +1338,7 @@ class Search {
     visited_.assign(tree.visited, tree.visited + nodes * (S + 1));
     for (int64_t n = 0; n < nodes; ++n) {
       Node node{};
+      node.left_by = kNone;
       node.first = entries_;
       node.location = tree.location[n];
       node.state = tree.state[n];
@@ -1460,13 +1485,15 @@ struct ProblemBatch {
   Batched<const int32_t> dfa_state;
   Batched<const bool> subgoal_mask;
   Batched<const float> dead_end_cost;
+  Batched<const int32_t> simulations;
 
   explicit ProblemBatch(Reader in)
       : accepting(in.next<bool>()), state_mask(in.next<bool>()), edges(in.next<int32_t>()), edge_mask(in.next<bool>()),
         edge_condition(in.next<int32_t>()), class_mask(in.next<bool>()), condition_classes(in.next<int32_t>()),
         condition_mask(in.next<bool>()), implies(in.next<bool>()), travel(in.next<float>()), finish(in.next<float>()),
         success_probability(in.next<float>()), success_cost(in.next<float>()), failure_cost(in.next<float>()),
-        dfa_state(in.next<int32_t>()), subgoal_mask(in.next<bool>()), dead_end_cost(in.next<float>()) {}
+        dfa_state(in.next<int32_t>()), subgoal_mask(in.next<bool>()), dead_end_cost(in.next<float>()),
+        simulations(in.next<int32_t>()) {}
 
   Shape shape() const {
     Shape shape;
@@ -1486,7 +1513,7 @@ struct ProblemBatch {
             condition_classes.row(i), condition_mask.row(i), implies.row(i),
             travel.row(i),         finish.row(i),         success_probability.row(i),
             success_cost.row(i),   failure_cost.row(i),   *dfa_state.row(i),
-            subgoal_mask.row(i),   *dead_end_cost.row(i)};
+            subgoal_mask.row(i),   *dead_end_cost.row(i), *simulations.row(i)};
   }
 };
 
@@ -1541,13 +1568,13 @@ Search& search_of_thread() {
 }
 
 // `tree`: 0 for plans alone, 1 for trees too, 2 where the results of the trees hold trees to go on with.
-ffi::Error search_rows(ffi::ThreadPool pool, int64_t tree, int64_t simulations, int64_t max_depth, int64_t capacity,
+ffi::Error search_rows(ffi::ThreadPool pool, int64_t tree, int64_t max_depth, int64_t capacity,
                        int64_t slots, int64_t guess_failures, int64_t few_actions, float optimism,
                        float optimism_of_few, float default_optimism, int64_t batch, ffi::RemainingArgs arguments,
                        ffi::RemainingRets results) {
   if (batch == 0) return ffi::Error::Success();
-  const Settings settings{simulations, max_depth,       capacity,        slots, guess_failures, few_actions, optimism,
-                          optimism_of_few, default_optimism};
+  const Settings settings{max_depth, capacity,        slots,           guess_failures,
+                          few_actions, optimism, optimism_of_few, default_optimism};
   const ProblemBatch problems(Reader(arguments, batch));
   Writer writer(results, batch);
   const PlanBatch plans(writer);
@@ -1572,7 +1599,6 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(best_first, search_rows,
                               ffi::Ffi::Bind()
                                   .Ctx<ffi::ThreadPool>()
                                   .Attr<int64_t>("tree")
-                                  .Attr<int64_t>("simulations")
                                   .Attr<int64_t>("max_depth")
                                   .Attr<int64_t>("capacity")
                                   .Attr<int64_t>("slots")

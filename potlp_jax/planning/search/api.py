@@ -16,7 +16,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Key, PRNGKeyArray, UInt32
+from jaxtyping import Array, Int32, Key, PRNGKeyArray, UInt32
 
 from potlp_jax.planning.problem import PlanningProblem, check_shapes
 from potlp_jax.planning.search.best_first import BEST_FIRST
@@ -30,7 +30,10 @@ from potlp_jax.precision import in_32_bits
 
 @in_32_bits
 def plan_actions(
-    problem: PlanningProblem, key: PRNGKeyArray, config: BestFirstConfig | UctConfig = BestFirstConfig()
+    problem: PlanningProblem,
+    key: PRNGKeyArray,
+    config: BestFirstConfig | UctConfig = BestFirstConfig(),
+    simulations: Int32[Array, ""] | int | None = None,
 ) -> Plan:
     """Search one problem for the action of least expected cost.
 
@@ -47,6 +50,9 @@ def plan_actions(
       config: which search, and its settings. Best-first search ends by itself on a small problem, on a large one after
         ``config.simulations``; ``Plan.lower_bound`` is ``Plan.value`` in the first case. PO-UCT always runs all
         simulations.
+      simulations: run so many at most, instead of ``config.simulations``, which still bounds them and fixes the memory;
+        less than 1 counts as 1. It may be traced: for another number nothing is compiled, and rows of a ``vmap`` may
+        have each its own.
 
     Returns:
       The plan.
@@ -54,7 +60,7 @@ def plan_actions(
     Raises:
       ProblemError: the shapes of the problem's arrays do not agree.
     """
-    return _search_one(problem, key, config, None, with_trees=False)[0]
+    return _search_one(problem, key, config, None, simulations, with_trees=False)[0]
 
 
 @in_32_bits
@@ -63,6 +69,7 @@ def search_tree(
     key: PRNGKeyArray,
     config: BestFirstConfig | UctConfig = BestFirstConfig(),
     tree: Tree | UctTree | None = None,
+    simulations: Int32[Array, ""] | int | None = None,
 ) -> tuple[Plan, Any]:
     """``plan_actions`` together with the searched tree.
 
@@ -72,6 +79,7 @@ def search_tree(
       config: as in ``plan_actions``.
       tree: of an earlier search of the same problem with the same kind of configuration, key and tree capacity. The
         search goes on with it for ``config.simulations`` more, and ends where one search of all of them would.
+      simulations: as in ``plan_actions``; of this call, not of the tree's earlier ones.
 
     Returns:
       The plan and the tree: ``Tree`` under ``BestFirstConfig``, ``UctTree`` under ``UctConfig``.
@@ -79,7 +87,7 @@ def search_tree(
     Raises:
       ProblemError: the shapes of the problem's arrays do not agree.
     """
-    return _search_one(problem, key, config, tree, with_trees=True)
+    return _search_one(problem, key, config, tree, simulations, with_trees=True)
 
 
 @in_32_bits
@@ -88,6 +96,7 @@ def search(
     keys: Key[Array, "B"],
     config: BestFirstConfig | UctConfig = BestFirstConfig(),
     trees: Tree | UctTree | None = None,
+    simulations: Int32[Array, "B"] | None = None,
 ) -> tuple[Plan, Any]:
     """``search_tree`` for a batch.
 
@@ -96,6 +105,7 @@ def search(
       keys: one per problem.
       config: as in ``plan_actions``, the same for all rows.
       trees: as in ``search_tree``, every leaf with the leading axis B.
+      simulations: as in ``plan_actions``, one number a row.
 
     Returns:
       Plans and trees with the leading axis B.
@@ -104,7 +114,8 @@ def search(
       ProblemError: the shapes of the problems' arrays do not agree.
     """
     check_shapes(problems, keys.shape)
-    return run_search(_search_for(config), config, problems, jax.vmap(_seed)(keys), trees)
+    seeds = jax.vmap(_seed)(keys)
+    return run_search(_search_for(config), config, problems, seeds, trees, budgets=simulations)
 
 
 def _search_one(
@@ -112,12 +123,14 @@ def _search_one(
     key: PRNGKeyArray,
     config: BestFirstConfig | UctConfig,
     tree: Tree | UctTree | None,
+    simulations: Int32[Array, ""] | int | None,
     with_trees: bool,
 ) -> tuple[Plan, Any]:
     check_shapes(problem)
+    budget = None if simulations is None else jnp.asarray(simulations, jnp.int32)
     # One problem is a batch of one: there is one kernel.
-    problems, seeds, trees = jax.tree.map(lambda leaf: leaf[None], (problem, _seed(key), tree))
-    found = run_search(_search_for(config), config, problems, seeds, trees, with_trees)
+    problems, seeds, trees, budgets = jax.tree.map(lambda leaf: leaf[None], (problem, _seed(key), tree, budget))
+    found = run_search(_search_for(config), config, problems, seeds, trees, with_trees, budgets)
     return jax.tree.map(lambda leaf: leaf[0], found)
 
 

@@ -245,19 +245,20 @@ def is_open(context: Context, tree: Tree) -> Bool[Array, "B"]:
     return root.value > root.floor
 
 
-def simulate(context: Context, tree: Tree, config: BestFirstConfig) -> Tree:
-    """One descent of all rows that are open.
+def simulate(context: Context, tree: Tree, active: Bool[Array, "B"], config: BestFirstConfig) -> Tree:
+    """One descent of all rows that are active.
 
     Args:
       context: of the problems.
       tree: the graphs.
+      active: rows that descend; only rows that are open (``is_open``).
       config: ``max_depth`` bounds the descent.
 
     Returns:
-      The graphs with at most one more node each; rows that are not open are unchanged.
+      The graphs with at most one more node each; rows that are not active are unchanged.
     """
     # Reads first, writes last: see the module.
-    descent = _descend(context, tree, config)
+    descent = _descend(context, tree, active, config)
     tree, leaf = _expand(context, tree, descent, config)
     return _count(_back_up(tree, descent, leaf), descent)
 
@@ -287,7 +288,7 @@ def _root_costs(context: Context, tree: Tree) -> Costs:
     return values.on_arrival(context.model.root.pending_cost, context.model.dead_end_cost)
 
 
-def _descend(context: Context, tree: Tree, config: BestFirstConfig) -> Descent:
+def _descend(context: Context, tree: Tree, active: Bool[Array, "B"], config: BestFirstConfig) -> Descent:
     """Follow the graph from the root to an outcome without a node, or to the rollout's end."""
     batch = tree.size.shape[0]
     root = _root_costs(context, tree)
@@ -296,8 +297,7 @@ def _descend(context: Context, tree: Tree, config: BestFirstConfig) -> Descent:
     nowhere = jnp.zeros((batch,), jnp.bool_)
     start = Descent(
         level=jnp.int32(0),
-        # Rows that have converged do not move, so that a row ends alike in any batch.
-        active=is_open(context, tree),
+        active=active,
         node=jnp.full((batch,), Tree.ROOT, jnp.int32),
         pending_cost=context.model.root.pending_cost,
         action=jnp.zeros((batch,), jnp.int32),

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, UInt32
+from jaxtyping import Array, Int32, UInt32
 
 from potlp_jax.native import by_platform
 from potlp_jax.planning.problem import PlanningProblem, screen
@@ -30,7 +30,8 @@ class SearchMethod:
       prepare: ``(problems, seeds, config) -> context``: what stays the same during the search.
       plant: ``(context, config) -> tree``: the roots alone.
       is_open: ``(context, tree) -> bool [B]``: whether more simulations can change anything.
-      simulate: ``(context, tree, config) -> tree``: one descent of every row that is open; others stay as they are.
+      simulate: ``(context, tree, active, config) -> tree``: one descent of every row that is active, bool [B]; others
+        stay as they are.
       choose: ``(context, tree) -> plan``.
       kernel: the same search as one call on CPU, where there is one.
     """
@@ -51,7 +52,7 @@ class SearchKernel:
     Attributes:
       library: that holds it (``potlp_jax.native``).
       fits: ``(problems) -> bool``: whether it takes problems of these shapes.
-      run: ``(problems, trees or None, config, with_trees) -> (plan, trees or None)``.
+      run: ``(problems, budgets, trees or None, config, with_trees) -> (plan, trees or None)``.
     """
 
     library: str
@@ -66,6 +67,7 @@ def run_search(
     seeds: UInt32[Array, "B 2"],
     trees: Any,
     with_trees: bool = True,
+    budgets: Int32[Array, "B"] | None = None,
 ) -> tuple[Plan, Any]:
     """Search a batch of problems; ``jax.vmap`` of this adds its axis to the batch.
 
@@ -76,13 +78,16 @@ def run_search(
       seeds: two random words per row.
       trees: of an earlier search of the same problems, to go on with; None to begin.
       with_trees: whether the trees are wanted.
+      budgets: simulations of each row, 1 to ``config.simulations``, to which others are clipped; None for the most.
 
     Returns:
       Plans and trees with the leading axis B; None for trees that are not wanted.
     """
     leaves, structure = jax.tree.flatten(problems)
+    most = jnp.full(seeds.shape[:1], config.simulations, jnp.int32)
+    budgets = most if budgets is None else jnp.clip(budgets.astype(jnp.int32), 1, most)
     kernel = _routed_kernel(search, config, structure, len(leaves), with_trees)
-    arrays = kernel(seeds, *leaves, *([] if trees is None else _arrays_of(trees)))
+    arrays = kernel(seeds, budgets, *leaves, *([] if trees is None else _arrays_of(trees)))
     count = len(dataclasses.fields(Plan))
     return _from_arrays(Plan, arrays[:count]), _from_arrays(search.tree, arrays[count:]) if with_trees else None
 
@@ -99,12 +104,12 @@ def _routed_kernel(
 
     @jax.custom_batching.custom_vmap
     @in_32_bits
-    def kernel(seeds, *arrays):
+    def kernel(seeds, budgets, *arrays):
         # The problem's leaves, and after them the tree's, where there is one.
         leaves, trees = arrays[:leaf_count], arrays[leaf_count:]
         problems = jax.tree.unflatten(structure, leaves)
         tree = _from_arrays(search.tree, trees) if trees else None
-        plan, tree = _search_batch(problems, seeds, tree, search=search, config=config, with_trees=with_trees)
+        plan, tree = _search_batch(problems, seeds, budgets, tree, search=search, config=config, with_trees=with_trees)
         return _arrays_of(plan) + (_arrays_of(tree) if with_trees else [])
 
     # Called where the caller's vmap is traced, which may be outside of the library's own functions.
@@ -129,6 +134,7 @@ def _routed_kernel(
 def _search_batch(
     problems: PlanningProblem,
     seeds: UInt32[Array, "B 2"],
+    budgets: Int32[Array, "B"],
     tree: Any,
     *,
     search: SearchMethod,
@@ -137,43 +143,51 @@ def _search_batch(
 ) -> tuple[Plan, Any]:
     """By the search's kernel on CPU, where it has one that can be used; otherwise in lockstep."""
 
-    def in_lockstep(problems: PlanningProblem, seeds: UInt32[Array, "B 2"], tree: Any) -> tuple[Plan, Any]:
-        plan, tree = _search_in_lockstep(problems, seeds, tree, search=search, config=config)
+    def in_lockstep(problems: PlanningProblem, seeds: Array, budgets: Array, tree: Any) -> tuple[Plan, Any]:
+        plan, tree = _search_in_lockstep(problems, seeds, budgets, tree, search=search, config=config)
         return plan, tree if with_trees else None
 
     kernel = search.kernel
     if kernel is None or not kernel.fits(problems):
-        return in_lockstep(problems, seeds, tree)
+        return in_lockstep(problems, seeds, budgets, tree)
 
-    def natively(problems: PlanningProblem, seeds: UInt32[Array, "B 2"], tree: Any) -> tuple[Plan, Any]:
+    def natively(problems: PlanningProblem, seeds: Array, budgets: Array, tree: Any) -> tuple[Plan, Any]:
         # A search that has a kernel draws nothing.
         del seeds
-        return kernel.run(problems, tree, config, with_trees)
+        return kernel.run(problems, budgets, tree, config, with_trees)
 
-    return by_platform(kernel.library, natively, in_lockstep, problems, seeds, tree)
+    return by_platform(kernel.library, natively, in_lockstep, problems, seeds, budgets, tree)
 
 
 def _search_in_lockstep(
-    problems: PlanningProblem, seeds: UInt32[Array, "B 2"], tree: Any, *, search: SearchMethod, config: Any
+    problems: PlanningProblem,
+    seeds: UInt32[Array, "B 2"],
+    budgets: Int32[Array, "B"],
+    tree: Any,
+    *,
+    search: SearchMethod,
+    config: Any,
 ) -> tuple[Plan, Any]:
     """Simulate until no row is open or the simulations are spent, then choose."""
-    problems, seeds, tree = vary_alike((problems, seeds, tree))
+    problems, seeds, budgets, tree = vary_alike((problems, seeds, budgets, tree))
     # A row with an invalid input becomes a dead end: nothing is planned with it, and no other row waits for it.
     problems, invalid = jax.vmap(screen)(problems)
     # Not part of the tree: a search that goes on prepares again, which costs a fraction of a search.
     context = search.prepare(problems, seeds, config)
     tree = search.plant(context, config) if tree is None else tree
 
-    # The loop ends with its slowest row; rows that have ended do nothing in between.
-    def unfinished(carry: tuple[Array, Any]) -> Array:
-        count, tree = carry
-        return (count < config.simulations) & jnp.any(search.is_open(context, tree))
+    def active(count: Array, tree: Any) -> Array:
+        return (count < budgets) & search.is_open(context, tree)
 
-    def advance(carry: tuple[Array, Any]) -> tuple[Array, Any]:
-        count, tree = carry
-        return count + 1, search.simulate(context, tree, config)
+    # The loop ends with its slowest row; rows that have ended do nothing in between, so that a row ends alike in any
+    # batch.
+    def advance(carry: tuple[Array, Array, Any]) -> tuple[Array, Array, Any]:
+        count, rows, tree = carry
+        tree = search.simulate(context, tree, rows, config)
+        return count + 1, active(count + 1, tree), tree
 
-    _, tree = jax.lax.while_loop(unfinished, advance, vary_alike((jnp.int32(0), tree)))
+    start = (jnp.int32(0), active(jnp.int32(0), tree), tree)
+    tree = jax.lax.while_loop(lambda carry: jnp.any(carry[1]), advance, vary_alike(start))[2]
     plan = search.choose(context, tree)
     status = jnp.where(invalid, status_array(Status.INVALID), plan.status)
     return dataclasses.replace(plan, status=status), tree

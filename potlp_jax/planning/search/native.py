@@ -2,7 +2,7 @@
 
 The kernel (``potlp_jax/native/kernels/search.cc``) searches the rows of a batch one by one. It leaves out what no
 rollout can get to, so that padding costs nothing, and settings of the search are attributes of the call: no program is
-compiled for them but the call itself.
+compiled for them but the call itself, and none at all for another budget.
 """
 
 import dataclasses
@@ -12,6 +12,7 @@ import jax
 import jax.ffi
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Int32
 
 from potlp_jax.native import target
 from potlp_jax.planning.history import WORD_BITS
@@ -46,7 +47,7 @@ _PROBLEM_FIELDS = (
     "subgoal_mask",
     "dead_end_cost",
 )
-"""Arguments of the kernel: those of the task first, in the order of ``ProblemBatch`` in its source."""
+"""Arguments of the kernel: those of the task first, in the order of ``ProblemBatch`` in its source; then the budgets."""
 
 
 def fits_kernel(problems: PlanningProblem) -> bool:
@@ -56,12 +57,17 @@ def fits_kernel(problems: PlanningProblem) -> bool:
 
 
 def search_natively(
-    problems: PlanningProblem, trees: Tree | None, config: BestFirstConfig, with_trees: bool
+    problems: PlanningProblem,
+    budgets: Int32[Array, "B"],
+    trees: Tree | None,
+    config: BestFirstConfig,
+    with_trees: bool,
 ) -> tuple[Plan, Tree | None]:
     """The whole search of a batch. For CPU, and only where the library ``LIBRARY`` is usable.
 
     Args:
       problems: every leaf has the leading axis B; ``fits_kernel``.
+      budgets: simulations of each row, at most.
       trees: to go on with, or None.
       config: of the search.
       with_trees: whether trees are wanted; without them, nothing is written but plans.
@@ -71,7 +77,7 @@ def search_natively(
       of them is kept.
     """
     arrays = [getattr(problems.task, name) for name in _TASK_FIELDS]
-    arrays += [getattr(problems, name) for name in _PROBLEM_FIELDS]
+    arrays += [*(getattr(problems, name) for name in _PROBLEM_FIELDS), budgets]
     batch = problems.dfa_state.shape[0]
     results = _plan_shapes(problems) + (_tree_shapes(problems, config) if with_trees else [])
     old = [] if trees is None else [getattr(trees, field.name) for field in dataclasses.fields(Tree)]
@@ -83,7 +89,6 @@ def search_natively(
         *arrays,
         *old,
         tree=np.int64(0 if not with_trees else 1 if trees is None else 2),
-        simulations=np.int64(config.simulations),
         max_depth=np.int64(config.max_depth),
         capacity=np.int64(config.capacity),
         slots=np.int64(config.slots),

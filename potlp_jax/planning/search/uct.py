@@ -225,18 +225,19 @@ def is_open(context: Context, tree: UctTree) -> Bool[Array, "B"]:
     return jnp.any(jnp.isfinite(tree.q_values[:, UctTree.ROOT]), axis=1)
 
 
-def simulate(context: Context, tree: UctTree, config: UctConfig) -> UctTree:
-    """One sampled rollout of all rows that are open.
+def simulate(context: Context, tree: UctTree, active: Bool[Array, "B"], config: UctConfig) -> UctTree:
+    """One sampled rollout of all rows that are active.
 
     Args:
       context: of the problems.
       tree: the trees.
+      active: rows that are rolled out; only rows that are open (``is_open``).
       config: ``max_depth`` and ``exploration`` matter.
 
     Returns:
-      The trees with at most one more node each; rows that are not open are unchanged.
+      The trees with at most one more node each; rows that are not active are unchanged.
     """
-    rollout = _descend(context, tree, config)
+    rollout = _descend(context, tree, active, config)
     tree, leaf = _expand(context, tree, rollout)
     return _back_up(tree, rollout, leaf)
 
@@ -259,14 +260,14 @@ def _new_q_values(terms: ActionTerms) -> Float32[Array, "B A"]:
     return jnp.where(terms.available, 0.0, jnp.inf).astype(jnp.float32)
 
 
-def _descend(context: Context, tree: UctTree, config: UctConfig) -> Rollout:
+def _descend(context: Context, tree: UctTree, active: Bool[Array, "B"], config: UctConfig) -> Rollout:
     """Sample a rollout from the root to an outcome without a node, or to its end."""
     batch, depth = tree.size.shape[0], config.max_depth
     nowhere = jnp.zeros((batch,), jnp.bool_)
     integers, floats = jnp.zeros((depth, batch), jnp.int32), jnp.zeros((depth, batch), jnp.float32)
     start = Rollout(
         level=jnp.int32(0),
-        active=is_open(context, tree),
+        active=active,
         node=jnp.full((batch,), UctTree.ROOT, jnp.int32),
         action=jnp.zeros((batch,), jnp.int32),
         success=nowhere,
