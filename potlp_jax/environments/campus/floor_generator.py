@@ -9,6 +9,7 @@ from jaxtyping import PRNGKeyArray
 
 from potlp_jax.environments.base import Generator, host_generators
 from potlp_jax.environments.campus.furnishing import Errand, Floor, FurnishConfig, Placement, furnish, missing_kinds
+from potlp_jax.environments.campus.people_posterior import PeoplePosterior, people_posterior
 from potlp_jax.errors import WorldError
 from potlp_jax.world.grid import World
 
@@ -62,6 +63,12 @@ class FloorGenerator(Generator):
         floor = self.draw_floor(floor_key)
         world, placement = furnish(floor, furnish_key, self.errand, self._furnishing, self._shape)
         return self.signed(world), floor, placement
+
+    def posterior(self, key: PRNGKeyArray, noise: PRNGKeyArray, count: int) -> PeoplePosterior:
+        """Who may be where on the floor of a key, the floor being known; see ``Generator.posterior``."""
+        _, floor, placement = self.generate_with_layout(key)
+        reach = self._furnishing.person_radius
+        return people_posterior(floor, self.errand, reach, placement.rooms, self._shape, noise, count)
 
     def draw_floor(self, key: PRNGKeyArray) -> Floor:
         """The building alone, with every kind of room that the task needs."""

@@ -34,6 +34,7 @@ from potlp_jax.environments.campus.furnishing import (
     furnish,
     name_kinds,
 )
+from potlp_jax.environments.campus.people_posterior import PeoplePosterior, people_posterior
 from potlp_jax.environments.campus.plan_floor import PlanFloor, rasterise
 from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.splits import FLOOR_PLAN_PREFIX
@@ -153,6 +154,12 @@ class FloorPlans(Generator):
         floor = self.building(key)
         world, placement = furnish(floor.floor, furnish_key, PEOPLE, self.config.furnishing, self._shape, floor.absent)
         return self.signed(world), floor, placement
+
+    def posterior(self, key: PRNGKeyArray, noise: PRNGKeyArray, count: int) -> PeoplePosterior:
+        """Who may be where on the plan of a key, the plan being known; see ``Generator.posterior``."""
+        _, plan, placement = self.generate_with_layout(key)
+        reach = self.config.furnishing.person_radius
+        return people_posterior(plan.floor, PEOPLE, reach, placement.rooms, self._shape, noise, count)
 
     def building(self, key: PRNGKeyArray) -> PlanFloor:
         """The building of this key's world; trials in one building are not independent."""

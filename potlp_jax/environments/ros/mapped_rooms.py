@@ -34,6 +34,7 @@ from potlp_jax.environments.campus.furnishing import (
     Placement,
     furnish,
 )
+from potlp_jax.environments.campus.people_posterior import PeoplePosterior, people_posterior
 from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.ros.cleaning import CleanMap, clean_map, warn_of_cut_off
 from potlp_jax.environments.ros.occupancy_map import load_map
@@ -143,6 +144,12 @@ class MappedRooms(Generator):
         """The world of this key, and who is where."""
         world, placement = furnish(self.floor, key, PARCELS, self._furnishing, self.floor.rooms.shape)
         return self.signed(world), placement
+
+    def posterior(self, key: PRNGKeyArray, noise: PRNGKeyArray, count: int) -> PeoplePosterior:
+        """Who may be where in the building, which is known; see ``Generator.posterior``."""
+        _, placement = self.generate_with_layout(key)
+        reach, shape = self._furnishing.person_radius, self.floor.rooms.shape
+        return people_posterior(self.floor, PARCELS, reach, placement.rooms, shape, noise, count)
 
 
 def _settings(resolution: float) -> Settings:

@@ -47,7 +47,7 @@ _PROBLEM_FIELDS = (
     "subgoal_mask",
     "dead_end_cost",
 )
-"""Arguments of the kernel: those of the task first, in the order of ``ProblemBatch`` in its source; then the budgets."""
+"""Arguments of the kernel, in the order of ``ProblemBatch`` in its source: the task's first; then the budgets."""
 
 
 def fits_kernel(problems: PlanningProblem) -> bool:
