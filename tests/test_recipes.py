@@ -87,6 +87,11 @@ def test_a_shipped_recipe_is_what_made_the_shipped_file(name):
     ]
     if begin is None:
         parts.append((recipe.collect.driver, recipe.training_worlds, recipe.collect))
+    parts += [
+        (driver, other.worlds(count, config.worlds_per_shard), config)
+        for driver, count, config in parts
+        for other in recipe.beside
+    ]
     # No world gives more views than this; many give as many, but some drives end early.
     most = sum(worlds * config.views_per_world for _, worlds, config in parts)
     assert 0.7 * most < estimator.metadata["panoramas"] <= most
