@@ -132,9 +132,14 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="python -m eval.real_maps --out {out} --maps {data}/maps --worlds 50 --processes {processes}",
     ),
     "floors": Experiment(page="floors", command="python -m eval.floor_statistics", variables=_OTHERS),
+    "buildings": Experiment(
+        page="buildings",
+        command="python -m eval.buildings --data {data} --out {out}/rows.jsonl --most 6 "
+        "--report docs/results/buildings",
+    ),
     "commits": Experiment(
         page="commits",
-        command="python -m eval.commits --pairs 500 --out {out}/rows.jsonl --report docs/results/commits.json",
+        command="python -m eval.commits --pairs 10000 --out {out}/rows.jsonl --report docs/results/commits.json",
     ),
     "trials": Experiment(
         page="trials",
@@ -188,7 +193,16 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="planner", command="python -m eval.bench.ended --instances 60 --simulations 500 --seconds 2 --out {out}"
     ),
     "regret": Experiment(
-        page="planner", command="python -m eval.bench.regret --instances 8 --seconds 10 --out {out}", one_core=True
+        page="planner",
+        command="python -m eval.bench.regret --planners best-first --subgoals 2 4 6 8 12 --instances 8 --seconds 2 "
+        "--budgets 30 300 1000 10000 100000 --out {out}",
+        one_core=True,
+    ),
+    "regret-beside": Experiment(
+        page="planner",
+        command="python -m eval.bench.regret --planners best-first po-uct-numba po-uct-pomdp-py --subgoals 1 2 4 6 8 "
+        "--instances 8 --seconds 10 --out {out}",
+        one_core=True,
     ),
     "throughput": Experiment(
         page="planner",

@@ -12,7 +12,7 @@ from flax import struct
 from eval.limit.__main__ import run
 from eval.limit.arms import Arm, key_of, missing_rows
 from eval.limit.mixed import mixed
-from eval.limit.report import page, results_of
+from eval.limit.report import markdown, page, results_of
 from eval.limit.rows import read_rows
 from eval.limit.worst import Loss, cause_of, worst_of
 from eval.provenance import lines_of
@@ -228,6 +228,13 @@ def test_shares_and_what_each_part_brings(tmp_path):
     assert page(json.loads(data.read_text()), data) == text
     assert "| 20.0 % (20 to 20) |" in text
     assert "| +60.0 (+60 to +60) |" in text
+    # Of floors the observer has the plan, and the command names the family.
+    floors = page({**results, "environment": "delivery"}, data)
+    assert "# The limit of estimates: delivery" in floors
+    assert "--environment delivery --report docs/results/limit\n" in floors
+    # Without PO-TLP there is nothing that gains are over.
+    without = results_of([row for row in rows if row["arm"] != Arm.POTLP], {"1": "F a"})
+    assert markdown(without).count("| task |") == 1
     # One building has no interval.
     assert "| 20.0 % (no interval) |" in page(results_of(rows[:5], {"1": "F a"}), data)
 

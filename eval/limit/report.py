@@ -33,6 +33,20 @@ TITLES = {
     Arm.BASELINE: "baseline",
 }
 
+OBSERVERS = {
+    "firefighting": (
+        "the generator's exact one, given every mapped cell and letter, and the tiles and the smoke (above a density "
+        "of 0.01) of every floor cell that has been in line of sight at a decision, at any distance. It knows how "
+        "buildings are drawn; what it does not know, nobody can."
+    )
+}
+OTHER_OBSERVER = (
+    "who may be where, given the floor plan, every mapped cell and letter, and whether a room is lit, of every room of "
+    "which a floor cell has been in line of sight at a decision. Having the plan, it bounds from above what can be "
+    "known of a floor that was never seen."
+)
+"""What an ideal observer knows, by environment; of floors with people or parcels."""
+
 Columns = Mapping[str, Callable[[Mapping[str, Any]], str]]
 """Of a table, by their titles: what each says of the figures of one task."""
 
@@ -116,18 +130,19 @@ def _seconds(rows: Sequence[Mapping[str, Any]], arm: Arm) -> dict[str, float]:
 def page(results: Mapping[str, Any], data: Path) -> str:
     """The text of the page, with the line of how it was made below each table; ``data`` is the file of the results."""
     lines = "\n".join(
-        [*_head(results), *_shares(results, data.name), *_gain_lines(results, data.name), *_foot(results)]
+        [*_head(results), *_shares(results, data.name), *_gain_lines(results, data.name), *_foot(results, data.name)]
     )
     return lines_of(lines + "\n", data.parent)
 
 
 def markdown(results: Mapping[str, Any]) -> str:
-    """The tables alone."""
-    return "\n".join([*_share_table(results), "", *_gain_table(results)])
+    """The tables alone; gains are over PO-TLP, where it ran."""
+    gains = ["", *_gain_table(results)] if _arms(results, [Arm.POTLP]) else []
+    return "\n".join([*_share_table(results), *gains])
 
 
 def _head(results: Mapping[str, Any]) -> Iterator[str]:
-    yield "# The limit of estimates"
+    yield f"# The limit of estimates{_of_environment(results, ': ')}"
     yield ""
     yield (
         "**Question.** How much of the attainable savings could PO-TLP keep if its estimates used all that the robot "
@@ -168,13 +183,13 @@ def _shares(results: Mapping[str, Any], data: str) -> Iterator[str]:
     )
     yield ""
     yield "- **oracle**: the true labels of the building;"
-    yield (
-        "- **ideal observer**: the means of the true labels over buildings drawn from the exact posterior of the "
-        "generator, given every mapped cell and letter, and the tiles and the smoke (above a density of 0.01) of every "
-        "floor cell that has been in line of sight at a decision, at any distance. It knows how buildings are drawn; "
-        "what it does not know, nobody can. The planner takes attempts to be independent of each other (Eq. 3), also "
-        "here. R_S and R_F are means over the buildings in which the attempt succeeds and over those in which it fails;"
-    )
+    if Arm.IDEAL_OBSERVER in _arms(results, Arm):
+        yield (
+            "- **ideal observer**: the means of the true labels over buildings drawn from a posterior: "
+            f"{OBSERVERS.get(results['environment'], OTHER_OBSERVER)} The planner takes attempts to be independent of "
+            "each other (Eq. 3), also here. R_S and R_F are means over the buildings in which the attempt succeeds and "
+            "over those in which it fails;"
+        )
     yield "- **true P_S**: the trained estimator's R_S and R_F with the true labels' P_S, 0 or 1;"
     yield (
         "- **true R_S and R_F**: the trained estimator's P_S, with the true labels' R_S of attempts that succeed in "
@@ -256,10 +271,17 @@ def _interval(low: float, high: float, form: str) -> str:
     return "no interval" if np.isnan(low) else f"{100 * low:{form}} to {100 * high:{form}}"
 
 
-def _foot(results: Mapping[str, Any]) -> Iterator[str]:
+def _of_environment(results: Mapping[str, Any], before: str) -> str:
+    """Its name, where the page is not that of the first family."""
+    return "" if results["environment"] in OBSERVERS else before + results["environment"]
+
+
+def _foot(results: Mapping[str, Any], data: str) -> Iterator[str]:
     yield "**Command.** The same command goes on where it was stopped, and with more worlds or another estimator."
     yield ""
-    yield from ("```sh", "python -m eval.limit --out out/limit --report docs/results/limit", "```", "")
+    environment = _of_environment(results, " --environment ")
+    command = f"python -m eval.limit --out out/limit{environment} --report docs/results/{Path(data).stem}"
+    yield from ("```sh", command, "```", "")
     yield f"Worlds of the split {results['split']}, the first of each task in which it is possible. Tasks:"
     yield ""
     yield from (f"- {name}: `{table['task']}`" for name, table in results["tables"].items())
