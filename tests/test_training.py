@@ -1,12 +1,10 @@
 """Training: the loss against plain NumPy, the order of the data, learning what can be learned, death and resumption."""
 
 import dataclasses
-import functools
 import itertools
 import math
 import os
 import random
-import re
 import shutil
 import signal
 import socket
@@ -19,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import NamedSharding, PartitionSpec
 
 from potlp_jax.errors import CheckpointError, TrainingError
 from potlp_jax.learning.augmentation import Augmentation
@@ -27,7 +26,7 @@ from potlp_jax.learning.checkpoints import checkpoint_steps
 from potlp_jax.learning.dataset import Samples, encode
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.dataset_reading import joined
-from potlp_jax.learning.devices import divide_processor, everywhere, is_first, join_processes, shared_out
+from potlp_jax.learning.devices import divide_processor, everywhere, is_first, join_processes, mesh, shared_out
 from potlp_jax.learning.estimator import read_estimator
 from potlp_jax.learning.loss import DataScale, evaluation_of, loss_sums, total_loss
 from potlp_jax.learning.network import Answers
@@ -35,12 +34,7 @@ from potlp_jax.learning.panorama_learner import PanoramaLearner, PanoramaOptions
 from potlp_jax.learning.serialization import load_estimator, save_estimator
 from potlp_jax.learning.training import batches_of, train
 from potlp_jax.learning.training_options import TrainingConfig
-from potlp_jax.learning.training_steps import (
-    initial_state,
-    learning_rate_schedule,
-    make_train_step,
-    shared_gradient,
-)
+from potlp_jax.learning.training_steps import initial_state, learning_rate_schedule, make_train_step, shared_sums
 from potlp_jax.world.camera import CameraConfig
 from tests.reference import data_sets as blank
 from tests.reference.data_sets import blank_columns, blank_fields, world_columns
@@ -449,26 +443,14 @@ def _shared(folder: str, address: str) -> None:
 
 def _gradient(learner: PanoramaLearner, samples: Samples):
     """Of the loss; a training alone would not tell it from its double, which Adam scales away."""
-    config, scale = _config(1, views_per_batch=7, weighting=0.4), DataScale.of(samples)
-    batch = shared_out(batches_of(learner, samples, config).training_batch(0))
-    params = everywhere(learner.init(jax.random.key(3)))
-    shared = jax.jit(functools.partial(shared_gradient, learner, scale, config))
-    # Devices wait for each other twice, the second time for what follows from the first.
-    assert len(re.findall(r"\bpsum\w*\[", str(jax.make_jaxpr(shared)(params, batch)))) == 2
-    return shared(params, batch)[2]
+    batch = shared_out(batches_of(learner, samples, _config(1, views_per_batch=7)).training_batch(0))
+    scale = DataScale.of(samples)
 
+    def loss(params, batch):
+        return total_loss(shared_sums(learner, scale, 0.4, params, batch), 0.5, 1.0)
 
-def _plain_gradient(learner: PanoramaLearner, samples: Samples):
-    """The same by the definition, on one device."""
-    config, scale = _config(1, views_per_batch=7, weighting=0.4), DataScale.of(samples)
-    batch = batches_of(learner, samples, config).training_batch(0)
-
-    def loss(params):
-        answers, of_views = learner.answers(params, batch.inputs, batch.phi_stay, batch.phi_go)
-        sums = loss_sums(answers, of_views, batch, learner.config, scale, config.weighting)
-        return total_loss(sums, config.cost_share, config.view_share)
-
-    return jax.jit(jax.grad(loss))(learner.init(jax.random.key(3)))
+    whole = NamedSharding(mesh(), PartitionSpec())
+    return jax.jit(jax.grad(loss), out_shardings=whole)(everywhere(learner.init(jax.random.key(3))), batch)
 
 
 def _joined(folder: Path, processes: int = 2) -> None:
@@ -506,9 +488,8 @@ def test_processes_and_devices_share_a_training_that_another_number_goes_on_with
     for one, other in zip(jax.tree.leaves(alone.params), params, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5)
     with np.load(tmp_path / "gradient.npz") as shared:
-        for found in (_plain_gradient(learner, samples), _gradient(learner, samples)):
-            for one, name in zip(jax.tree.leaves(found), shared.files, strict=True):
-                np.testing.assert_allclose(one, shared[name], rtol=1e-3, atol=1e-5)
+        for one, name in zip(jax.tree.leaves(_gradient(learner, samples)), shared.files, strict=True):
+            np.testing.assert_allclose(one, shared[name], rtol=1e-3, atol=1e-5)
     # One process with one device goes on with what two with four had left.
     checkpoints = tmp_path / "checkpoints"
     assert checkpoint_steps(checkpoints) == [4, 6]

@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jax.flatten_util import ravel_pytree
 from jax.sharding import NamedSharding, PartitionSpec
-from jaxtyping import Array, Float32, Int32, UInt32
+from jaxtyping import Array, Float32, Int32, PRNGKeyArray, UInt32
 
 from potlp_jax.learning.batches import Batch
 from potlp_jax.learning.devices import VIEWS, mesh
@@ -111,15 +110,18 @@ def make_train_step(
     """
     optimizer = make_optimizer(config)
 
+    def loss(params: Params, batch: Batch, key: PRNGKeyArray) -> tuple[Array, Sums]:
+        # All views at once, so that what is drawn does not depend on how they are shared out.
+        inputs = learner.augmented(batch.inputs, key, config.augmentation)
+        sums = shared_sums(learner, scale, config.weighting, params, dataclasses.replace(batch, inputs=inputs))
+        return total_loss(sums, config.cost_share, config.view_share), sums
+
     # Whole on every device, so that every process can read it.
     @functools.partial(jax.jit, out_shardings=NamedSharding(mesh(), PartitionSpec()))
     def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, Float32[Array, ""]]:
         # By the step and not by splitting: a resumed training has the same keys.
         key = jax.random.fold_in(jax.random.wrap_key_data(state.key), state.step)
-        # All views at once, so that what is drawn does not depend on how they are shared out.
-        inputs = learner.augmented(batch.inputs, key, config.augmentation)
-        augmented = dataclasses.replace(batch, inputs=inputs)
-        value, sums, gradient = shared_gradient(learner, scale, config, state.params, augmented)
+        (value, sums), gradient = jax.value_and_grad(loss, has_aux=True)(state.params, batch, key)
         with jax.numpy_dtype_promotion("standard"):  # Optax mixes integer counters and floats
             update, optimizer_state = optimizer.update(gradient, state.optimizer, state.params)
         params = optax.apply_updates(state.params, update)
@@ -172,48 +174,13 @@ def shared_sums(learner: Learner, scale: DataScale, weighting: float, params: Pa
     Returns:
         Sums of the whole batch.
     """
+    shared, whole = PartitionSpec(VIEWS), PartitionSpec()
 
     def sums_of(params: Params, part: Batch) -> Sums:
-        return _summed(_own_sums(learner, scale, weighting, params, part))
+        answers, view_loss = learner.answers(params, part.inputs, part.phi_stay, part.phi_go)
+        sums = loss_sums(answers, view_loss, part, learner.config, scale, weighting)
+        return jax.tree.map(lambda value: value[None], sums)
 
-    return _on_devices(sums_of)(params, batch)
-
-
-def shared_gradient(
-    learner: Learner, scale: DataScale, config: TrainingConfig, params: Params, batch: Batch
-) -> tuple[Float32[Array, ""], Sums, Params]:
-    """Loss, sums and gradient of a batch, of whose views each device takes as many; as ``shared_sums``."""
-
-    def gradient_of(params: Params, part: Batch) -> tuple[Array, Sums, Params]:
-        sums, pull_back = jax.vjp(lambda params: _own_sums(learner, scale, config.weighting, params, part), params)
-        # The loss is no sum over views: how much those of this device count follows from the sums of all.
-        sums = _summed(sums)
-        value, weights = jax.value_and_grad(total_loss)(sums, config.cost_share, config.view_share)
-        (gradient,) = pull_back(weights)
-        return value, sums, _summed(gradient)
-
-    return _on_devices(gradient_of)(params, batch)
-
-
-def _on_devices(function: Callable[[Params, Batch], Any]) -> Callable[[Params, Batch], Any]:
-    """A function of parameters and of a device's part of a batch, whose results are the same on all devices."""
-    whole = PartitionSpec()
     # Without the check: loops in the networks begin with constants, which it takes for equal on all devices.
-    return jax.shard_map(
-        function, mesh=mesh(), in_specs=(whole, PartitionSpec(VIEWS)), out_specs=whole, check_vma=False
-    )
-
-
-def _own_sums(learner: Learner, scale: DataScale, weighting: float, params: Params, part: Batch) -> Sums:
-    answers, view_loss = learner.answers(params, part.inputs, part.phi_stay, part.phi_go)
-    return loss_sums(answers, view_loss, part, learner.config, scale, weighting)
-
-
-def _summed(tree: Any) -> Any:
-    """Sums over all devices, of one vector: they wait for each other once.
-
-    Sums of single arrays are independent of each other. Each device of a processor begins with another one, and where
-    there are as few threads as devices all wait for ever.
-    """
-    vector, restore = ravel_pytree(tree)
-    return restore(jax.lax.psum(vector, VIEWS))
+    parts = jax.shard_map(sums_of, mesh=mesh(), in_specs=(whole, shared), out_specs=shared, check_vma=False)
+    return jax.tree.map(jnp.sum, parts(params, batch))
