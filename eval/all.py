@@ -73,6 +73,11 @@ EXPERIMENTS: dict[str, Experiment] = {
     "limit": Experiment(
         page="limit", command="python -m eval.limit --out {out} --worlds 60 --report docs/results/limit"
     ),
+    "limit-delivery": Experiment(
+        page="limit_delivery",
+        command="python -m eval.limit --out {out} --environment delivery --worlds 16 --buildings 8 "
+        "--report docs/results/limit_delivery",
+    ),
     "worst": Experiment(
         page="worst",
         command="python -m eval.limit.worst {all}/table1 --out {out} --trials 40 --report docs/results/worst",
