@@ -6,11 +6,11 @@
 ``DATA`` is the folder with the maps, plans and buildings of others; without it the generated families run alone. Each
 building is a process of its own, whose largest memory is that of the whole: reading, compiling, deciding. A document
 and a package lie in cells drawn at random, whatever the building calls its places, so that every file that can be read
-is a world; the baseline and PO-TLP, which asks the estimator for parcels, look for both in ``--worlds`` of them.
-Generated families run tasks and estimators of their own, on validation worlds. Seconds a decision are those of a whole
-trial, sensing and driving included, divided by its decisions, in the fastest trial: others compile for arrays of
-subgoals that grow. ``--most`` takes so many buildings of each family, spread evenly over their sizes in bytes. The same
-command goes on where it was stopped.
+is a world (of several levels the first); the baseline and PO-TLP, which asks the estimator for parcels, look for both
+in ``--worlds`` of them. Generated families run tasks and estimators of their own, on validation worlds. Seconds a
+decision are those of a whole trial, sensing and driving included, divided by its decisions, in the fastest trial:
+others compile for arrays of subgoals that grow. ``--most`` takes so many buildings of each family, spread evenly over
+their sizes in bytes. The same command goes on where it was stopped.
 """
 
 import argparse
@@ -36,6 +36,8 @@ from potlp_jax.environments.campus.furnishing import NARROW_DOORS, PARCELS
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.ros.buildings import load_building
 from potlp_jax.environments.ros.cleaning import clean_map
+from potlp_jax.environments.ros.map_settings import read_yaml
+from potlp_jax.environments.ros.rmf import is_building
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import PotlpWarning
 from potlp_jax.learning.estimator import named_estimator
@@ -74,7 +76,7 @@ class FoundPlaces(Generator):
     family = PARCELS_FAMILY
 
     def __init__(self, file: Path) -> None:
-        clean = clean_map(load_building(file))
+        clean = clean_map(load_building(file, _first_level(file)))
         self.name = f"found:{file.stem}"
         self._free, self._resolution = clean.free, clean.frame.resolution
         self.settings = Settings({**NARROW_DOORS, **scaled_to(self._resolution)})
@@ -91,6 +93,12 @@ class FoundPlaces(Generator):
         return make_world(
             ~self._free, letters * self._free, (row, column), self._resolution, propositions=self.propositions
         )
+
+
+def _first_level(file: Path) -> str | None:
+    """Of a building with levels; None of other files."""
+    fields = read_yaml(file) if file.suffix == ".yaml" else {}
+    return next(iter(fields["levels"])) if is_building(fields) else None
 
 
 def run_building(source: str, worlds: int) -> dict[str, Any]:

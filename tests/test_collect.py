@@ -360,7 +360,7 @@ def test_labels_by_a_posterior_are_means_that_are_right_on_average(compiled, tmp
 def test_families_that_do_not_say_what_they_can_be_give_no_such_labels(tmp_path):
     config = dataclasses.replace(CONFIG, posterior=12, held_out=())
     with pytest.raises(WorldError, match="does not say what its worlds can be"):
-        collect(make("delivery"), "delivery", Split.TRAINING, 2, tmp_path / "delivery", config)
+        collect(make("toy"), "toy", Split.TRAINING, 2, tmp_path / "toy", config)
     with pytest.raises(DatasetError, match="no building of its family agrees"):
         collect(Contradicting(GENERATOR.config), "firefighting", Split.TRAINING, 2, tmp_path / "wrong", config)
     with pytest.raises(DatasetError, match="posterior is -1"):

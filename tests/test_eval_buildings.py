@@ -33,6 +33,11 @@ def test_two_places_lie_where_the_robot_can_go(data):
         assert world.family == "parcels"
         assert world.settings["decision"]["frontiers"]["min_size"] == 1
     assert len({tuple(world.start.tolist()) for world in worlds}) > 1
+    # Of two levels the first.
+    two = data / "two.building.yaml"
+    level = TWO_ROOMS.replace("DOOR", "hinged").partition("levels:")[2]
+    two.write_text(f"levels:{level}{level.replace('L1', 'L2')}")
+    assert FoundPlaces(two).generate(world_key(Split.TEST, 0, "found:two.building")).shape == worlds[0].shape
 
 
 def test_buildings_are_spread_over_their_sizes(data):

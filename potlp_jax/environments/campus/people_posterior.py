@@ -46,7 +46,7 @@ class Plan:
     occupied: Bool[Array, "H W"]
     rooms: Int32[Array, "H W"]
     prior: Float32[Array, "P H W"]
-    by_room: Int32[Array, " HW"]
+    by_room: Int32[Array, " _"]
     reach: int = struct.field(pytree_node=False)
     room_count: int = struct.field(pytree_node=False)
     groups: tuple[tuple[int, ...], ...] = struct.field(pytree_node=False)
