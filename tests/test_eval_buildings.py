@@ -36,7 +36,9 @@ def test_two_places_lie_where_the_robot_can_go(data):
     # Of two levels the first.
     two = data / "two.building.yaml"
     level = TWO_ROOMS.replace("DOOR", "hinged").partition("levels:")[2]
-    two.write_text(f"levels:{level}{level.replace('L1', 'L2')}")
+    # The second is twice as large.
+    larger = level.replace("L1", "L2").replace("distance: [3, 10]", "distance: [3, 20]")
+    two.write_text(f"levels:{level}{larger}")
     assert FoundPlaces(two).generate(world_key(Split.TEST, 0, "found:two.building")).shape == worlds[0].shape
 
 
