@@ -304,6 +304,7 @@ def test_the_commands_collect_and_fit_by_a_recipe(tmp_path):
         (("collect", "mars", "--worlds", 4), "mars"),
         (("fit",), "give a DATASET and --validation, or a recipe"),
         (("fit", "data"), "another of other worlds"),
+        (("fit", "data", "--validation", "other", "--processes", "2"), "a fit of a DATASET uses all cores by itself"),
         (
             ("fit", "data", "--validation", "other", "--initial", "mine.npz", "--set", "network.fovea=2"),
             "--initial keeps the network of its estimator as it is: leave out --set network",

@@ -26,7 +26,7 @@ from potlp_jax.learning.checkpoints import checkpoint_steps
 from potlp_jax.learning.dataset import Samples, encode
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.dataset_reading import joined
-from potlp_jax.learning.devices import divide_processor, everywhere, is_first, join_processes, mesh, shared_out
+from potlp_jax.learning.devices import everywhere, is_first, join_processes, mesh, shared_out
 from potlp_jax.learning.estimator import read_estimator
 from potlp_jax.learning.loss import DataScale, evaluation_of, loss_sums, total_loss
 from potlp_jax.learning.network import Answers
@@ -415,7 +415,7 @@ SHARED = {"views_per_batch": 3, "augmentation": Augmentation(brightness=0.1, col
 
 def _shared(folder: str, address: str) -> None:
     """The training of the test below, in one of two processes with two devices each."""
-    divide_processor(2)
+    jax.config.update("jax_num_cpu_devices", 2)
     join_processes(address)
     samples, validation = synthetic(8, 5, 10), synthetic(5, 5, 11)
     # Three views for four devices: one of them gets a row that counts nothing.
@@ -521,12 +521,6 @@ def test_rows_of_processes_together_are_the_batch_of_one():
         for leaf, *rows in zip(*map(jax.tree.leaves, (one, *pieces)), strict=True):
             np.testing.assert_array_equal(np.concatenate(rows)[:5], leaf)
         assert not pieces[1].mask[2:].any()
-
-
-def test_a_processor_in_use_is_not_divided():
-    jax.block_until_ready(jnp.zeros(1) + 1)
-    with pytest.raises(TrainingError, match="cannot be divided into 7 devices any more"):
-        divide_processor(7)
 
 
 def test_resuming_with_other_options_or_data_names_the_difference(tmp_path):

@@ -79,7 +79,7 @@ def fit(
 
     from potlp_jax.codec import settings_from_words, with_settings
     from potlp_jax.learning.dataset_reading import joined, read_dataset
-    from potlp_jax.learning.devices import divide_processor, is_first, join_processes
+    from potlp_jax.learning.devices import is_first, join_processes
     from potlp_jax.recipes import fitting
     from potlp_jax.recipes.recipe import follow, read_recipe
 
@@ -91,6 +91,8 @@ def fit(
         fail("--initial goes on from an estimator with a DATASET; a recipe makes one from nothing")
     if initial is not None and any(word.startswith("network") for word in settings or []):
         fail("--initial keeps the network of its estimator as it is: leave out --set network")
+    if datasets and processes > 1:
+        fail("--processes is for collecting, as a recipe does: a fit of a DATASET uses all cores by itself; leave it out")
     given = None if recipe is None else read_recipe(recipe)
     if cluster is not None and datasets:
         fail("--cluster is for collecting, as a recipe does: a fit is shared by processes that join (--join)")
@@ -99,8 +101,6 @@ def fit(
     )
     options = {"epochs": epochs, "minutes": minutes}
     config = with_settings(config, _given(**options) | {"training": _given(seed=seed)}, "options")
-    if processes > 1:
-        divide_processor(processes)
     join_processes(join)
     if not datasets and jax.process_count() > 1:
         fail("several processes share a fit of a DATASET: collect first (`potlp collect --recipe`), then fit")

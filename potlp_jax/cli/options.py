@@ -139,7 +139,7 @@ Processes = Annotated[
     typer.Option(
         "--processes",
         min=1,
-        help="Collect in so many processes, each on a core; fit on so many cores, if they divide a batch's views.",
+        help="Collect in so many processes, each on a core. A fit uses all cores by itself.",
     ),
 ]
 

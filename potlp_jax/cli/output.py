@@ -88,6 +88,9 @@ def set_verbosity(level: int) -> None:
     # The handler stays for the process; commands that run one after another must not each add one.
     if not any(isinstance(handler, _Messages) for handler in package.handlers):
         package.addHandler(_Messages())
+        # With none of its own the root logger is given one by the first library that logs there, which would say all
+        # of this again.
+        logging.getLogger().addHandler(logging.NullHandler())
 
 
 def shows_progress() -> bool:

@@ -25,18 +25,6 @@ VIEWS: str = "views"
 _SIZES = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
 
 
-def divide_processor(parts: int) -> None:
-    """Have the processor count as so many devices, which share the views of a batch. Accelerators stay as they are.
-
-    Raises:
-        TrainingError: jax has computed something before, and its devices are what they are.
-    """
-    try:
-        jax.config.update("jax_num_cpu_devices", parts)
-    except RuntimeError as error:
-        raise TrainingError(f"the processor cannot be divided into {parts} devices any more: {error}") from error
-
-
 def join_processes(address: str | None = None) -> None:
     """Share the fit with other processes, where several were begun; jax must not have computed anything before.
 
