@@ -92,7 +92,9 @@ def fit(
     if initial is not None and any(word.startswith("network") for word in settings or []):
         fail("--initial keeps the network of its estimator as it is: leave out --set network")
     if datasets and processes > 1:
-        fail("--processes is for collecting, as a recipe does: a fit of a DATASET uses all cores by itself; leave it out")
+        fail(
+            "--processes is for collecting, as a recipe does: a fit of a DATASET uses all cores by itself; leave it out"
+        )
     given = None if recipe is None else read_recipe(recipe)
     if cluster is not None and datasets:
         fail("--cluster is for collecting, as a recipe does: a fit is shared by processes that join (--join)")
