@@ -584,3 +584,13 @@ def test_quiet_and_verbose_govern_what_is_said_on_stderr(flag):
 
 def test_quiet_still_tells_errors():
     assert "castle" in _potlp("--quiet", "run", "castle").stderr
+
+
+def test_a_line_is_said_once_where_a_library_logs_to_the_root():
+    # A process of its own: whether the root logger has a handler is decided once.
+    code = (
+        "import logging; from potlp_jax.cli.output import set_verbosity; set_verbosity(logging.INFO); "
+        "logging.warning('of a library'); logging.getLogger('potlp_jax.x').info('of ours')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.count("of ours") == 1
