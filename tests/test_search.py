@@ -199,47 +199,82 @@ def prepared(problem):
 @pytest.mark.parametrize("family", ["shared", "shared-dear"])
 def test_guesses_of_coupled_problems_are_what_the_rule_costs(family):
     context = prepared(family_problem(family, 2, "tuning", 1))
-    terms = jax.vmap(terms_of_all)(context.model.tables, context.model.root)
-    root = context.model.product_state(context.model.root.location, context.model.root.state)
-    chance, success_cost, available = terms.success_probability, terms.success_cost, terms.available
-    guesses = guess_outcomes(context.rule, root, jnp.zeros(1), available, chance, success_cost, 24)
-    after_failure, after_success = (np.asarray(guess[0]) for guess in guesses)
+    terms = root_terms(context)
+    after_failure, after_success = guesses_at_root(context, terms)
     rule = jax.tree.map(lambda leaf: leaf[0], context.rule)
-    chance, success_cost = (np.asarray(array[0], np.float64) for array in (chance, success_cost))
+    chance, success_cost = (
+        np.asarray(array[0], np.float64) for array in (terms.success_probability, terms.success_cost)
+    )
     tried = chance > 0
-    chosen = np.flatnonzero(np.asarray(available[0] & (rule.product_states >= 0)))
+    chosen = np.flatnonzero(np.asarray(terms.available[0] & (rule.product_states >= 0)))
     assert len(chosen) > 2
+
+    def assert_equal(guess, action, expected):
+        np.testing.assert_allclose((guess.cost[0, action], guess.dead_end[0, action]), expected, rtol=1e-4)
+
     for action in chosen:
         at, remaining = int(rule.product_states[action]), tried & ~np.asarray(rule.closes[action])
         expected = rest_of_chain(rule, chance, success_cost, at, rule.failure_cost[action], remaining, NESTED)
-        np.testing.assert_allclose(after_failure[action], expected, rtol=1e-4)
+        assert_equal(after_failure, action, expected)
         at = int(rule.success_states[action])
         if at >= 0:
             expected = rest_of_chain(rule, chance, success_cost, at, success_cost[action], tried, NESTED)
-            np.testing.assert_allclose(after_success[action], expected, rtol=1e-4)
+            assert_equal(after_success, action, expected)
+
+
+def root_terms(context):
+    return jax.vmap(terms_of_all)(context.model.tables, context.model.root)
+
+
+def guesses_at_root(context, terms):
+    """After failure and after success of every action."""
+    root = context.model.product_state(context.model.root.location, context.model.root.state)
+    chance, success_cost = terms.success_probability, terms.success_cost
+    return guess_outcomes(context.rule, root, jnp.zeros(1), terms.available, chance, success_cost, 24)
+
+
+@pytest.mark.parametrize("family", ["three-single", "firefighting", "shared-dear"])
+def test_guesses_are_the_cost_of_their_dead_ends_where_nothing_else_costs(family):
+    problem = family_problem(family, 3, "tuning", 2)
+    problem = dataclasses.replace(
+        problem,
+        travel=jnp.where(jnp.isinf(problem.travel), jnp.inf, 0.0),
+        finish=jnp.full_like(problem.finish, jnp.inf),
+        success_cost=jnp.full_like(problem.success_cost, 1e-6),
+        failure_cost=jnp.zeros_like(problem.failure_cost),
+    )
+    context = prepared(problem)
+    terms = root_terms(context)
+    available = np.asarray(terms.available & (context.rule.product_states >= 0))
+    for guess in guesses_at_root(context, terms):
+        dead_end, cost = np.asarray(guess.dead_end)[available], np.asarray(guess.cost)[available]
+        assert np.any((dead_end > 0.01) & (dead_end < 0.99))
+        np.testing.assert_allclose(cost, dead_end * float(problem.dead_end_cost), rtol=1e-3, atol=1e-3)
 
 
 def rest_of_chain(rule, chance, success_cost, at, pending_cost, remaining, nested, reached=1.0):
-    """What the rule costs from a product state on, where only ``remaining`` actions can succeed, by plain recursion."""
+    """What the rule costs from a product state on, where only ``remaining`` actions can succeed, by plain recursion;
+    and the probability that it ends at a dead end."""
     distance = np.where(rule.product_states == at, 0.0, np.asarray(rule.path_costs)[at] + pending_cost)
-    after = np.asarray(rule.after_success, np.float64)
+    after = np.asarray(rule.after_success.cost, np.float64)
     attempt = distance + chance * (success_cost + after) + (1 - chance) * np.asarray(rule.failure_cost)
     ratio = np.where(remaining, attempt / np.where(remaining, chance, 1.0), np.inf)
     best = int(np.argmin(ratio))
     if reached <= NEGLIGIBLE or np.isinf(ratio[best]):
-        return float(rule.dead_end_cost)
-    succeeds, success_state = after[best], int(rule.success_states[best])
+        return float(rule.dead_end_cost), 1.0
+    succeeds, success_state = (after[best], float(rule.after_success.dead_end[best])), int(rule.success_states[best])
     if nested > 0 and success_state >= 0:
         pending = success_cost[best]
         succeeds = rest_of_chain(rule, chance, success_cost, success_state, pending, remaining, nested - 1)
     rest, at = remaining & ~np.asarray(rule.closes[best]), int(rule.product_states[best])
     pending = float(rule.failure_cost[best])
-    fails = 0.0
+    fails = 0.0, 0.0
     if chance[best] < 1:
         reached *= 1 - chance[best]
         fails = rest_of_chain(rule, chance, success_cost, at, pending, rest, nested, reached)
-    success = chance[best] * (success_cost[best] + succeeds)
-    return distance[best] + success + (1 - chance[best]) * (pending + fails)
+    success = chance[best] * (success_cost[best] + succeeds[0])
+    cost = distance[best] + success + (1 - chance[best]) * (pending + fails[0])
+    return cost, chance[best] * succeeds[1] + (1 - chance[best]) * fails[1]
 
 
 def test_more_simulations_do_not_mislead_where_dead_ends_are_dear():

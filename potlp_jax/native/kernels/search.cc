@@ -31,6 +31,7 @@ constexpr float kNegligible = 1e-3f;   // guess.NEGLIGIBLE
 constexpr int kPasses = 4;             // guess.PASSES
 constexpr int kNested = 2;             // guess.NESTED
 constexpr float kLeastGuess = 1e-4f;   // best_first.LEAST_GUESS
+constexpr float kMostDeadEnds = 1 - 0x1p-8f;  // best_first.MOST_DEAD_ENDS
 constexpr int kProbes = 8;             // graph.PROBES
 constexpr int kNone = -1;              // NO_STATE, NO_SUBGOAL, NO_ACTION, NO_CLASS, NOWHERE, UNVISITED
 constexpr uint32_t kTreeOverflow = 2, kDepthOverflow = 4, kDeadEnd = 8, kAcceptingRoot = 16, kInvalid = 512;
@@ -66,6 +67,7 @@ struct Arrays {
 struct TreeArrays {
   float *q_values, *bounds, *floors, *chances, *success_costs;
   int32_t* children;
+  uint32_t* dead_ends;
   float* values;
   int32_t *location, *state;
   uint32_t *holds, *fails, *visited;
@@ -148,6 +150,37 @@ inline uint32_t mix(uint32_t bits) {
   return bits ^ (bits >> 16);
 }
 
+// graph.as_dead_ends and dead_ends_in.
+inline Marks as_dead_ends(const Lanes& failure, const Lanes& success) {
+  Marks high, low;
+  std::memcpy(&high, &failure, sizeof high);
+  std::memcpy(&low, &success, sizeof low);
+  return (high & int32_t(0xFFFF0000)) | (low >> 16);  // Not negative: no sign is drawn along.
+}
+
+inline float float_of(uint32_t bits) {
+  float value;
+  std::memcpy(&value, &bits, sizeof value);
+  return value;
+}
+
+inline float dead_end_in(uint32_t entry, bool success) {
+  return float_of(success ? entry << 16 : entry & 0xFFFF0000u);
+}
+
+inline Lanes dead_ends_in(const Marks& entries, bool success) {
+  const Marks bits = success ? entries << 16 : entries & int32_t(0xFFFF0000);
+  Lanes values;
+  std::memcpy(&values, &bits, sizeof values);
+  return values;
+}
+
+// best_first._discounted, of one guess or of a vector of them.
+template <typename Value>
+inline Value discounted(const Value& guess, const Value& dead_end, float optimism) {
+  return lesser((1.0f - optimism) * guess + optimism * dead_end, guess);
+}
+
 // Costs that are not negative, as bits that are.
 inline Marks as_guesses(const Lanes& values) {
   Marks bits;
@@ -165,6 +198,11 @@ struct Costs {
   float value, bound, floor;
 
   float low(bool certifies) const { return certifies ? floor : bound; }
+};
+
+// What is guessed to follow an outcome; its dead end is a probability.
+struct Guess {
+  float cost, dead_end;
 };
 
 struct NodeValues {
@@ -215,6 +253,7 @@ struct StateActions {
   std::vector<Set> condition;
   std::vector<float> failure_cost, chance, success_cost;  // with nothing known
   std::vector<float> after, after_success;  // what a success is worth, to the rule and to an entry
+  std::vector<float> dead_end;              // after a success
   // Path costs to each action from a product state, and to a product state from where each action fails; 0 inside. Made
   // when they are wanted: where they begin is kNone before.
   std::vector<float> rows, columns;
@@ -229,7 +268,9 @@ struct Candidates {
 
 struct Chain {
   std::vector<int> position;
-  std::vector<float> open_cost, cost, chance, rest;  // open_cost: of attempts, inf after they were taken or closed
+  std::vector<float> open_cost;  // of attempts, inf after they were taken or closed
+  std::vector<float> cost, chance, dead_end;  // by level; the dead end is that after its success
+  std::vector<Guess> rest;
   int length;
   std::vector<Set> failed;  // while it is followed: at each subgoal
 };
@@ -521,7 +562,8 @@ class Search {
     const int width = own.width = (own.count + kLanes - 1) / kLanes * kLanes;
     own.product_state.assign(width, kNone - 1);
     own.condition.assign(width, 0);
-    for (auto* values : {&own.failure_cost, &own.chance, &own.success_cost, &own.after, &own.after_success}) {
+    for (auto* values : {&own.failure_cost, &own.chance, &own.success_cost, &own.after, &own.after_success,
+                         &own.dead_end}) {
       values->assign(width, 0);
     }
     for (int i = 0; i < own.count; ++i) {
@@ -664,11 +706,11 @@ class Search {
   }
 
   // guess._value_successes, with the chances and costs of all actions in `all_chance_` and `all_cost_`.
-  void value_successes(std::vector<float>& after) {
+  void value_successes(std::vector<Guess>& after) {
     const int count = actions_.size(), S = shape_.S, E = shape_.E, Z = shape_.Z;
     after.resize(count);
-    for (int k = 0; k < count; ++k) after[k] = actions_[k].accepts ? 0.0f : dead_end_cost_;
-    after[count - 1] = 0;
+    for (int k = 0; k < count; ++k) after[k] = actions_[k].accepts ? Guess{0, 0} : Guess{dead_end_cost_, 1};
+    after[count - 1] = {0, 0};
     new_values_.resize(S);
     for (int pass = 0; pass < (cyclic_ ? kPasses : 1); ++pass) {
       for (const int edge : edge_order_) {
@@ -696,6 +738,7 @@ class Search {
     chain.position.clear();
     chain.cost.clear();
     chain.chance.clear();
+    chain.dead_end.clear();
     float reached = 1;
     bool active = true;
     for (chain.length = 0; active && chain.length < most; ++chain.length) {
@@ -713,17 +756,20 @@ class Search {
       const int taken = ratio.place(least), k = own.action[taken];
       const Action& action = actions_[k];
       const float chance = list.chance[taken];
-      float cost = least * chance;
+      float cost = least * chance, dead_end = own.dead_end[taken];
       if (nested > 0) {
         if (leads_on(action)) {
-          cost += chance * rest_after(nested - 1, success_state(action), all_cost_[k], chain.failed);
-          cost -= chance * after_[k];
+          const Guess rest = rest_after(nested - 1, success_state(action), all_cost_[k], chain.failed);
+          cost += chance * rest.cost;
+          cost -= chance * after_[k].cost;
+          dead_end = rest.dead_end;
         }
         chain.failed[action.subgoal] |= action.backward;
       }
       chain.position.push_back(taken);
       chain.cost.push_back(cost);
       chain.chance.push_back(chance);
+      chain.dead_end.push_back(dead_end);
       reached *= 1.0f - chance;
       active = reached > kNegligible;
       close_failed(chain, own, action);
@@ -731,9 +777,12 @@ class Search {
       pending_cost = action.failure_cost;
     }
     chain.rest.resize(chain.length + 1);
-    chain.rest[chain.length] = dead_end_cost_;
+    chain.rest[chain.length] = {dead_end_cost_, 1};
     for (int level = chain.length - 1; level >= 0; --level) {
-      chain.rest[level] = chain.cost[level] + (1.0f - chain.chance[level]) * chain.rest[level + 1];
+      const float chance = chain.chance[level], fails = 1.0f - chance;
+      const Guess& below = chain.rest[level + 1];
+      chain.rest[level] = {chain.cost[level] + fails * below.cost,
+                           chance * chain.dead_end[level] + fails * below.dead_end};
     }
   }
 
@@ -742,7 +791,7 @@ class Search {
   int success_state(const Action& action) const { return action.subgoal * shape_.Z + action.to_state; }
 
   // What the rule costs from a product state on, by what `history_` knows and what else has failed.
-  float rest_after(int nested, int product_state, float pending_cost, const std::vector<Set>& failed) {
+  Guess rest_after(int nested, int product_state, float pending_cost, const std::vector<Set>& failed) {
     Chain& chain = nested_[nested];
     const Candidates& list = tried_from(product_state % shape_.Z);
     const StateActions& own = *list.actions;
@@ -763,7 +812,7 @@ class Search {
   }
 
   // Actions that lead on from a state by `all_chance_` and `all_cost_`, wherever paths lead.
-  void list_tried(Candidates& list, int state, const std::vector<float>& after) {
+  void list_tried(Candidates& list, int state, const std::vector<Guess>& after) {
     StateActions& own = actions_from(state);
     list.actions = &own;
     list.chance.assign(own.width, 0);
@@ -771,7 +820,8 @@ class Search {
     for (int i = 0; i < own.count; ++i) {
       list.chance[i] = all_chance_[own.action[i]];
       list.success_cost[i] = all_cost_[own.action[i]];
-      own.after[i] = after[own.action[i]];
+      own.after[i] = after[own.action[i]].cost;
+      own.dead_end[i] = after[own.action[i]].dead_end;
     }
     own.valued = false;
     value_attempts(list);
@@ -783,13 +833,16 @@ class Search {
     const int count = own.count;
     const std::vector<Set> none(shape_.S + 1, 0);
     without_.assign(own.width, dead_end_cost_);
-    anew_.assign(count, 0);
+    dead_end_without_.assign(own.width, 1);
+    anew_.assign(count, {0, 0});
     for (int i = 0; i < count; ++i) {
       const Action& action = actions_[own.action[i]];
       if (action.subgoal == static_cast<int>(shape_.S) || path_[i] == kInf) continue;
       std::vector<Set> failed = none;
       failed[action.subgoal] = action.backward;
-      without_[i] = rest_after(kNested, action.product_state, action.failure_cost, failed);
+      const Guess rest = rest_after(kNested, action.product_state, action.failure_cost, failed);
+      without_[i] = rest.cost;
+      dead_end_without_[i] = rest.dead_end;
       if (leads_on(action)) anew_[i] = rest_after(kNested, success_state(action), all_cost_[own.action[i]], none);
     }
     // Only now: the chains need what the successes are worth to the rule.
@@ -812,11 +865,16 @@ class Search {
   void guess_failures(const Candidates& list) {
     StateActions& own = *list.actions;
     const int width = own.width;
-    without_.assign(width, chain_.rest[0]);
-    float spent = 0, reached = 1;
+    without_.assign(width, chain_.rest[0].cost);
+    dead_end_without_.assign(width, chain_.rest[0].dead_end);
+    Guess spent{0, 0};
+    float reached = 1;
     for (int level = 0; level < chain_.length; ++level) {
-      without_[chain_.position[level]] = spent + reached * chain_.rest[level + 1];
-      spent += reached * chain_.cost[level];
+      const Guess& rest = chain_.rest[level + 1];
+      without_[chain_.position[level]] = spent.cost + reached * rest.cost;
+      dead_end_without_[chain_.position[level]] = spent.dead_end + reached * rest.dead_end;
+      spent.cost += reached * chain_.cost[level];
+      spent.dead_end += reached * chain_.chance[level] * chain_.dead_end[level];
       reached *= 1.0f - chain_.chance[level];
     }
     if (chain_.length == 0) return;
@@ -874,6 +932,7 @@ class Search {
     if (size <= q_.size()) return;
     for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) values->resize(2 * size);
     for (auto& children : child_) children.resize(2 * size);
+    dead_ends_.resize(2 * size);
   }
 
   // Those of a subgoal and a state lie side by side.
@@ -885,21 +944,22 @@ class Search {
   }
 
   // What successes are worth, to the actions from a state.
-  void value_entries(StateActions& own, const std::vector<float>& after) const {
+  void value_entries(StateActions& own, const std::vector<Guess>& after) const {
     if (own.valued) return;
     const float least = kLeastGuess * dead_end_cost_;
     // What a coupled problem's guesses are made of changes from node to node.
     own.valued = !coupled_;
     for (int i = 0; i < own.count; ++i) {
       const int k = own.action[i];
-      own.after[i] = after[k];
-      own.after_success[i] = actions_[k].accepts ? 0.0f : std::max(after[k], least);
+      own.after[i] = after[k].cost;
+      own.after_success[i] = actions_[k].accepts ? 0.0f : std::max(after[k].cost, least);
+      own.dead_end[i] = after[k].dead_end;
     }
   }
 
   void fill_entries(const Node& node, const StateActions& own) {
-    const Lanes one = all_lanes(1.0f), least = all_lanes(kLeastGuess * dead_end_cost_), doubt = one - optimism_;
-    const auto store = [](std::vector<float>& values, int at, const Lanes& lanes) {
+    const Lanes one = all_lanes(1.0f), least = all_lanes(kLeastGuess * dead_end_cost_);
+    const auto store = [](auto& values, int at, const auto& lanes) {
       std::memcpy(values.data() + at, &lanes, sizeof lanes);
     };
     for (int i = 0; i < own.width; i += kLanes) {
@@ -912,14 +972,19 @@ class Search {
       known += (one - chance) * load(own.failure_cost.data() + i);
       const Lanes guessed = chance * after_success + (one - chance) * after_failure;
       store(q_, at, known + guessed);
-      store(bound_, at, known + doubt * guessed);
+      const Lanes failure_dead_end = load(dead_end_without_.data() + i) * dead_end_cost_;
+      const Lanes success_dead_end = load(own.dead_end.data() + i) * dead_end_cost_;
+      const Marks dead_ends = as_dead_ends(lesser(failure_dead_end, kMostDeadEnds * after_failure),
+                                           lesser(success_dead_end, kMostDeadEnds * after_success));
+      const Lanes doubted_failure = discounted(after_failure, dead_ends_in(dead_ends, false), optimism_);
+      const Lanes doubted_success = discounted(after_success, dead_ends_in(dead_ends, true), optimism_);
+      store(bound_, at, known + (chance * doubted_success + (one - chance) * doubted_failure));
       store(floor_, at, known);
       store(chance_, at, chance);
       store(success_cost_, at, success_cost);
-      const Marks guesses[2] = {as_guesses(after_failure), as_guesses(after_success)};
-      for (int success = 0; success < 2; ++success) {
-        std::memcpy(child_[success].data() + at, &guesses[success], sizeof guesses[success]);
-      }
+      store(child_[0], at, as_guesses(after_failure));
+      store(child_[1], at, as_guesses(after_success));
+      store(dead_ends_, at, dead_ends);
     }
   }
 
@@ -1126,8 +1191,8 @@ class Search {
     const float path_cost = path_costs(state_actions_[node.state], node.product_state)[entry];
     // Follow the outcome that contributes more to the gap.
     const float chance = chance_[at], success_cost = success_cost_[at], failure_cost = action.failure_cost;
-    const Costs after_success = outcome_costs(child_[1][at], success_cost, is_last);
-    const Costs after_failure = outcome_costs(child_[0][at], failure_cost, is_last);
+    const Costs after_success = outcome_costs(at, true, success_cost, is_last);
+    const Costs after_failure = outcome_costs(at, false, failure_cost, is_last);
     const float success_gap = chance * (after_success.value - after_success.low(certifies));
     const float failure_gap = (1.0f - chance) * (after_failure.value - after_failure.low(certifies));
     // Nothing is to be learnt from satisfying the task, and a certain success cannot fail.
@@ -1180,10 +1245,11 @@ class Search {
     return std::isinf(least) ? kNone : cost.place(least);
   }
 
-  Costs outcome_costs(int child, float pending_cost, bool is_last) const {
+  Costs outcome_costs(int at, bool success, float pending_cost, bool is_last) const {
+    const int child = child_[success][at];
     if (child < 0) {
       const float guess = guess_in(child);
-      return {guess, (1.0f - optimism_) * guess, 0.0f};
+      return {guess, discounted(guess, dead_end_in(dead_ends_[at], success), optimism_), 0.0f};
     }
     return closed_where(is_last, nodes_[child].values.on_arrival(pending_cost, dead_end_cost_));
   }
@@ -1292,6 +1358,7 @@ class Search {
     for (float* costs : {tree.q_values, tree.bounds, tree.floors}) std::fill(costs, costs + rows * A, kInf);
     for (float* terms : {tree.chances, tree.success_costs}) std::fill(terms, terms + rows * A, 0.0f);
     std::fill(tree.children, tree.children + rows * A * 2, kNone);
+    std::fill(tree.dead_ends, tree.dead_ends + rows * A, 0);
     std::fill(tree.values + nodes * 7, tree.values + rows * 7, 0.0f);
     for (int32_t* place : {tree.location, tree.state}) std::fill(place + nodes, place + rows, 0);
     for (uint32_t* known : {tree.holds, tree.fails}) std::fill(known + nodes * S, known + rows * S, 0);
@@ -1311,6 +1378,7 @@ class Search {
         tree.chances[entry] = chance_[at];
         tree.success_costs[entry] = success_cost_[at];
         for (int success = 0; success < 2; ++success) tree.children[2 * entry + success] = child_[success][at];
+        tree.dead_ends[entry] = dead_ends_[at];
       }
       const NodeValues& own = node.values;
       const float values[7] = {own.leave.value, own.stay.value,  own.leave.bound, own.stay.bound,
@@ -1372,6 +1440,7 @@ class Search {
       chance_[at] = tree.chances[entry];
       success_cost_[at] = tree.success_costs[entry];
       for (int success = 0; success < 2; ++success) child_[success][at] = tree.children[2 * entry + success];
+      dead_ends_[at] = tree.dead_ends[entry];
     }
   }
 
@@ -1382,6 +1451,7 @@ class Search {
     if (large) {
       for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) empty(*values, large);
       for (auto& children : child_) empty(children, large);
+      empty(dead_ends_, large);
     }
     empty(nodes_, large);
     empty(table_, large);
@@ -1408,7 +1478,7 @@ class Search {
   std::vector<float> cube_probability_, cube_cost_;
   std::vector<Set> cube_bits_, forward_of_, backward_of_, cubes_of_, relevant_;
   std::vector<int> edge_order_, action_at_;
-  std::vector<float> after_root_;
+  std::vector<Guess> after_root_;
   std::vector<StateActions> state_actions_;
 
   // The graph.
@@ -1416,6 +1486,7 @@ class Search {
   std::vector<Set> holds_, fails_, visited_;
   std::vector<float> q_, bound_, floor_, chance_, success_cost_;
   std::vector<int32_t> child_[2];  // after a failure, after a success
+  std::vector<uint32_t> dead_ends_;
   int entries_ = 0;
   std::vector<int32_t> table_, root_visits_;
   int32_t simulations_, steps_;
@@ -1427,7 +1498,8 @@ class Search {
   Candidates list_, valued_;
   std::vector<Candidates> tried_;
   Chain chain_, nested_[kNested + 1];
-  std::vector<float> anew_, path_, after_, all_chance_, all_cost_, new_values_, without_;
+  std::vector<Guess> anew_, after_, new_values_;
+  std::vector<float> path_, all_chance_, all_cost_, without_, dead_end_without_;
 };
 
 // One array of a batch: the row of every array lies behind that of the row before.
@@ -1541,6 +1613,7 @@ struct PlanBatch {
 struct TreeBatch {
   Batched<float> q_values, bounds, floors, chances, success_costs;
   Batched<int32_t> children;
+  Batched<uint32_t> dead_ends;
   Batched<float> values;
   Batched<int32_t> location, state;
   Batched<uint32_t> holds, fails, visited;
@@ -1549,15 +1622,15 @@ struct TreeBatch {
 
   explicit TreeBatch(Writer& out)
       : q_values(out.next<float>()), bounds(out.next<float>()), floors(out.next<float>()), chances(out.next<float>()),
-        success_costs(out.next<float>()), children(out.next<int32_t>()), values(out.next<float>()),
-        location(out.next<int32_t>()), state(out.next<int32_t>()), holds(out.next<uint32_t>()),
+        success_costs(out.next<float>()), children(out.next<int32_t>()), dead_ends(out.next<uint32_t>()),
+        values(out.next<float>()), location(out.next<int32_t>()), state(out.next<int32_t>()), holds(out.next<uint32_t>()),
         fails(out.next<uint32_t>()), visited(out.next<uint32_t>()), table(out.next<int32_t>()),
         root_visits(out.next<int32_t>()), size(out.next<int32_t>()), simulations(out.next<int32_t>()),
         steps(out.next<int32_t>()), status(out.next<uint32_t>()) {}
 
   TreeArrays row(int64_t i) const {
     return {q_values.row(i), bounds.row(i), floors.row(i), chances.row(i),     success_costs.row(i), children.row(i),
-            values.row(i),   location.row(i), state.row(i), holds.row(i),      fails.row(i),         visited.row(i),
+            dead_ends.row(i), values.row(i), location.row(i), state.row(i), holds.row(i),      fails.row(i),         visited.row(i),
             table.row(i),    root_visits.row(i), size.row(i), simulations.row(i), steps.row(i),      status.row(i)};
   }
 };

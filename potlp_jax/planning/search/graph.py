@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float32, Int32, UInt32
 from potlp_jax.planning.history import History
 from potlp_jax.planning.search.arrays import least_of_each, mix
 from potlp_jax.planning.search.config import BestFirstConfig
-from potlp_jax.planning.search.model import Model
+from potlp_jax.planning.search.model import FAILURE, SUCCESS, Model
 
 PROBES: int = 8
 """Consecutive slots of the hash table in which a history may be found. Where all are taken the node is not entered: it
@@ -40,7 +40,8 @@ class Costs:
 
     Attributes:
       value: with guesses as they are; what is believed.
-      bound: with every guess reduced by the search's optimism; where to look first.
+      bound: with every guess reduced by the search's optimism, apart from what dead ends cost in it; where to look
+        first.
       floor: with every guess replaced by 0. Costs are not negative, so that the true cost is no lower.
     """
 
@@ -113,6 +114,7 @@ class Tree:
       children: each action's outcomes, ``FAILURE`` and ``SUCCESS`` (``search.model``): the index of the outcome's node;
         where it has none, a negative number that holds its guessed value (``as_guess``). Outcomes that satisfy the task
         never have a node: their value is 0.
+      dead_ends: what dead ends cost in the guesses of each action's two outcomes (``as_dead_ends``).
       values: packed ``NodeValues`` of each node.
       location: of the node's history, as in ``history.History``.
       state: of the node's history.
@@ -133,6 +135,7 @@ class Tree:
     chances: Float32[Array, "*B N A"]
     success_costs: Float32[Array, "*B N A"]
     children: Int32[Array, "*B N A 2"]
+    dead_ends: UInt32[Array, "*B N A"]
     values: Float32[Array, "*B N 7"]
     location: Int32[Array, "*B N"]
     state: Int32[Array, "*B N"]
@@ -186,6 +189,7 @@ class NewNode:
     chances: Float32[Array, "*B A"]
     success_costs: Float32[Array, "*B A"]
     children: Int32[Array, "*B A 2"]
+    dead_ends: UInt32[Array, "*B A"]
 
 
 def as_guess(value: Float32[Array, "*N"]) -> Int32[Array, "*N"]:
@@ -199,6 +203,21 @@ def as_guess(value: Float32[Array, "*N"]) -> Int32[Array, "*N"]:
 def guess_in(child: Int32[Array, "*N"]) -> Float32[Array, "*N"]:
     """The guessed value in an entry of ``Tree.children``; it means something only where the entry is negative."""
     return jnp.abs(jax.lax.bitcast_convert_type(child, jnp.float32))
+
+
+def as_dead_ends(failure: Float32[Array, "*N"], success: Float32[Array, "*N"]) -> UInt32[Array, "*N"]:
+    """What dead ends cost in the guesses of an action's outcomes, as an entry of ``Tree.dead_ends``.
+
+    Each as the 16 higher bits of its number, so that one word holds both: up to 0.8 % too low.
+    """
+    bits = [jax.lax.bitcast_convert_type(cost, jnp.uint32) for cost in (failure, success)]
+    return (bits[FAILURE] & jnp.uint32(0xFFFF0000)) | (bits[SUCCESS] >> 16)
+
+
+def dead_ends_in(entry: UInt32[Array, "*N"]) -> tuple[Float32[Array, "*N"], Float32[Array, "*N"]]:
+    """What ``as_dead_ends`` has kept, after failure and after success."""
+    failure, success = entry & jnp.uint32(0xFFFF0000), entry << 16
+    return jax.lax.bitcast_convert_type(failure, jnp.float32), jax.lax.bitcast_convert_type(success, jnp.float32)
 
 
 def plant_tree(model: Model, root: NewNode, config: BestFirstConfig) -> Tree:
@@ -227,6 +246,7 @@ def plant_tree(model: Model, root: NewNode, config: BestFirstConfig) -> Tree:
         chances=first(root.chances),
         success_costs=first(root.success_costs),
         children=first(root.children, Tree.UNVISITED),
+        dead_ends=first(root.dead_ends),
         values=first(values.pack()),
         location=first(model.root.location),
         state=first(model.root.state),
@@ -372,6 +392,7 @@ def add_node(
         chances=write(tree.chances, node.chances),
         success_costs=write(tree.success_costs, node.success_costs),
         children=write(tree.children, node.children),
+        dead_ends=write(tree.dead_ends, node.dead_ends),
         location=write(tree.location, history.location),
         state=write(tree.state, history.state),
         holds=write(tree.holds, history.holds),

@@ -13,6 +13,9 @@ and with what it teaches. Chains are then **nested**: a success along a chain is
 that has failed before. The values of ``value_successes_anew`` still choose the order, and stand for successes that are
 nested more than ``NESTED`` deep.
 
+Beside its cost every guess has its **dead end**, the probability that the rule ends at one: what it adds to the cost is
+far surer than the rest, because any order of the same attempts has the same chance that all fail.
+
 Ordering by cost per chance is optimal for independent tests without path costs between them (Mitten 1960). With path
 costs the rule is a policy like any other, so that a guess is seldom too low in problems that are not coupled.
 
@@ -52,6 +55,19 @@ a guess by the length of a chain."""
 
 
 @struct.dataclass(kw_only=True)
+class Guess:
+    """What is guessed to follow an outcome.
+
+    Attributes:
+      cost: expected cost, what dead ends cost included.
+      dead_end: probability of ending at a dead end.
+    """
+
+    cost: Float32[Array, "..."]
+    dead_end: Float32[Array, "..."]
+
+
+@struct.dataclass(kw_only=True)
 class Rule:
     """The rule in a batch of problems; ``R`` is the batch axis, ``P`` numbers product states.
 
@@ -61,8 +77,8 @@ class Rule:
       success_states: where its success leads; negative where that satisfies the task, and for finish and padding.
       failure_cost: R_F of each action.
       closes: ``[r, a, b]``: a failure of ``a`` closes the condition of ``b``, so that ``b`` fails too.
-      after_success: guessed expected cost after each action's success, the cost that is then pending included; 0 where
-        the success satisfies the task, and for finish.
+      after_success: ``[r, a]``, guess after each action's success, the cost that is then pending included; 0 where the
+        success satisfies the task, and for finish.
       dead_end_cost: of each problem.
       reach: ``[r, z, z']``: from z the rollout can get to z'.
       coupled: True where what fails in one state of the automaton closes a condition of a later one.
@@ -73,7 +89,7 @@ class Rule:
     success_states: Int32[Array, "*R A"]
     failure_cost: Float32[Array, "*R A"]
     closes: Bool[Array, "*R A A"]
-    after_success: Float32[Array, "*R A"]
+    after_success: Guess
     dead_end_cost: Float32[Array, "*R"]
     reach: Bool[Array, "*R Z Z"]
     coupled: Bool[Array, "*R"]
@@ -111,14 +127,16 @@ class _Chain:
       action: the action; A where the chain has ended.
       cost: expected cost of its attempt, what follows its success included.
       chance: its P_S.
-      rest: expected cost from this level on, given that all before have failed.
+      dead_end: probability of ending at a dead end after its success.
+      rest: ``[L + 1, N]``, what follows from this level on, given that all before have failed.
     """
 
     levels: Int32[Array, ""]
     action: Int32[Array, "L N"]
     cost: Float32[Array, "L N"]
     chance: Float32[Array, "L N"]
-    rest: Float32[Array, "L1 N"]
+    dead_end: Float32[Array, "L N"]
+    rest: Guess
 
 
 @struct.dataclass(kw_only=True)
@@ -135,6 +153,7 @@ class _Walk:
       action: see ``_Chain``.
       cost: see ``_Chain``.
       chance: see ``_Chain``.
+      dead_end: see ``_Chain``.
     """
 
     level: Int32[Array, ""]
@@ -146,6 +165,7 @@ class _Walk:
     action: Int32[Array, "L N"]
     cost: Float32[Array, "L N"]
     chance: Float32[Array, "L N"]
+    dead_end: Float32[Array, "L N"]
 
 
 def make_rule(
@@ -217,11 +237,17 @@ def value_successes_anew(
     def value_anew(rule: Rule) -> Rule:
         unvalued = dataclasses.replace(rule, after_success=_unvalued(tables, rule.dead_end_cost))
         anew = _value_successes(unvalued, tables, chance, success_cost, length)
-        own = jnp.where(rule.coupled[:, None], anew.after_success, rule.after_success)
-        return dataclasses.replace(rule, after_success=own)
+        return dataclasses.replace(
+            rule, after_success=_where(rule.coupled[:, None], anew.after_success, rule.after_success)
+        )
 
     # The batch pays for it only if one of its problems needs it.
     return jax.lax.cond(jnp.any(rule.coupled), value_anew, lambda rule: rule, rule)
+
+
+def _where(condition: Bool[Array, "..."], guess: Guess, other: Guess) -> Guess:
+    """The one guess where the condition holds, the other elsewhere."""
+    return jax.tree.map(lambda own, other: jnp.where(condition, own, other), guess, other)
 
 
 def _success_states(tables: ActionTables) -> Int32[Array, "R A"]:
@@ -231,9 +257,10 @@ def _success_states(tables: ActionTables) -> Int32[Array, "R A"]:
     return jnp.where(leads_on, rows.subgoal * states + rows.to_state, NO_STATE).astype(jnp.int32)
 
 
-def _unvalued(tables: ActionTables, dead_end_cost: Float32[Array, "R"]) -> Float32[Array, "R A"]:
-    """What successes are worth until they are valued: they lead nowhere, unless they satisfy the task."""
-    return jnp.where(tables.actions.accepts, 0.0, dead_end_cost[:, None]).at[:, -1].set(0.0)
+def _unvalued(tables: ActionTables, dead_end_cost: Float32[Array, "R"]) -> Guess:
+    """What successes are worth until they are valued: they lead to a dead end, unless they satisfy the task."""
+    dead_end = jnp.where(tables.actions.accepts, jnp.float32(0.0), jnp.float32(1.0)).at[:, -1].set(0.0)
+    return Guess(cost=jnp.where(dead_end > 0, dead_end_cost[:, None], 0.0), dead_end=dead_end)
 
 
 def _is_coupled(tables: ActionTables, closes: Bool[Array, "R A A"], reach: Bool[Array, "R Z Z"]) -> Bool[Array, "R"]:
@@ -253,8 +280,8 @@ def guess_outcomes(
     chance: Float32[Array, "R A"],
     success_cost: Float32[Array, "R A"],
     length: int,
-) -> tuple[Float32[Array, "R A"], Float32[Array, "R A"]]:
-    """Guessed expected cost after every action of one history per problem.
+) -> tuple[Guess, Guess]:
+    """What is guessed to follow every action of one history per problem.
 
     After the failure of the rule's first action the rest of its chain follows. After the failure of another action the
     chain begins where that action failed, and does without it. In coupled problems each outcome has nested chains of
@@ -270,16 +297,17 @@ def guess_outcomes(
       length: failures in a row that are followed.
 
     Returns:
-      The guess after failure and the guess after success, the costs that are then pending included.
+      The guess after failure and the guess after success, ``[R, A]``, the costs that are then pending included.
     """
 
-    def guess_each(rule: Rule) -> tuple[Array, Array]:
+    def guess_each(rule: Rule) -> tuple[Guess, Guess]:
         return _guess_each(rule, available, chance, success_cost, length)
 
     along_chain = _guess_along_chain(rule, product_state, pending_cost, available, chance, success_cost, length)
     # The batch pays for it only if one of its problems needs it.
     each = jax.lax.cond(jnp.any(rule.coupled), guess_each, lambda rule: along_chain, rule)
-    return jax.tree.map(lambda own, other: jnp.where(rule.coupled[:, None], own, other), each, along_chain)
+    failure, success = (_where(rule.coupled[:, None], own, other) for own, other in zip(each, along_chain, strict=True))
+    return failure, success
 
 
 def _guess_each(
@@ -288,7 +316,7 @@ def _guess_each(
     chance: Float32[Array, "R A"],
     success_cost: Float32[Array, "R A"],
     length: int,
-) -> tuple[Float32[Array, "R A"], Float32[Array, "R A"]]:
+) -> tuple[Guess, Guess]:
     """The guesses of ``guess_outcomes`` for coupled problems: nested chains from each outcome of each action.
 
     Args:
@@ -299,7 +327,7 @@ def _guess_each(
       length: failures in a row that are followed.
 
     Returns:
-      The guess after failure and the guess after success; where there is no such outcome, the dead-end cost.
+      The guess after failure and the guess after success; where there is no such outcome, a dead end.
     """
     count, actions = available.shape
     attempts = rule.product_states >= 0
@@ -322,8 +350,11 @@ def _guess_each(
         attempt_cost=_attempt_cost(rule, rows, chance, success_cost)[problem],
         success_cost=success_cost[problem],
     )
-    rest = _follow_chain(rule, starts, length, NESTED).rest[0].reshape(count, 2, actions)
-    return rest[:, 0], rest[:, 1]
+    rest = _follow_chain(rule, starts, length, NESTED).rest
+    failure, success = (
+        jax.tree.map(lambda rest, which=which: rest[0].reshape(count, 2, actions)[:, which], rest) for which in range(2)
+    )
+    return failure, success
 
 
 def _guess_along_chain(
@@ -334,7 +365,7 @@ def _guess_along_chain(
     chance: Float32[Array, "R A"],
     success_cost: Float32[Array, "R A"],
     length: int,
-) -> tuple[Float32[Array, "R A"], Float32[Array, "R A"]]:
+) -> tuple[Guess, Guess]:
     """The guesses of ``guess_outcomes`` for problems that are not coupled, with the same arguments: one chain each."""
     rows = jnp.arange(product_state.shape[0], dtype=jnp.int32)
     # What has been learnt enters the chances and costs here.
@@ -349,27 +380,36 @@ def _guess_along_chain(
         success_cost=success_cost,
     )
     chain = _follow_chain(rule, starts, length)
-    without = _costs_without(chain, available.shape[1])
-    return without + _cost_to_begin_elsewhere(rule, starts, chain), rule.after_success
+    without = _without_each(chain, available.shape[1])
+    elsewhere = without.cost + _cost_to_begin_elsewhere(rule, starts, chain)
+    return dataclasses.replace(without, cost=elsewhere), rule.after_success
 
 
-def _costs_without(chain: _Chain, actions: int) -> Float32[Array, "N A"]:
-    """Expected cost of each chain with one action left out."""
+def _without_each(chain: _Chain, actions: int) -> Guess:
+    """Each chain with one action left out, ``[N, A]``."""
     count = chain.action.shape[1]
     number = jnp.arange(count, dtype=jnp.int32)
 
     def skip(level, carry):
         # What the levels before cost, and then the rest of the chain behind the level that is left out.
         spent, reached, without = carry
-        left_out = spent + rounded_product(reached, chain.rest[level + 1])
-        # Where a chain has ended the index is A, and the write is dropped.
-        without = without.at[number, chain.action[level]].set(left_out, mode="drop", unique_indices=True)
-        spent += rounded_product(reached, chain.cost[level])
+
+        def leave_out(without: Array, spent: Array, rest: Array) -> Array:
+            left_out = spent + rounded_product(reached, rest[level + 1])
+            # Where a chain has ended the index is A, and the write is dropped.
+            return without.at[number, chain.action[level]].set(left_out, mode="drop", unique_indices=True)
+
+        without = jax.tree.map(leave_out, without, spent, chain.rest)
+        spent = Guess(
+            cost=spent.cost + rounded_product(reached, chain.cost[level]),
+            dead_end=spent.dead_end + rounded_product(reached * chain.chance[level], chain.dead_end[level]),
+        )
         return spent, reached * (1.0 - chain.chance[level]), without
 
     # An action that the chain does not contain leaves it whole.
-    whole = jnp.broadcast_to(chain.rest[0][:, None], (count, actions))
-    start = jnp.zeros((count,), jnp.float32), jnp.ones((count,), jnp.float32), whole
+    whole = jax.tree.map(lambda rest: jnp.broadcast_to(rest[0][:, None], (count, actions)), chain.rest)
+    zeros = jnp.zeros((count,), jnp.float32)
+    start = Guess(cost=zeros, dead_end=zeros), jnp.ones((count,), jnp.float32), whole
     return jax.lax.fori_loop(0, chain.levels, skip, vary_alike(start, chain))[2]
 
 
@@ -465,8 +505,12 @@ def _value_successes(
         chain = _follow_chain(now, starts, length)
         # A problem without cycles is not valued again because another of the batch has them.
         keeps = order.is_final[problem, edge] | ((step >= todo) & ~order.cyclic[problem])
-        value = jnp.where(keeps, after_success[problem, action], chain.rest[0])
-        return after_success.at[problem, action].set(value, unique_indices=True)
+
+        def renew(after: Array, rest: Array) -> Array:
+            value = jnp.where(keeps, after[problem, action], rest[0])
+            return after.at[problem, action].set(value, unique_indices=True)
+
+        return jax.tree.map(renew, after_success, chain.rest)
 
     steps = todo * jnp.where(jnp.any(order.cyclic), PASSES, 1)
     start = vary_alike(rule.after_success, rule)
@@ -478,7 +522,7 @@ def _attempt_cost(
 ) -> Float32[Array, "N A"]:
     """Expected cost of each attempt without the path to it: what follows success is included, what follows failure
     is not."""
-    succeeds = rounded_product(chance, success_cost + rule.after_success[problem])
+    succeeds = rounded_product(chance, success_cost + rule.after_success.cost[problem])
     return succeeds + rounded_product(1.0 - chance, rule.failure_cost[problem])
 
 
@@ -497,6 +541,7 @@ def _follow_chain(rule: Rule, starts: _Starts, length: int, nested: int = 0) -> 
         action=jnp.full((length, count), actions, jnp.int32),
         cost=zeros,
         chance=zeros,
+        dead_end=zeros,
     )
     walk = jax.lax.while_loop(
         lambda walk: (walk.level < length) & jnp.any(walk.active),
@@ -504,16 +549,27 @@ def _follow_chain(rule: Rule, starts: _Starts, length: int, nested: int = 0) -> 
         vary_alike(walk, rule),
     )
 
-    def add(step: Int32[Array, ""], rest: Float32[Array, "L1 N"]) -> Float32[Array, "L1 N"]:
+    def add(step: Int32[Array, ""], rest: Guess) -> Guess:
         # From the chain's end backward. Levels that a chain did not reach cost nothing and cannot succeed.
         level = walk.level - 1 - step
-        below = walk.cost[level] + rounded_product(1.0 - walk.chance[level], rest[level + 1])
-        return jax.lax.dynamic_update_index_in_dim(rest, below, level, 0)
+        chance = walk.chance[level]
+        own = Guess(cost=walk.cost[level], dead_end=rounded_product(chance, walk.dead_end[level]))
+
+        def put(rest: Array, own: Array) -> Array:
+            below = own + rounded_product(1.0 - chance, rest[level + 1])
+            return jax.lax.dynamic_update_index_in_dim(rest, below, level, 0)
+
+        return jax.tree.map(put, rest, own)
 
     # A chain that is cut, or that has no action left, ends at a dead end.
-    end = jnp.broadcast_to(rule.dead_end_cost[starts.problem], (length + 1, count))
+    end = Guess(
+        cost=jnp.broadcast_to(rule.dead_end_cost[starts.problem], (length + 1, count)),
+        dead_end=jnp.ones((length + 1, count), jnp.float32),
+    )
     rest = jax.lax.fori_loop(0, walk.level, add, vary_alike(end, rule))
-    return _Chain(levels=walk.level, action=walk.action, cost=walk.cost, chance=walk.chance, rest=rest)
+    return _Chain(
+        levels=walk.level, action=walk.action, cost=walk.cost, chance=walk.chance, dead_end=walk.dead_end, rest=rest
+    )
 
 
 def _fail_once(rule: Rule, starts: _Starts, walk: _Walk, length: int, nested: int) -> _Walk:
@@ -543,8 +599,9 @@ def _fail_once(rule: Rule, starts: _Starts, walk: _Walk, length: int, nested: in
     chance = starts.chance[number, action]
     # The ratio times the chance gives the cost back.
     cost = rounded_product(least, chance)
+    dead_end = rule.after_success.dead_end[problem, action]
     if nested:
-        cost = _with_nested_success(rule, starts, walk, action, moves, cost, length, nested)
+        cost, dead_end = _with_nested_success(rule, starts, walk, action, moves, cost, length, nested)
     # The chain follows the failure.
     reached = walk.reached * (1.0 - chance)
 
@@ -561,6 +618,7 @@ def _fail_once(rule: Rule, starts: _Starts, walk: _Walk, length: int, nested: in
         action=record(walk.action, jnp.where(moves, action, actions)),
         cost=record(walk.cost, jnp.where(moves, cost, 0.0)),
         chance=record(walk.chance, jnp.where(moves, chance, 0.0)),
+        dead_end=record(walk.dead_end, dead_end),
     )
 
 
@@ -573,8 +631,8 @@ def _with_nested_success(
     cost: Float32[Array, "N"],
     length: int,
     nested: int,
-) -> Float32[Array, "N"]:
-    """The cost of each chain's next attempt, with its success valued by a chain without what has failed so far.
+) -> tuple[Float32[Array, "N"], Float32[Array, "N"]]:
+    """Each chain's next attempt, with its success valued by a chain without what has failed so far.
 
     Args:
       rule: of the problems.
@@ -587,7 +645,7 @@ def _with_nested_success(
       nested: how deep chains are nested, this one included.
 
     Returns:
-      The cost; unchanged where the success leads nowhere.
+      The cost, unchanged where the success leads nowhere, and the probability of a dead end after the success.
     """
     problem, number = starts.problem, jnp.arange(action.shape[0], dtype=jnp.int32)
     success_state = rule.success_states[problem, action]
@@ -600,5 +658,8 @@ def _with_nested_success(
         available=~jnp.isinf(walk.inverse_chance) & leads_on[:, None],
     )
     chance = starts.chance[number, action]
-    anew = cost + rounded_product(chance, _follow_chain(rule, inner, length, nested - 1).rest[0])
-    return jnp.where(leads_on, anew - rounded_product(chance, rule.after_success[problem, action]), cost)
+    rest = _follow_chain(rule, inner, length, nested - 1).rest
+    after = jax.tree.map(lambda values: values[problem, action], rule.after_success)
+    anew = cost + rounded_product(chance, rest.cost[0])
+    cost = jnp.where(leads_on, anew - rounded_product(chance, after.cost), cost)
+    return cost, jnp.where(leads_on, rest.dead_end[0], after.dead_end)
