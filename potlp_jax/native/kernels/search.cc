@@ -37,10 +37,9 @@ constexpr int kNone = -1;              // NO_STATE, NO_SUBGOAL, NO_ACTION, NO_CL
 constexpr uint32_t kTreeOverflow = 2, kDepthOverflow = 4, kDeadEnd = 8, kAcceptingRoot = 16, kInvalid = 512;
 constexpr size_t kKeptEntries = size_t{1} << 20;  // Memory that a thread keeps from one search to the next.
 
-// optimism.OPTIMISM, FEW_ACTIONS, OPTIMISM_OF_FEW come as attributes, so that they are written once.
 struct Settings {
-  int64_t max_depth, capacity, slots, guess_failures, few_actions;
-  float optimism, optimism_of_few, default_optimism;
+  int64_t max_depth, capacity, slots, guess_failures;
+  float optimism;
 };
 
 struct Shape {
@@ -312,15 +311,10 @@ class Search {
     start_ = invalid_ ? 0 : in_.dfa_state;
     state_accepts_.assign(Z, 0);
     for (int z = 0; z < Z; ++z) state_accepts_[z] = in_.accepting[z] && in_.state_mask[z] && !invalid_;
-    int subgoals = 0, edges = 0;
-    for (int s = 0; s < S; ++s) subgoals += subgoal_real_[s];
-    for (int e = 0; e < E; ++e) edges += in_.edge_mask[e];
-    const bool few = subgoals * edges + 1 <= settings_.few_actions;
-    // Negative where the configuration names none.
-    optimism_ = settings_.optimism >= 0 ? settings_.optimism
-                : few                   ? settings_.optimism_of_few
-                                        : settings_.default_optimism;
-    relate_states(subgoals > 0);
+    optimism_ = settings_.optimism;
+    bool subgoals = false;
+    for (int s = 0; s < S; ++s) subgoals |= subgoal_real_[s];
+    relate_states(subgoals);
     list_conditions();
     list_actions();
     coupled_ = is_coupled();
@@ -1642,12 +1636,10 @@ Search& search_of_thread() {
 
 // `tree`: 0 for plans alone, 1 for trees too, 2 where the results of the trees hold trees to go on with.
 ffi::Error search_rows(ffi::ThreadPool pool, int64_t tree, int64_t max_depth, int64_t capacity,
-                       int64_t slots, int64_t guess_failures, int64_t few_actions, float optimism,
-                       float optimism_of_few, float default_optimism, int64_t batch, ffi::RemainingArgs arguments,
-                       ffi::RemainingRets results) {
+                       int64_t slots, int64_t guess_failures, float optimism, int64_t batch,
+                       ffi::RemainingArgs arguments, ffi::RemainingRets results) {
   if (batch == 0) return ffi::Error::Success();
-  const Settings settings{max_depth, capacity,        slots,           guess_failures,
-                          few_actions, optimism, optimism_of_few, default_optimism};
+  const Settings settings{max_depth, capacity, slots, guess_failures, optimism};
   const ProblemBatch problems(Reader(arguments, batch));
   Writer writer(results, batch);
   const PlanBatch plans(writer);
@@ -1676,10 +1668,7 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(best_first, search_rows,
                                   .Attr<int64_t>("capacity")
                                   .Attr<int64_t>("slots")
                                   .Attr<int64_t>("guess_failures")
-                                  .Attr<int64_t>("few_actions")
                                   .Attr<float>("optimism")
-                                  .Attr<float>("optimism_of_few")
-                                  .Attr<float>("default_optimism")
                                   .Attr<int64_t>("batch")
                                   .RemainingArgs()
                                   .RemainingRets());

@@ -11,8 +11,8 @@ be lost in its discount. And the search ends when it is spent, proven or not.
 
 Values are those of Eq. 3 itself: expectations over both outcomes, minima over actions. Outcomes that have no node yet
 have a guessed value (``search.guess``). Beside its value every node has a **bound**, its value if every guess, apart
-from what dead ends cost in it, were too high by the fraction ``optimism``, and a **floor**, its value if every guess were 0. One simulation of all rows of a
-batch is
+from what dead ends cost in it, were too high by the fraction ``optimism``, and a **floor**, its value if every guess
+were 0. One simulation of all rows of a batch is
 
 1. **descend**: from the root, take the action of least bound, and of its two outcomes the one that contributes more to
    the gap between value and bound, until an outcome without a node is reached. Where no gap between value and bound is
@@ -78,7 +78,6 @@ from potlp_jax.planning.search.guess import Guess, Rule, guess_outcomes, make_ru
 from potlp_jax.planning.search.lockstep import SearchKernel, SearchMethod
 from potlp_jax.planning.search.model import FAILURE, SUCCESS, Model, make_model
 from potlp_jax.planning.search.native import LIBRARY, fits_kernel, search_natively
-from potlp_jax.planning.search.optimism import optimism_of
 from potlp_jax.planning.search.plan import Plan, plan_of_least_score
 from potlp_jax.planning.sharding import vary_alike
 from potlp_jax.task.relations import transitive_closure
@@ -104,7 +103,7 @@ class Context:
       model: the problems.
       rule: guesses the value of outcomes without a node.
       relevant: per state of the automaton, mask over the conditions that later choices can depend on.
-      optimism: of each problem.
+      optimism: ``BestFirstConfig.optimism``, of each problem.
     """
 
     model: Model
@@ -236,7 +235,7 @@ def prepare(problems: PlanningProblem, seeds: UInt32[Array, "B 2"], config: Best
         model=model,
         rule=rule,
         relevant=jax.vmap(_relevant_conditions)(model.tables, reach),
-        optimism=optimism_of(problems, config),
+        optimism=jnp.full(problems.dfa_state.shape, config.optimism, jnp.float32),
     )
 
 

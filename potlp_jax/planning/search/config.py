@@ -14,10 +14,10 @@ class BestFirstConfig:
     Attributes:
       simulations: descents per search; each adds at most one node. The search ends earlier once it has proven its value
         to be the optimum.
-      optimism: fraction by which guessed values are assumed to be too high: the descent takes the action that would be
-        best if they all were. Once nothing is left to examine under this assumption, the search goes on as if it
-        were 1, so that one that ends by itself is exact. None: 0.7 in problems of up to 41 actions, where one wrong
-        guess weighs more and there is less to examine, otherwise 0.3 (docs/results/planner.md, "How optimistic?").
+      optimism: fraction by which guessed values, apart from what dead ends cost in them, are assumed to be too high:
+        the descent takes the action that would be best if they all were. Once nothing is left to examine under this
+        assumption, the search goes on as if all guesses were 0, so that one that ends by itself is exact. The default
+        is tuned on problems that no result uses (docs/results/planner.md, "How optimistic?").
       max_depth: actions per descent. A descent that gets there is cut, valued by what is known of its last node, and
         flagged.
       tree_capacity: nodes per tree, at least 1; None for one more than simulations. A full tree is flagged.
@@ -26,7 +26,7 @@ class BestFirstConfig:
     """
 
     simulations: int = 300
-    optimism: float | None = None
+    optimism: float = 0.5
     max_depth: int = 64
     tree_capacity: int | None = None
     guess_failures: int = 24
@@ -35,7 +35,7 @@ class BestFirstConfig:
     def __post_init__(self) -> None:
         _check_kind(self, "best-first")
         _check_at_least_one(self, "simulations", "max_depth", "tree_capacity", "guess_failures")
-        if self.optimism is not None and not 0 <= self.optimism <= 1:
+        if not 0 <= self.optimism <= 1:
             raise ValueError(f"BestFirstConfig.optimism is {self.optimism}, must lie in [0, 1]")
 
     @property

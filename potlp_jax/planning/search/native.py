@@ -19,7 +19,6 @@ from potlp_jax.planning.history import WORD_BITS
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.search.graph import KEY_WORDS, PROBES, VALUE_COLUMNS, Tree
-from potlp_jax.planning.search.optimism import FEW_ACTIONS, OPTIMISM, OPTIMISM_OF_FEW
 from potlp_jax.planning.search.plan import Plan
 from potlp_jax.planning.sharding import vary_alike
 
@@ -93,11 +92,7 @@ def search_natively(
         capacity=np.int64(config.capacity),
         slots=np.int64(config.slots),
         guess_failures=np.int64(config.guess_failures),
-        few_actions=np.int64(FEW_ACTIONS),
-        # Negative where the configuration names none.
-        optimism=np.float32(-1.0 if config.optimism is None else config.optimism),
-        optimism_of_few=np.float32(OPTIMISM_OF_FEW),
-        default_optimism=np.float32(OPTIMISM),
+        optimism=np.float32(config.optimism),
         batch=np.int64(batch),
     )
     found = vary_alike(list(found), arrays, old)

@@ -23,11 +23,11 @@ class Plan:
       q_values: expected cost of each action, inf where it is not available (under ``UctConfig`` also where no rollout
         took it).
       visits: simulations that began with each action.
-      optimism_gap: fraction of ``value`` by which it would fall if every guess that it rests on were too high by the
-        search's optimism (``BestFirstConfig``). Above 0 it is **no bound on the error**: it looks down only, a guess
-        may also be too low, and it may be too high by more than the optimism. 0 says, if the optimism is not 0, that
-        ``value`` rests on no guess: it is what the plan's own policy costs, so that the optimum is no higher. inf from
-        ``UctConfig``, which has no bounds.
+      optimism_gap: fraction of ``value`` by which it would fall if every guess that it rests on, apart from what dead
+        ends cost in it, were too high by the search's optimism (``BestFirstConfig``). Above 0 it is **no bound on the
+        error**: it looks down only, a guess may also be too low, and it may be too high by more than the optimism.
+        0 says, if the optimism is not 0, that ``value`` rests on no guess: it is what the plan's own policy costs, so
+        that the optimum is no higher. inf from ``UctConfig``, which has no bounds.
       lower_bound: certified: the optimum is no lower, up to rounding, unless ``status`` has ``DEPTH_OVERFLOW``. Where
         ``optimism_gap`` is 0 the optimum lies between it and ``value``. Where it equals ``value`` the search has ended,
         and ``value`` is the optimum (proof: ``search.best_first``). -inf from ``UctConfig``. ``planning.exact`` gives
