@@ -317,3 +317,38 @@ def test_the_regret_of_our_search_is_of_its_own_choices_and_ends():
         assert all(many[4])
         for action, q_values in zip(many[3], optima, strict=True):
             np.testing.assert_allclose(q_values[action], q_values.min(), rtol=1e-5)
+
+
+def test_the_goal_counts_from_where_it_is_kept():
+    from eval.bench.regret_report import Row, time_to_goal
+
+    def row(budget, percent):
+        of_instance = ([0], [percent], [percent], [True], [0.0], [False])
+        return Row("test", "find", 1, "best-first", budget, float(budget), *of_instance)
+
+    assert time_to_goal([row(1, 0.5), row(10, 3.0), row(100, 0.9), row(1000, 0.1)]) == 100.0
+    assert time_to_goal([row(1, 0.5), row(10, 3.0)]) == np.inf
+
+
+def test_regrets_are_summed_up_by_subgoals_and_by_budget():
+    from eval.bench.regret_report import Row, by_budget, by_subgoals
+
+    def row(family, subgoals, budget, percent, ended):
+        exact, zeros = [True, True, False], [0.0] * 3
+        return Row("test", family, subgoals, "best-first", budget, 1.0, [0, 1, 2], percent, zeros, exact, zeros, ended)
+
+    rows = [
+        row("find", 2, 30, [9.0, 9.0, 9.0], [False] * 3),
+        row("find", 2, 300, [0.0, 1.0, 2.0], [True, True, False]),
+        row("find", 4, 300, [3.0, 3.0, 3.0], [False, True, True]),
+        row("two", 4, 300, [0.0, 0.0, 0.0], [True] * 3),
+    ]
+    lines = by_subgoals(rows, 300).splitlines()
+    assert lines[0] == "| family | S = 2 | S = 4 | exact |"
+    assert lines[2:] == ["| find | 1 (2) | 3 (3) | 4 of 6 |", "| two | – | 0 (0) | 2 of 3 |"]
+    lines = by_budget([row for row in rows if row.family == "find"]).splitlines()
+    assert lines[0] == "| family | 30 | 300 | ended at the last, wrong |"
+    # Of the four that ended one has no exact truth, and one was right.
+    assert lines[2].startswith("| find | 9 (9 to 9) | 2 (")
+    assert lines[2].endswith("| 4 of 6, 2 |")
+    assert lines[3].startswith("| all | 9 (9 to 9) | 2 (")

@@ -187,17 +187,6 @@ def test_the_truth_is_kept_for_the_same_problem_only(tmp_path):
         np.testing.assert_allclose(truth.q_values, solve_exact(problem).q_values)
 
 
-def test_the_goal_counts_from_where_it_is_kept():
-    from eval.bench.regret_report import Row, time_to_goal
-
-    def row(budget, percent):
-        of_instance = ([0], [percent], [percent], [True], [0.0], [False])
-        return Row("test", "find", 1, "best-first", budget, float(budget), *of_instance)
-
-    assert time_to_goal([row(1, 0.5), row(10, 3.0), row(100, 0.9), row(1000, 0.1)]) == 100.0
-    assert time_to_goal([row(1, 0.5), row(10, 3.0)]) == np.inf
-
-
 def test_every_instance_is_answered_by_its_own_row():
     """More instances than fit at once, and a last group that is not full."""
     from eval.bench import regret

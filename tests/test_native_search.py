@@ -48,7 +48,7 @@ def _assert_equal_trees(found: Tree, expected: Tree) -> None:
     available = np.isfinite(np.asarray(expected.q_values))
     for field in dataclasses.fields(Tree):
         name, arrays = field.name, [np.asarray(getattr(tree, field.name)) for tree in (found, expected)]
-        if name in ("chances", "success_costs", "dead_ends"):
+        if name in ("chances", "success_costs"):
             arrays = [np.where(available, array, 0) for array in arrays]
         if name == "children":
             arrays = [np.where(available[..., None], array, 0) for array in arrays]

@@ -235,14 +235,7 @@ def guesses_at_root(context, terms):
 
 @pytest.mark.parametrize("family", ["three-single", "firefighting", "shared-dear"])
 def test_guesses_are_the_cost_of_their_dead_ends_where_nothing_else_costs(family):
-    problem = family_problem(family, 3, "tuning", 2)
-    problem = dataclasses.replace(
-        problem,
-        travel=jnp.where(jnp.isinf(problem.travel), jnp.inf, 0.0),
-        finish=jnp.full_like(problem.finish, jnp.inf),
-        success_cost=jnp.full_like(problem.success_cost, 1e-6),
-        failure_cost=jnp.zeros_like(problem.failure_cost),
-    )
+    problem = nothing_costs_but_dead_ends(family_problem(family, 3, "tuning", 2))
     context = prepared(problem)
     terms = root_terms(context)
     available = np.asarray(terms.available & (context.rule.product_states >= 0))
@@ -250,6 +243,32 @@ def test_guesses_are_the_cost_of_their_dead_ends_where_nothing_else_costs(family
         dead_end, cost = np.asarray(guess.dead_end)[available], np.asarray(guess.cost)[available]
         assert np.any((dead_end > 0.01) & (dead_end < 0.99))
         np.testing.assert_allclose(cost, dead_end * float(problem.dead_end_cost), rtol=1e-3, atol=1e-3)
+
+
+def nothing_costs_but_dead_ends(problem):
+    return dataclasses.replace(
+        problem,
+        travel=jnp.where(jnp.isinf(problem.travel), jnp.inf, 0.0),
+        finish=jnp.full_like(problem.finish, jnp.inf),
+        success_cost=jnp.full_like(problem.success_cost, 1e-6),
+        failure_cost=jnp.zeros_like(problem.failure_cost),
+    )
+
+
+def test_what_dead_ends_cost_in_guesses_is_not_discounted():
+    problem = family_problem("three-single", 3, "tuning", 2)
+    config = BestFirstConfig(simulations=1, optimism=1.0)
+    gaps = plan_many([nothing_costs_but_dead_ends(problem), problem], keys(2), config).optimism_gap
+    assert 0 < gaps[0] < 0.02
+    assert gaps[1] > 0.1
+
+
+def test_a_guess_that_is_all_dead_end_leaves_a_gap():
+    """After the only attempt has failed nothing is left but the dead end; still it is a guess until it is examined."""
+    problem = nothing_costs_but_dead_ends(family_problem("find", 1, "tuning", 1))
+    tree = best_first.plant(prepared(problem), BestFirstConfig())
+    assert 0 < float(problem.success_probability[0, 0]) < 1
+    assert float(tree.q_values[0, 0, 0]) * 0.99 < float(tree.bounds[0, 0, 0]) < float(tree.q_values[0, 0, 0])
 
 
 def rest_of_chain(rule, chance, success_cost, at, pending_cost, remaining, nested, reached=1.0):

@@ -10,6 +10,9 @@ import numpy as np
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
+from potlp_jax.bench.problems import FAMILIES
+from potlp_jax.planning.search.config import BestFirstConfig
+
 GOAL_PERCENT = 1.0
 
 WRONG_PERCENT = 0.05
@@ -45,14 +48,19 @@ class Row:
     @property
     def mean_interval(self) -> tuple[float, float]:
         """Bootstrap interval of the mean regret, 95 %."""
-        chosen = np.random.default_rng(0).integers(0, len(self.percent), (RESAMPLES, len(self.percent)))
-        low, high = np.percentile(np.asarray(self.percent)[chosen].mean(axis=1), [2.5, 97.5])
-        return float(low), float(high)
+        return bootstrap_interval(self.percent)
 
     @property
     def ended_wrong(self) -> int:
         """Searches that ended by themselves at a wrong choice."""
         return sum(e and x and p > WRONG_PERCENT for e, x, p in zip(self.ended, self.exact, self.percent, strict=True))
+
+
+def bootstrap_interval(values: Sequence[float]) -> tuple[float, float]:
+    """Of the mean, 95 %, over the values."""
+    chosen = np.random.default_rng(0).integers(0, len(values), (RESAMPLES, len(values)))
+    low, high = np.percentile(np.asarray(values)[chosen].mean(axis=1), [2.5, 97.5])
+    return float(low), float(high)
 
 
 def time_to_goal(rows: Sequence[Row]) -> float:
@@ -65,8 +73,63 @@ def time_to_goal(rows: Sequence[Row]) -> float:
     return reached
 
 
-def table(rows: Sequence[Row]) -> str:
-    """Markdown: CPU time to the goal, then everything."""
+def tables(rows: Sequence[Row]) -> str:
+    """Markdown: for each planner its families by number of subgoals at the default budget, and over all by budget; then
+    CPU time to the goal, and everything."""
+    default = BestFirstConfig().simulations
+    parts = []
+    for planner in dict.fromkeys(row.planner for row in rows):
+        own = [row for row in rows if row.planner == planner]
+        parts += [f"{planner}, {default} simulations, mean (worst) regret in %:\n\n{by_subgoals(own, default)}"]
+        parts += [f"{planner}, over all S, mean (95 %) regret in % by simulations:\n\n{by_budget(own)}"]
+    return "\n".join([*parts, _every_row(rows)])
+
+
+def by_subgoals(rows: Sequence[Row], budget: int) -> str:
+    """Markdown of one planner: a line a family, a column a number of subgoals, at one budget."""
+    rows = [row for row in rows if row.budget == budget]
+    counts = sorted({row.subgoals for row in rows})
+    lines = [
+        "| family | " + "".join(f"S = {count} | " for count in counts) + "exact |",
+        "|---" * (len(counts) + 2) + "|",
+    ]
+    for family in dict.fromkeys(row.family for row in rows):
+        own = {row.subgoals: row for row in rows if row.family == family}
+        cells = [
+            f"{_short(own[count].mean_percent)} ({_short(max(own[count].percent))})" if count in own else "–"
+            for count in counts
+        ]
+        exact = [known for row in own.values() for known in row.exact]
+        lines.append(f"| {family} | {' | '.join(cells)} | {sum(exact)} of {len(exact)} |")
+    return "\n".join(lines) + "\n"
+
+
+def by_budget(rows: Sequence[Row]) -> str:
+    """Markdown of one planner: a line a family, over all numbers of subgoals, a column a budget."""
+    budgets = sorted({row.budget for row in rows})
+    lines = ["| family | " + "".join(f"{budget:,} | " for budget in budgets) + "ended at the last, wrong |"]
+    lines.append("|---" * (len(budgets) + 2) + "|")
+    for family in [*dict.fromkeys(row.family for row in rows), "all"]:
+        own = [row for row in rows if family in (row.family, "all")]
+        cells = [_mean_and_interval([row for row in own if row.budget == budget]) for budget in budgets]
+        last = [row for row in own if row.budget == budgets[-1]]
+        ended, wrong = sum(sum(row.ended) for row in last), sum(row.ended_wrong for row in last)
+        lines.append(f"| {family} | {' | '.join(cells)} | {ended} of {sum(len(row.ended) for row in last)}, {wrong} |")
+    return "\n".join(lines) + "\n"
+
+
+def _mean_and_interval(rows: Sequence[Row]) -> str:
+    percent = [regret for row in rows for regret in row.percent]
+    low, high = bootstrap_interval(percent)
+    return f"{_short(float(np.mean(percent)))} ({_short(low)} to {_short(high)})"
+
+
+def _short(percent: float) -> str:
+    # Less than this is rounding of 32 bits.
+    return "0" if percent < 1e-6 else f"{percent:.2g}"
+
+
+def _every_row(rows: Sequence[Row]) -> str:
     planners = list(dict.fromkeys(row.planner for row in rows))
     cases = list(dict.fromkeys((row.family, row.subgoals) for row in rows))
     lines = [f"CPU ms per decision to a mean regret of at most {GOAL_PERCENT:g} % (– where no budget gets there).", ""]
@@ -128,7 +191,8 @@ def plot(rows: Sequence[Row], subgoals: int, path: Path) -> None:
 
 
 def report(rows: Sequence[Row], out: Path) -> None:
-    """Table and plots."""
-    (out / "regret.md").write_text(table(rows))
+    """Tables and plots, in the order of ``FAMILIES``."""
+    rows = sorted(rows, key=lambda row: (list(FAMILIES).index(row.family), row.subgoals))
+    (out / "regret.md").write_text(tables(rows))
     for subgoals in sorted({row.subgoals for row in rows}):
         plot([row for row in rows if row.subgoals == subgoals], subgoals, out / f"regret-S{subgoals}.png")

@@ -3,7 +3,19 @@
 One module for each part of the core, in the order of the table.
 """
 
-from eval.mutants.core import distances, imagination, judges, learning, rollouts, search, status, tasks, trials, world
+from eval.mutants.core import (
+    distances,
+    imagination,
+    judges,
+    kernels,
+    learning,
+    rollouts,
+    search,
+    status,
+    tasks,
+    trials,
+    world,
+)
 from eval.mutants.mutant import Mutant
 
 MUTANTS: tuple[Mutant, ...] = (
@@ -17,4 +29,5 @@ MUTANTS: tuple[Mutant, ...] = (
     *trials.MUTANTS,
     *status.MUTANTS,
     *judges.MUTANTS,
+    *kernels.MUTANTS,
 )

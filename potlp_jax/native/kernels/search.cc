@@ -31,7 +31,7 @@ constexpr float kNegligible = 1e-3f;   // guess.NEGLIGIBLE
 constexpr int kPasses = 4;             // guess.PASSES
 constexpr int kNested = 2;             // guess.NESTED
 constexpr float kLeastGuess = 1e-4f;   // best_first.LEAST_GUESS
-constexpr float kMostDeadEnds = 1 - 0x1p-8f;  // best_first.MOST_DEAD_ENDS
+constexpr int32_t kShares = 2048;      // graph.SHARES
 constexpr int kProbes = 8;             // graph.PROBES
 constexpr int kNone = -1;              // NO_STATE, NO_SUBGOAL, NO_ACTION, NO_CLASS, NOWHERE, UNVISITED
 constexpr uint32_t kTreeOverflow = 2, kDepthOverflow = 4, kDeadEnd = 8, kAcceptingRoot = 16, kInvalid = 512;
@@ -66,7 +66,6 @@ struct Arrays {
 struct TreeArrays {
   float *q_values, *bounds, *floors, *chances, *success_costs;
   int32_t* children;
-  uint32_t* dead_ends;
   float* values;
   int32_t *location, *state;
   uint32_t *holds, *fails, *visited;
@@ -149,48 +148,31 @@ inline uint32_t mix(uint32_t bits) {
   return bits ^ (bits >> 16);
 }
 
-// graph.as_dead_ends and dead_ends_in.
-inline Marks as_dead_ends(const Lanes& failure, const Lanes& success) {
-  Marks high, low;
-  std::memcpy(&high, &failure, sizeof high);
-  std::memcpy(&low, &success, sizeof low);
-  return (high & int32_t(0xFFFF0000)) | (low >> 16);  // Not negative: no sign is drawn along.
+// graph.as_guess.
+inline Marks as_guesses(const Lanes& values, const Lanes& dead_ends) {
+  const Lanes share = dead_ends < values ? dead_ends / values * float{kShares} : all_lanes(float{kShares - 1});
+  Marks bits;
+  std::memcpy(&bits, &values, sizeof bits);
+  return (bits & -kShares) | INT32_MIN | __builtin_convertvector(share, Marks);
 }
 
-inline float float_of(uint32_t bits) {
-  float value;
+// graph.guess_in and dead_ends_in, and best_first._discounted; of one entry or of a vector of them.
+template <typename Value, typename Entry>
+inline Value guess_in(const Entry& child) {
+  const Entry bits = child & (INT32_MAX & -kShares);
+  Value value;
   std::memcpy(&value, &bits, sizeof value);
   return value;
 }
 
-inline float dead_end_in(uint32_t entry, bool success) {
-  return float_of(success ? entry << 16 : entry & 0xFFFF0000u);
-}
+inline float as_float(int32_t count) { return count; }
+inline Lanes as_float(const Marks& count) { return __builtin_convertvector(count, Lanes); }
 
-inline Lanes dead_ends_in(const Marks& entries, bool success) {
-  const Marks bits = success ? entries << 16 : entries & int32_t(0xFFFF0000);
-  Lanes values;
-  std::memcpy(&values, &bits, sizeof values);
-  return values;
-}
-
-// best_first._discounted, of one guess or of a vector of them.
-template <typename Value>
-inline Value discounted(const Value& guess, const Value& dead_end, float optimism) {
-  return lesser((1.0f - optimism) * guess + optimism * dead_end, guess);
-}
-
-// Costs that are not negative, as bits that are.
-inline Marks as_guesses(const Lanes& values) {
-  Marks bits;
-  std::memcpy(&bits, &values, sizeof bits);
-  return bits | INT32_MIN;
-}
-
-inline float guess_in(int32_t child) {
-  float value;
-  std::memcpy(&value, &child, sizeof value);
-  return std::fabs(value);
+template <typename Value, typename Entry>
+inline Value discounted(const Entry& child, float optimism) {
+  const Value guess = guess_in<Value>(child);
+  const Value dead_ends = guess * (as_float(child & (kShares - 1)) / float{kShares});
+  return lesser((1.0f - optimism) * guess + optimism * dead_ends, guess);
 }
 
 struct Costs {
@@ -926,7 +908,6 @@ class Search {
     if (size <= q_.size()) return;
     for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) values->resize(2 * size);
     for (auto& children : child_) children.resize(2 * size);
-    dead_ends_.resize(2 * size);
   }
 
   // Those of a subgoal and a state lie side by side.
@@ -961,24 +942,21 @@ class Search {
       const Lanes chance = load(list_.chance.data() + i), success_cost = load(list_.success_cost.data() + i);
       Lanes after_failure = load(without_.data() + i);
       after_failure = after_failure < least ? least : after_failure;
-      const Lanes after_success = load(own.after_success.data() + i);
+      const Marks failure = as_guesses(after_failure, load(dead_end_without_.data() + i) * dead_end_cost_);
+      const Marks success =
+          as_guesses(load(own.after_success.data() + i), load(own.dead_end.data() + i) * dead_end_cost_);
       Lanes known = load(path_.data() + i) + chance * success_cost;
       known += (one - chance) * load(own.failure_cost.data() + i);
-      const Lanes guessed = chance * after_success + (one - chance) * after_failure;
-      store(q_, at, known + guessed);
-      const Lanes failure_dead_end = load(dead_end_without_.data() + i) * dead_end_cost_;
-      const Lanes success_dead_end = load(own.dead_end.data() + i) * dead_end_cost_;
-      const Marks dead_ends = as_dead_ends(lesser(failure_dead_end, kMostDeadEnds * after_failure),
-                                           lesser(success_dead_end, kMostDeadEnds * after_success));
-      const Lanes doubted_failure = discounted(after_failure, dead_ends_in(dead_ends, false), optimism_);
-      const Lanes doubted_success = discounted(after_success, dead_ends_in(dead_ends, true), optimism_);
-      store(bound_, at, known + (chance * doubted_success + (one - chance) * doubted_failure));
+      const auto expected = [&](const Lanes& after_success, const Lanes& after_failure) {
+        return known + (chance * after_success + (one - chance) * after_failure);
+      };
+      store(q_, at, expected(guess_in<Lanes>(success), guess_in<Lanes>(failure)));
+      store(bound_, at, expected(discounted<Lanes>(success, optimism_), discounted<Lanes>(failure, optimism_)));
       store(floor_, at, known);
       store(chance_, at, chance);
       store(success_cost_, at, success_cost);
-      store(child_[0], at, as_guesses(after_failure));
-      store(child_[1], at, as_guesses(after_success));
-      store(dead_ends_, at, dead_ends);
+      store(child_[0], at, failure);
+      store(child_[1], at, success);
     }
   }
 
@@ -1185,8 +1163,8 @@ class Search {
     const float path_cost = path_costs(state_actions_[node.state], node.product_state)[entry];
     // Follow the outcome that contributes more to the gap.
     const float chance = chance_[at], success_cost = success_cost_[at], failure_cost = action.failure_cost;
-    const Costs after_success = outcome_costs(at, true, success_cost, is_last);
-    const Costs after_failure = outcome_costs(at, false, failure_cost, is_last);
+    const Costs after_success = outcome_costs(child_[1][at], success_cost, is_last);
+    const Costs after_failure = outcome_costs(child_[0][at], failure_cost, is_last);
     const float success_gap = chance * (after_success.value - after_success.low(certifies));
     const float failure_gap = (1.0f - chance) * (after_failure.value - after_failure.low(certifies));
     // Nothing is to be learnt from satisfying the task, and a certain success cannot fail.
@@ -1239,11 +1217,9 @@ class Search {
     return std::isinf(least) ? kNone : cost.place(least);
   }
 
-  Costs outcome_costs(int at, bool success, float pending_cost, bool is_last) const {
-    const int child = child_[success][at];
+  Costs outcome_costs(int child, float pending_cost, bool is_last) const {
     if (child < 0) {
-      const float guess = guess_in(child);
-      return {guess, discounted(guess, dead_end_in(dead_ends_[at], success), optimism_), 0.0f};
+      return {guess_in<float>(child), discounted<float>(child, optimism_), 0.0f};
     }
     return closed_where(is_last, nodes_[child].values.on_arrival(pending_cost, dead_end_cost_));
   }
@@ -1352,7 +1328,6 @@ class Search {
     for (float* costs : {tree.q_values, tree.bounds, tree.floors}) std::fill(costs, costs + rows * A, kInf);
     for (float* terms : {tree.chances, tree.success_costs}) std::fill(terms, terms + rows * A, 0.0f);
     std::fill(tree.children, tree.children + rows * A * 2, kNone);
-    std::fill(tree.dead_ends, tree.dead_ends + rows * A, 0);
     std::fill(tree.values + nodes * 7, tree.values + rows * 7, 0.0f);
     for (int32_t* place : {tree.location, tree.state}) std::fill(place + nodes, place + rows, 0);
     for (uint32_t* known : {tree.holds, tree.fails}) std::fill(known + nodes * S, known + rows * S, 0);
@@ -1372,7 +1347,6 @@ class Search {
         tree.chances[entry] = chance_[at];
         tree.success_costs[entry] = success_cost_[at];
         for (int success = 0; success < 2; ++success) tree.children[2 * entry + success] = child_[success][at];
-        tree.dead_ends[entry] = dead_ends_[at];
       }
       const NodeValues& own = node.values;
       const float values[7] = {own.leave.value, own.stay.value,  own.leave.bound, own.stay.bound,
@@ -1434,7 +1408,6 @@ class Search {
       chance_[at] = tree.chances[entry];
       success_cost_[at] = tree.success_costs[entry];
       for (int success = 0; success < 2; ++success) child_[success][at] = tree.children[2 * entry + success];
-      dead_ends_[at] = tree.dead_ends[entry];
     }
   }
 
@@ -1445,7 +1418,6 @@ class Search {
     if (large) {
       for (auto* values : {&q_, &bound_, &floor_, &chance_, &success_cost_}) empty(*values, large);
       for (auto& children : child_) empty(children, large);
-      empty(dead_ends_, large);
     }
     empty(nodes_, large);
     empty(table_, large);
@@ -1480,7 +1452,6 @@ class Search {
   std::vector<Set> holds_, fails_, visited_;
   std::vector<float> q_, bound_, floor_, chance_, success_cost_;
   std::vector<int32_t> child_[2];  // after a failure, after a success
-  std::vector<uint32_t> dead_ends_;
   int entries_ = 0;
   std::vector<int32_t> table_, root_visits_;
   int32_t simulations_, steps_;
@@ -1607,7 +1578,6 @@ struct PlanBatch {
 struct TreeBatch {
   Batched<float> q_values, bounds, floors, chances, success_costs;
   Batched<int32_t> children;
-  Batched<uint32_t> dead_ends;
   Batched<float> values;
   Batched<int32_t> location, state;
   Batched<uint32_t> holds, fails, visited;
@@ -1616,16 +1586,16 @@ struct TreeBatch {
 
   explicit TreeBatch(Writer& out)
       : q_values(out.next<float>()), bounds(out.next<float>()), floors(out.next<float>()), chances(out.next<float>()),
-        success_costs(out.next<float>()), children(out.next<int32_t>()), dead_ends(out.next<uint32_t>()),
+        success_costs(out.next<float>()), children(out.next<int32_t>()),
         values(out.next<float>()), location(out.next<int32_t>()), state(out.next<int32_t>()), holds(out.next<uint32_t>()),
         fails(out.next<uint32_t>()), visited(out.next<uint32_t>()), table(out.next<int32_t>()),
         root_visits(out.next<int32_t>()), size(out.next<int32_t>()), simulations(out.next<int32_t>()),
         steps(out.next<int32_t>()), status(out.next<uint32_t>()) {}
 
   TreeArrays row(int64_t i) const {
-    return {q_values.row(i), bounds.row(i), floors.row(i), chances.row(i),     success_costs.row(i), children.row(i),
-            dead_ends.row(i), values.row(i), location.row(i), state.row(i), holds.row(i),      fails.row(i),         visited.row(i),
-            table.row(i),    root_visits.row(i), size.row(i), simulations.row(i), steps.row(i),      status.row(i)};
+    return {q_values.row(i), bounds.row(i),      floors.row(i), chances.row(i),     success_costs.row(i), children.row(i),
+            values.row(i),   location.row(i),    state.row(i),  holds.row(i),       fails.row(i),         visited.row(i),
+            table.row(i),    root_visits.row(i), size.row(i),   simulations.row(i), steps.row(i),         status.row(i)};
   }
 };
 

@@ -67,14 +67,13 @@ from potlp_jax.planning.search.graph import (
     NodeValues,
     Tree,
     add_node,
-    as_dead_ends,
     as_guess,
     dead_ends_in,
     find,
     guess_in,
     plant_tree,
 )
-from potlp_jax.planning.search.guess import Guess, Rule, guess_outcomes, make_rule, value_successes_anew
+from potlp_jax.planning.search.guess import Rule, guess_outcomes, make_rule, value_successes_anew
 from potlp_jax.planning.search.lockstep import SearchKernel, SearchMethod
 from potlp_jax.planning.search.model import FAILURE, SUCCESS, Model, make_model
 from potlp_jax.planning.search.native import LIBRARY, fits_kernel, search_natively
@@ -86,10 +85,6 @@ from potlp_jax.types import Status
 LEAST_GUESS: float = 1e-4
 """Guesses at outcomes that do not satisfy the task are at least this share of the dead-end cost, so that an outcome
 without a node leaves a gap that 24 bits can hold: one that rounding hides changes the value by less than 0.06 %."""
-
-MOST_DEAD_ENDS: float = 1.0 - 2.0**-8
-"""Largest share of a guess that dead ends count for, so that every guess is discounted and leaves a gap; the nearest to
-1 that ``Tree.dead_ends`` can hold."""
 
 ALL_CONDITIONS = 0xFFFFFFFF
 """A word of a mask over conditions in which every bit is set."""
@@ -433,7 +428,6 @@ class _Attempt:
       success_cost: R_S.
       failure_cost: R_F.
       children: of its outcomes, as in ``Tree``.
-      dead_ends: of its outcomes, as in ``Tree``.
     """
 
     path_cost: Float32[Array, "B"]
@@ -441,7 +435,6 @@ class _Attempt:
     success_cost: Float32[Array, "B"]
     failure_cost: Float32[Array, "B"]
     children: Int32[Array, "B 2"]
-    dead_ends: UInt32[Array, "B"]
 
 
 def _attempt_at(model: Model, tree: Tree, descent: Descent, selection: _Selection) -> _Attempt:
@@ -455,7 +448,6 @@ def _attempt_at(model: Model, tree: Tree, descent: Descent, selection: _Selectio
         success_cost=tree.success_costs[rows, node, action],
         failure_cost=model.tables.actions.failure_cost[rows, action],
         children=tree.children[rows, node, action],
-        dead_ends=tree.dead_ends[rows, node, action],
     )
 
 
@@ -500,9 +492,8 @@ def _follow_gap(
       The outcome that is followed.
     """
     chance, failure_child, success_child = attempt.chance, attempt.children[:, FAILURE], attempt.children[:, SUCCESS]
-    failure_dead_end, success_dead_end = dead_ends_in(attempt.dead_ends)
-    after_success = _outcome_costs(context, tree, success_child, attempt.success_cost, success_dead_end, is_last)
-    after_failure = _outcome_costs(context, tree, failure_child, attempt.failure_cost, failure_dead_end, is_last)
+    after_success = _outcome_costs(context, tree, success_child, attempt.success_cost, is_last)
+    after_failure = _outcome_costs(context, tree, failure_child, attempt.failure_cost, is_last)
     success_gap = after_success.value - after_success.low(certifies)
     failure_gap = after_failure.value - after_failure.low(certifies)
     success = chance * success_gap >= (1.0 - chance) * failure_gap
@@ -530,7 +521,6 @@ def _outcome_costs(
     tree: Tree,
     child: Int32[Array, "B"],
     pending_cost: Float32[Array, "B"],
-    dead_end: Float32[Array, "B"],
     is_last: Bool[Array, ""],
 ) -> Costs:
     """Costs after an outcome: those of its node, or by the guess where there is none."""
@@ -539,14 +529,14 @@ def _outcome_costs(
     visited = node.on_arrival(pending_cost, context.model.dead_end_cost)
     visited = _closed_where(is_last, visited)
     guess = guess_in(child)
-    optimistic = _discounted(guess, dead_end, context.optimism)
-    unvisited = Costs(value=guess, bound=optimistic, floor=jnp.zeros_like(guess))
+    unvisited = Costs(value=guess, bound=_discounted(child, context.optimism), floor=jnp.zeros_like(guess))
     return jax.tree.map(lambda new, old: jnp.where(child < 0, new, old), unvisited, visited)
 
 
-def _discounted(guess: Float32[Array, "*B"], dead_end: Float32[Array, "*B"], optimism: Array) -> Float32[Array, "*B"]:
+def _discounted(child: Int32[Array, "*B"], optimism: Array) -> Float32[Array, "*B"]:
     """Guesses of which all but what dead ends cost in them is reduced by the optimism; never above the guesses."""
-    return jnp.minimum(rounded_product(1.0 - optimism, guess) + rounded_product(optimism, dead_end), guess)
+    guess = guess_in(child)
+    return jnp.minimum(rounded_product(1.0 - optimism, guess) + rounded_product(optimism, dead_ends_in(child)), guess)
 
 
 def _closed_where(cut: Bool[Array, "*B"], costs: Costs) -> Costs:
@@ -596,35 +586,26 @@ def _new_node(context: Context, history: History, config: BestFirstConfig) -> Ne
         config.guess_failures,
     )
     least = LEAST_GUESS * context.model.dead_end_cost[:, None]
-    failure_values = jnp.maximum(failure.cost, least)
-    success_values = jnp.where(context.model.accepts, 0.0, jnp.maximum(success.cost, least))
-    dead_ends = as_dead_ends(
-        _cost_of_dead_ends(context.model, failure, failure_values),
-        _cost_of_dead_ends(context.model, success, success_values),
-    )
+    after_failure = jnp.maximum(failure.cost, least)
+    after_success = jnp.where(context.model.accepts, 0.0, jnp.maximum(success.cost, least))
+    dead_ends = jnp.stack([failure.dead_end, success.dead_end], axis=-1) * context.model.dead_end_cost[:, None, None]
+    children = as_guess(jnp.stack([after_failure, after_success], axis=-1), dead_ends)
     # Eq. 3 with guessed values, the same with the guesses reduced by the optimism, and without them.
     known = terms.distance + rounded_product(chance, terms.success_cost)
     known += rounded_product(1.0 - chance, terms.failure_cost)
-    guessed = rounded_product(chance, success_values) + rounded_product(1.0 - chance, failure_values)
-    doubted = [
-        _discounted(values, dead_end, context.optimism[:, None])
-        for values, dead_end in zip((failure_values, success_values), dead_ends_in(dead_ends), strict=True)
-    ]
-    optimistic = rounded_product(chance, doubted[SUCCESS]) + rounded_product(1.0 - chance, doubted[FAILURE])
+
+    def expected(after: Float32[Array, "B A 2"]) -> Float32[Array, "B A"]:
+        guessed = rounded_product(chance, after[..., SUCCESS]) + rounded_product(1.0 - chance, after[..., FAILURE])
+        return jnp.where(available, known + guessed, jnp.inf)
+
     return NewNode(
-        q_values=jnp.where(available, known + guessed, jnp.inf),
-        bounds=jnp.where(available, known + optimistic, jnp.inf),
+        q_values=expected(guess_in(children)),
+        bounds=expected(_discounted(children, context.optimism[:, None, None])),
         floors=jnp.where(available, known, jnp.inf),
         chances=chance,
         success_costs=terms.success_cost,
-        children=as_guess(jnp.stack([failure_values, success_values], axis=-1)),
-        dead_ends=dead_ends,
+        children=children,
     )
-
-
-def _cost_of_dead_ends(model: Model, guess: Guess, values: Float32[Array, "B A"]) -> Float32[Array, "B A"]:
-    """What dead ends cost in guesses, of which they are a part."""
-    return jnp.minimum(guess.dead_end * model.dead_end_cost[:, None], MOST_DEAD_ENDS * values)
 
 
 def _back_up(tree: Tree, descent: Descent, leaf: Leaf) -> Tree:

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float32, Int32, UInt32
 from potlp_jax.planning.history import History
 from potlp_jax.planning.search.arrays import least_of_each, mix
 from potlp_jax.planning.search.config import BestFirstConfig
-from potlp_jax.planning.search.model import FAILURE, SUCCESS, Model
+from potlp_jax.planning.search.model import Model
 
 PROBES: int = 8
 """Consecutive slots of the hash table in which a history may be found. Where all are taken the node is not entered: it
@@ -32,6 +32,9 @@ VALUE_COLUMNS: int = 7
 KEY_WORDS: int = 2
 """Words of a history's key in the hash table; the node's index follows them. Two of ten thousand histories of one tree
 share all 64 bits with a probability below 3e-12."""
+
+SHARES: int = 2048
+"""A guess keeps the share of dead ends in it as a multiple of one in so many: a power of 2, less than 1."""
 
 
 @struct.dataclass(kw_only=True)
@@ -112,9 +115,8 @@ class Tree:
       chances: P_S of each action, given what is known at the node.
       success_costs: R_S of each action, given what is known at the node.
       children: each action's outcomes, ``FAILURE`` and ``SUCCESS`` (``search.model``): the index of the outcome's node;
-        where it has none, a negative number that holds its guessed value (``as_guess``). Outcomes that satisfy the task
-        never have a node: their value is 0.
-      dead_ends: what dead ends cost in the guesses of each action's two outcomes (``as_dead_ends``).
+        where it has none, a negative number that holds what is guessed of it (``as_guess``). Outcomes that satisfy the
+        task never have a node: their value is 0.
       values: packed ``NodeValues`` of each node.
       location: of the node's history, as in ``history.History``.
       state: of the node's history.
@@ -135,7 +137,6 @@ class Tree:
     chances: Float32[Array, "*B N A"]
     success_costs: Float32[Array, "*B N A"]
     children: Int32[Array, "*B N A 2"]
-    dead_ends: UInt32[Array, "*B N A"]
     values: Float32[Array, "*B N 7"]
     location: Int32[Array, "*B N"]
     state: Int32[Array, "*B N"]
@@ -189,35 +190,35 @@ class NewNode:
     chances: Float32[Array, "*B A"]
     success_costs: Float32[Array, "*B A"]
     children: Int32[Array, "*B A 2"]
-    dead_ends: UInt32[Array, "*B A"]
 
 
-def as_guess(value: Float32[Array, "*N"]) -> Int32[Array, "*N"]:
-    """A guessed value as an entry of ``Tree.children``: its bits with the sign set, so that it is no node's index.
+def as_guess(value: Float32[Array, "*N"], dead_ends: Float32[Array, "*N"]) -> Int32[Array, "*N"]:
+    """A guess as an entry of ``Tree.children``: negative, so that it is no node's index.
 
-    An outcome has a node or a guess, never both, so that one word holds either.
+    An outcome has a node or a guess, never both, so that one word holds either: the bits of the value, but the last of
+    its mantissa make room for the share of dead ends in it. So the value is up to 0.02 % too low and the share up to
+    0.05 %; and as the share stays below 1, every guess leaves a gap when it is discounted.
+
+    Args:
+      value: the guessed cost, not negative.
+      dead_ends: what dead ends cost in it.
+
+    Returns:
+      What ``guess_in`` and ``dead_ends_in`` read.
     """
-    return jax.lax.bitcast_convert_type(-jnp.abs(value), jnp.int32)
+    share = jnp.where(dead_ends < value, jnp.floor(dead_ends / value * SHARES), SHARES - 1)
+    bits = jax.lax.bitcast_convert_type(-jnp.abs(value), jnp.int32)
+    return (bits & ~(SHARES - 1)) | share.astype(jnp.int32)
 
 
 def guess_in(child: Int32[Array, "*N"]) -> Float32[Array, "*N"]:
     """The guessed value in an entry of ``Tree.children``; it means something only where the entry is negative."""
-    return jnp.abs(jax.lax.bitcast_convert_type(child, jnp.float32))
+    return jnp.abs(jax.lax.bitcast_convert_type(child & ~(SHARES - 1), jnp.float32))
 
 
-def as_dead_ends(failure: Float32[Array, "*N"], success: Float32[Array, "*N"]) -> UInt32[Array, "*N"]:
-    """What dead ends cost in the guesses of an action's outcomes, as an entry of ``Tree.dead_ends``.
-
-    Each as the 16 higher bits of its number, so that one word holds both: up to 0.8 % too low.
-    """
-    bits = [jax.lax.bitcast_convert_type(cost, jnp.uint32) for cost in (failure, success)]
-    return (bits[FAILURE] & jnp.uint32(0xFFFF0000)) | (bits[SUCCESS] >> 16)
-
-
-def dead_ends_in(entry: UInt32[Array, "*N"]) -> tuple[Float32[Array, "*N"], Float32[Array, "*N"]]:
-    """What ``as_dead_ends`` has kept, after failure and after success."""
-    failure, success = entry & jnp.uint32(0xFFFF0000), entry << 16
-    return jax.lax.bitcast_convert_type(failure, jnp.float32), jax.lax.bitcast_convert_type(success, jnp.float32)
+def dead_ends_in(child: Int32[Array, "*N"]) -> Float32[Array, "*N"]:
+    """What dead ends cost in that value; likewise."""
+    return guess_in(child) * ((child & (SHARES - 1)).astype(jnp.float32) / SHARES)
 
 
 def plant_tree(model: Model, root: NewNode, config: BestFirstConfig) -> Tree:
@@ -246,7 +247,6 @@ def plant_tree(model: Model, root: NewNode, config: BestFirstConfig) -> Tree:
         chances=first(root.chances),
         success_costs=first(root.success_costs),
         children=first(root.children, Tree.UNVISITED),
-        dead_ends=first(root.dead_ends),
         values=first(values.pack()),
         location=first(model.root.location),
         state=first(model.root.state),
@@ -392,7 +392,6 @@ def add_node(
         chances=write(tree.chances, node.chances),
         success_costs=write(tree.success_costs, node.success_costs),
         children=write(tree.children, node.children),
-        dead_ends=write(tree.dead_ends, node.dead_ends),
         location=write(tree.location, history.location),
         state=write(tree.state, history.state),
         holds=write(tree.holds, history.holds),

@@ -139,7 +139,6 @@ def _tree_shapes(problems: PlanningProblem, config: BestFirstConfig) -> list[jax
         "chances": costs,
         "success_costs": costs,
         "children": of(jnp.int32, nodes, actions, 2),
-        "dead_ends": of(jnp.uint32, nodes, actions),
         "values": of(jnp.float32, nodes, VALUE_COLUMNS),
         "location": of(jnp.int32, nodes),
         "state": of(jnp.int32, nodes),
