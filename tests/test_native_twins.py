@@ -102,6 +102,20 @@ def test_tables_equal_those_of_portals_and_sweeps(seed, labelled):
     _same(distance_table, transitions, free, task.accepting, cells, states, targets, jnp.float32(0.3))
 
 
+def test_the_only_way_leads_through_a_letter():
+    """A hallway one cell wide: beyond the letter no state is as it was before."""
+    _needs("distances")
+    task = Task.from_formula("F a & F b", propositions=("a", "b")).padded(SIZES)
+    letters = jnp.zeros((3, 9), jnp.int32).at[1, 4].set(1)
+    free = jnp.zeros((3, 9), bool).at[1].set(True)
+    transitions = jnp.where(task.accepting, NO_STATE, product_transitions(task, letters, free))
+    ends = jnp.asarray([[1, 0], [1, 8]], jnp.int32)
+    states = jnp.full(2, int(task.initial), jnp.int32)
+    travel, _ = _same(distance_table, transitions, free, task.accepting, ends, states, ends, jnp.float32(1))
+    np.testing.assert_array_equal(travel[0, 1, int(task.initial)], np.inf)
+    assert np.any(np.asarray(travel[0, 1]) == 8)
+
+
 def test_where_nothing_is_free_or_nothing_is_asked():
     _needs("distances")
     free = jnp.zeros((4, 5), bool)

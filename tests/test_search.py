@@ -245,6 +245,15 @@ def test_guesses_are_the_cost_of_their_dead_ends_where_nothing_else_costs(family
         np.testing.assert_allclose(cost, dead_end * float(problem.dead_end_cost), rtol=1e-3, atol=1e-3)
 
 
+def test_after_a_failure_the_dead_end_is_that_all_others_fail():
+    problem = family_problem("find", 3, "tuning", 3)
+    context = prepared(problem)
+    after_failure, _ = guesses_at_root(context, root_terms(context))
+    fails = 1 - np.asarray(problem.success_probability[:, 0], np.float64)
+    expected = [np.prod(np.delete(fails, subgoal)) for subgoal in range(3)]
+    np.testing.assert_allclose(after_failure.dead_end[0, :3], expected, rtol=1e-5)
+
+
 def nothing_costs_but_dead_ends(problem):
     return dataclasses.replace(
         problem,

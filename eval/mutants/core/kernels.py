@@ -70,7 +70,7 @@ MUTANTS = (
         "paths between portals cross cells of letters",
         "if ((kind & kNeutral) && reached < cost_[there]) {",
         "if (reached < cost_[there]) {",
-        "tables",
+        "tables or only_way",
     ),
     _of(
         "grid_search.h",

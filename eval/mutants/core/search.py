@@ -62,7 +62,7 @@ MUTANTS = (
         "jnp.where(tables.actions.accepts, jnp.float32(0.0), jnp.float32(1.0))",
         "jnp.ones(tables.actions.accepts.shape, jnp.float32)",
         _CONVERGED,
-        "converges or wrong_guess or regret",
+        "all_others_fail",
     ),
     Mutant(
         PART,
