@@ -32,7 +32,7 @@ N                              nodes of a search graph, or any number of things 
 NZ                             nodes times states
 B                              rows of a batch
 D                              depth: actions of one simulation
-R, L1                          rows of a table of guesses; lengths of a chain of failures, 0 among them
+R                              rows of a batch of problems whose guesses are computed together
 V                              words of a bit set over product states; in learning, panoramas in memory
 n                              flags, or words of a packed row
 slots                          entries of a hash table

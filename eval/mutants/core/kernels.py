@@ -4,7 +4,8 @@ from eval.mutants.mutant import Mutant
 
 PART = "native kernels"
 
-_SEARCH = "potlp_jax/native/kernels/search.cc"
+_KERNELS = "potlp_jax/native/kernels"
+_SEARCH = f"{_KERNELS}/search.cc"
 _SEARCH_TESTS = ("tests/test_native_search.py",)
 _TWINS = ("tests/test_native_twins.py",)
 
@@ -14,7 +15,7 @@ def _of_search(says: str, old: str, new: str) -> Mutant:
 
 
 def _of(name: str, says: str, old: str, new: str, only: str) -> Mutant:
-    return Mutant(PART, says, f"potlp_jax/native/kernels/{name}", old, new, _TWINS, only)
+    return Mutant(PART, says, f"{_KERNELS}/{name}", old, new, _TWINS, only)
 
 
 MUTANTS = (
