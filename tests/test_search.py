@@ -352,6 +352,30 @@ def test_pessimistic_guess_is_revisited():
     np.testing.assert_allclose(plan.value, exact.value, rtol=1e-4)
 
 
+def test_every_action_of_the_root_is_tried():
+    """A guess may be too high by more than the discount: no descent would ever begin with that action."""
+    problem = family_problem("three-single", 4, "tuning", 0)
+
+    def searched(simulations):
+        config = BestFirstConfig(simulations=simulations, tree_capacity=257)
+        plan, tree = tree_jit(problem, jax.random.key(0), config=config)
+        bounds = np.asarray(tree.bounds[0])
+        return np.asarray(plan.visits), np.where(np.asarray(plan.visits) == 0, bounds, np.inf)
+
+    visits, bounds = searched(1)
+    first = best_first.SIMULATIONS_BEFORE_TRIES * (np.isfinite(bounds).sum() + visits.sum())
+    visits, bounds = searched(int(first))
+    untried = np.isfinite(bounds).sum()
+    assert untried > 5
+    # The next one in every four is of least bound, and left alone thereafter unless it is the best.
+    for tries in range(1, untried + 1):
+        best = int(np.argmin(bounds))
+        visits, bounds = searched(int(first) + best_first.TRY_EVERY * tries)
+        assert visits[best] >= 1
+        assert np.isfinite(bounds).sum() == untried - tries
+    assert np.all(np.isinf(bounds))
+
+
 def test_keys_change_nothing():
     problem = shared_shape("F((a | b) & X(b | c))", 0, unreachable=0.0)
     assert_same_plans(*(tree_jit(problem, jax.random.key(seed), config=QUICK) for seed in (1, 2)))

@@ -25,6 +25,16 @@ MUTANTS = (
         "lesser((1.0f - optimism) * guess, guess)",
     ),
     _of_search(
+        "the search tries actions from the first simulation on",
+        "return simulations_ >= kSimulationsBeforeTries * available ? least : kNone;",
+        "return least;",
+    ),
+    _of_search(
+        "the search tries the action of largest bound",
+        "(least == kNone || bound[i] < bound[least])) least = i;",
+        "(least == kNone || bound[i] > bound[least])) least = i;",
+    ),
+    _of_search(
         "the search finds no history again",
         "== key[0] && static_cast<uint32_t>(entry[1]) == key[1]",
         "== key[0] && static_cast<uint32_t>(entry[1]) == key[0]",

@@ -12,6 +12,23 @@ _CONVERGED = ("tests/test_search.py",)
 MUTANTS = (
     Mutant(
         PART,
+        "no action of the root is tried for its own sake",
+        _BEST_FIRST,
+        "return tries[:, None] & (visits > 0)",
+        "return (tries & False)[:, None] & (visits > 0)",
+        _CONVERGED,
+        "tried",
+    ),
+    Mutant(
+        PART,
+        "searches that certify try actions, too",
+        _BEST_FIRST,
+        "tries = is_due & is_late & ~certifies & jnp.any",
+        "tries = is_due & is_late & jnp.any",
+        ("tests/test_native_search.py",),
+    ),
+    Mutant(
+        PART,
         "the backup passes values up as bounds",
         _BEST_FIRST,
         "bounds=write(tree.bounds, action.bound, step.actions)",

@@ -31,6 +31,7 @@ constexpr float kNegligible = 1e-3f;   // guess.NEGLIGIBLE
 constexpr int kPasses = 4;             // guess.PASSES
 constexpr int kNested = 2;             // guess.NESTED
 constexpr float kLeastGuess = 1e-4f;   // best_first.LEAST_GUESS
+constexpr int kSimulationsBeforeTries = 4, kTryEvery = 4;  // best_first
 constexpr int32_t kShares = 2048;      // graph.SHARES
 constexpr int kProbes = 8;             // graph.PROBES
 constexpr int kNone = -1;              // NO_STATE, NO_SUBGOAL, NO_ACTION, NO_CLASS, NOWHERE, UNVISITED
@@ -1061,6 +1062,7 @@ class Search {
     table_.assign((settings_.slots + kProbes) * 3, kNone);
     root_visits_.assign(actions_.size(), 0);
     simulations_ = steps_ = 0;
+    all_tried_ = false;
     status_ = 0;
     keep(new_node(kNone));
   }
@@ -1125,7 +1127,8 @@ class Search {
     Descent descent;
     levels_.clear();
     for (int64_t level = 0; descent.active && level < settings_.max_depth; ++level) {
-      descend_once(descent, certifies, level + 1 >= settings_.max_depth);
+      const int tried = level == 0 && !certifies ? next_try() : kNone;
+      descend_once(descent, certifies, tried, level + 1 >= settings_.max_depth);
     }
     int child = kNone;
     const Costs leaf = expand(descent, child);
@@ -1143,9 +1146,26 @@ class Search {
 
   int action_of(const Node& node, int entry) const { return state_actions_[node.state].action[entry]; }
 
-  void descend_once(Descent& descent, bool certifies, bool is_last) {
+  // The entry that the next descent begins with because none has (best_first._passed_over), or kNone.
+  int next_try() {
+    if (all_tried_ || simulations_ % kTryEvery != kTryEvery - 1) return kNone;
+    const Node& root = nodes_[0];
+    const float* bound = bound_.data() + root.first;
+    int64_t available = 0;
+    int least = kNone;
+    for (int i = 0; i < entry_count(root); ++i) {
+      if (std::isinf(bound[i])) continue;
+      available += 1;
+      if (root_visits_[action_of(root, i)] == 0 && (least == kNone || bound[i] < bound[least])) least = i;
+    }
+    all_tried_ = least == kNone;
+    return simulations_ >= kSimulationsBeforeTries * available ? least : kNone;
+  }
+
+  // One action further; by `tried` if it is an entry.
+  void descend_once(Descent& descent, bool certifies, int tried, bool is_last) {
     Node& node = nodes_[descent.node];
-    const int entry = select_again(node, certifies, descent.pending_cost);
+    const int entry = tried != kNone ? tried : select_again(node, certifies, descent.pending_cost);
     if (entry == kNone) {
       // A dead end.
       descent.active = false;
@@ -1389,6 +1409,7 @@ class Search {
     simulations_ = *tree.simulations;
     steps_ = *tree.steps;
     status_ = *tree.status;
+    all_tried_ = false;
   }
 
   void read_entries(const TreeArrays& tree, int64_t row, Node& node) {
@@ -1456,6 +1477,7 @@ class Search {
   std::vector<int32_t> table_, root_visits_;
   int32_t simulations_, steps_;
   uint32_t status_;
+  bool all_tried_;  // found when a try is due
 
   // Used anew by every simulation.
   History history_;

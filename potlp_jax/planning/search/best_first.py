@@ -14,13 +14,18 @@ have a guessed value (``search.guess``). Beside its value every node has a **bou
 from what dead ends cost in it, were too high by the fraction ``optimism``, and a **floor**, its value if every guess
 were 0. One simulation of all rows of a batch is
 
-1. **descend**: from the root, take the action of least bound, and of its two outcomes the one that contributes more to
-   the gap between value and bound, until an outcome without a node is reached. Where no gap between value and bound is
-   left at the root, the descent does the same with floors in place of bounds: it **certifies**. Only reads.
+1. **descend**: from the root, take the action of least bound (at the root itself not always: see "Tries"), and of its
+   two outcomes the one that contributes more to the gap between value and bound, until an outcome without a node is
+   reached. Where no gap between value and bound is left at the root, the descent does the same with floors in place of
+   bounds: it **certifies**. Only reads.
 2. **expand**: give that outcome a node, or find the one that another order of the same events led to.
 3. **back up** values, bounds and floors along the descent. Only writes.
 
 Once value and floor of the root are equal the search ends.
+
+**Tries.** An action of the root whose guess is more than the discount too high is never descended into, however good it
+is. So once a search has run ``SIMULATIONS_BEFORE_TRIES`` simulations for every action of the root, one simulation in
+``TRY_EVERY`` begins with the action of least bound among those that no simulation has begun with, until there are none.
 
 **A search that has ended is exact**, up to rounding, unless its status has an overflow. (1) Costs are not negative, so
 that 0 is no more than what follows any outcome; Eq. 3 is monotone in these; so no floor exceeds the true cost, also a
@@ -33,7 +38,8 @@ on no guess, and no less than the optimum. By (1) it is no more.
 
 **Every search ends**, given simulations and memory. While value and floor (or bound) of the root differ, the action of
 least floor has a gap, hence one of its outcomes, and so on: the descent meets an outcome without a node and links it to
-one, or it meets stored numbers that are older than their children's and renews them. There are finitely many histories.
+one, or it meets stored numbers that are older than their children's and renews them. There are finitely many histories,
+and fewer tries than actions.
 
 All reads of a simulation come before its writes, so that XLA updates the arrays in place and the cost of a simulation
 does not depend on their size.
@@ -85,6 +91,12 @@ from potlp_jax.types import Status
 LEAST_GUESS: float = 1e-4
 """Guesses at outcomes that do not satisfy the task are at least this share of the dead-end cost, so that an outcome
 without a node leaves a gap that 24 bits can hold: one that rounding hides changes the value by less than 0.06 %."""
+
+SIMULATIONS_BEFORE_TRIES: int = 4
+"""Simulations for every action of the root before the search tries those that it has not chosen by itself."""
+
+TRY_EVERY: int = 4
+"""One simulation in this many is a try, while there are untried actions (docs/results/planner.md, "Tries")."""
 
 ALL_CONDITIONS = 0xFFFFFFFF
 """A word of a mask over conditions in which every bit is set."""
@@ -296,6 +308,7 @@ def _descend(context: Context, tree: Tree, active: Bool[Array, "B"], config: Bes
     root = _root_costs(context, tree)
     # No gap is left between value and bound: what remains is to prove it, or to find that a guess was too high.
     certifies = root.value <= root.bound
+    passed_over = _passed_over(tree, certifies)
     nowhere = jnp.zeros((batch,), jnp.bool_)
     start = Descent(
         level=jnp.int32(0),
@@ -315,13 +328,28 @@ def _descend(context: Context, tree: Tree, active: Bool[Array, "B"], config: Bes
 
     def take_action(descent: Descent) -> Descent:
         is_last = descent.level + 1 >= config.max_depth
-        return _descend_once(context, tree, descent, certifies, is_last)
+        return _descend_once(context, tree, descent, certifies, passed_over & (descent.level == 0), is_last)
 
     return jax.lax.while_loop(goes_on, take_action, vary_alike(start))
 
 
+def _passed_over(tree: Tree, certifies: Bool[Array, "B"]) -> Bool[Array, "B A"]:
+    """The actions that the next descent does not begin with: none, or in rows that try, all that were tried before."""
+    visits = tree.root_visits
+    available = ~jnp.isinf(tree.bounds[:, Tree.ROOT])
+    is_due = tree.simulations % TRY_EVERY == TRY_EVERY - 1
+    is_late = tree.simulations >= SIMULATIONS_BEFORE_TRIES * jnp.sum(available, axis=1)
+    tries = is_due & is_late & ~certifies & jnp.any(available & (visits == 0), axis=1)
+    return tries[:, None] & (visits > 0)
+
+
 def _descend_once(
-    context: Context, tree: Tree, descent: Descent, certifies: Bool[Array, "B"], is_last: Bool[Array, ""]
+    context: Context,
+    tree: Tree,
+    descent: Descent,
+    certifies: Bool[Array, "B"],
+    passed_over: Bool[Array, "B A"],
+    is_last: Bool[Array, ""],
 ) -> Descent:
     """Take one action in every row that is still descending.
 
@@ -330,6 +358,7 @@ def _descend_once(
       tree: the graphs.
       descent: so far.
       certifies: True in rows that minimise floors instead of bounds.
+      passed_over: True at actions that are not taken.
       is_last: True at the last level that ``max_depth`` allows.
 
     Returns:
@@ -337,7 +366,7 @@ def _descend_once(
     """
     model, node = context.model, descent.node
     rows = model.rows
-    selection = _select_action(model, tree, descent, certifies)
+    selection = _select_action(model, tree, descent, certifies, passed_over)
     action, moves = selection.action, selection.moves
     accepts = model.accepts[rows, action]
     step = _follow_gap(context, tree, _attempt_at(model, tree, descent, selection), accepts, certifies, is_last)
@@ -391,8 +420,11 @@ class _Selection:
     rival: Costs
 
 
-def _select_action(model: Model, tree: Tree, descent: Descent, certifies: Bool[Array, "B"]) -> _Selection:
-    """The action of least bound at every row's node, or of least floor where the row certifies."""
+def _select_action(
+    model: Model, tree: Tree, descent: Descent, certifies: Bool[Array, "B"], passed_over: Bool[Array, "B A"]
+) -> _Selection:
+    """The action of least bound at every row's node, or of least floor where the row certifies; of those not passed
+    over."""
     rows, node = model.rows, descent.node
     # Without the barrier XLA would look every entry up again for each of the minima below.
     q_values, bounds, floors, values = jax.lax.optimization_barrier(
@@ -402,7 +434,7 @@ def _select_action(model: Model, tree: Tree, descent: Descent, certifies: Bool[A
     inside = model.stays_inside(tree.location[rows, node], tree.state[rows, node])
     # Only actions that leave the unknown region pay the pending cost.
     score = costs.low(certifies[:, None]) + jnp.where(inside, 0.0, descent.pending_cost[:, None])
-    action, least = first_of_least(score)
+    action, least = first_of_least(jnp.where(passed_over, jnp.inf, score))
     goes_inside = inside[rows, action]
     chosen = jnp.arange(score.shape[1], dtype=jnp.int32)[None, :] == action[:, None]
     # The backup changes the chosen action's Q. With the least of the others of its kind, the new minimum is known
