@@ -1293,9 +1293,9 @@ class Search {
                         action(level->base.floor, after.floor)};
       Node& node = nodes_[level->node];
       NodeValues values = level->before;
-      (level->inside ? values.stay : values.leave) = {lesser(level->rival.value, costs.value),
-                                                      lesser(level->rival.bound, costs.bound),
-                                                      lesser(level->rival.floor, costs.floor)};
+      (level->inside ? values.stay : values.leave) =
+          Costs{lesser(level->rival.value, costs.value), lesser(level->rival.bound, costs.bound),
+                lesser(level->rival.floor, costs.floor)};
       values.visits += 1;
       const float pending = level->pending_cost;
       after = {lesser(pending + values.leave.value, values.stay.value),
