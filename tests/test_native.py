@@ -4,6 +4,7 @@ import itertools
 import os
 import subprocess
 import sys
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -121,13 +122,17 @@ def test_processes_that_race_all_get_a_whole_library(kernels, compiler):
 def test_without_a_compiler_the_twin_runs_and_the_status_says_why(kernels, monkeypatch):
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CXX", raising=False)
-    np.testing.assert_array_equal(_scale(jnp.ones(2, jnp.float32)), [3, 3])
+    # No warning: nothing here needs a compiler.
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        np.testing.assert_array_equal(_scale(jnp.ones(2, jnp.float32)), [3, 3])
     assert "no C++ compiler" in libraries._loaded("scale").reason
 
 
-def test_what_does_not_compile_leaves_the_twin_and_no_file(kernels, compiler):
+def test_what_does_not_compile_leaves_the_twin_and_no_file_and_is_said(kernels, compiler):
     (kernels / "scale.cc").write_text("not C++")
-    np.testing.assert_array_equal(_scale(jnp.ones(2, jnp.float32)), [3, 3])
+    with pytest.warns(UserWarning, match=r"scale: the native kernel cannot be used here.*slower"):
+        np.testing.assert_array_equal(_scale(jnp.ones(2, jnp.float32)), [3, 3])
     assert "failed" in libraries._loaded("scale").reason
     assert not list((kernels.parent / "cache").rglob("*.part"))
 

@@ -41,6 +41,10 @@ class BuildError(Exception):
     """A library could not be built; the message says why. Never leaves the package: the twin runs instead."""
 
 
+class NoCompilerError(BuildError):
+    """There is no compiler, which is no fault: nothing here needs one."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Compiler:
     """A C++ compiler.
@@ -55,12 +59,12 @@ class Compiler:
 
 
 def find_compiler() -> Compiler:
-    """The system's C++ compiler. Raises BuildError where there is none that runs."""
+    """The system's C++ compiler. Raises NoCompilerError where there is none, BuildError where it does not run."""
     chosen = os.environ.get("CXX", "")
     names = (chosen,) if chosen else COMPILERS
     path = next((found for found in map(shutil.which, names) if found), None)
     if path is None:
-        raise BuildError(f"no C++ compiler: none of {', '.join(names)} is on PATH")
+        raise NoCompilerError(f"no C++ compiler: none of {', '.join(names)} is on PATH")
     return Compiler(path=path, version=_run([path, "--version"]))
 
 

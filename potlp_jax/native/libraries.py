@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import os
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -16,7 +17,7 @@ from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 
-from potlp_jax.native.build import BuildError, built_library
+from potlp_jax.native.build import BuildError, NoCompilerError, built_library
 
 SWITCH: str = "POTLP_NATIVE"
 """Environment variable that turns all native kernels off where it is 0; read once in a process."""
@@ -150,8 +151,15 @@ def _loaded(library: str) -> LibraryStatus:
         try:
             file = built_library(library)
             _register(file, LIBRARIES[library])
+        except NoCompilerError as error:
+            reason = str(error)
         except (BuildError, OSError) as error:
             file, reason = None, str(error)
+            warnings.warn(
+                f"{library}: the native kernel cannot be used here, and its twin in JAX runs in its place, with the"
+                f" same results, but slower; `python -m potlp_jax.native` shows all. {reason.partition(os.linesep)[0]}",
+                stacklevel=2,
+            )
     return LibraryStatus(name=library, file=file, reason=reason, seconds=time.perf_counter() - began)
 
 
