@@ -199,14 +199,8 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     "regret": Experiment(
         page="planner",
-        command="python -m eval.bench.regret --planners best-first --subgoals 2 4 6 8 12 --instances 8 --seconds 2 "
-        "--budgets 30 300 1000 10000 100000 --out {out}",
-        one_core=True,
-    ),
-    "regret-beside": Experiment(
-        page="planner",
-        command="python -m eval.bench.regret --planners best-first po-uct-numba po-uct-pomdp-py --subgoals 1 2 4 6 8 "
-        "--instances 8 --seconds 10 --out {out}",
+        command="python -m eval.bench.regret --planners best-first po-uct-numba po-uct-pomdp-py --subgoals 2 4 6 8 12 "
+        "--instances 8 --seconds 2 --budgets 30 300 1000 10000 100000 --out {out}",
         one_core=True,
     ),
     "throughput": Experiment(

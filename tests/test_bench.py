@@ -352,3 +352,26 @@ def test_regrets_are_summed_up_by_subgoals_and_by_budget():
     assert lines[2].startswith("| find | 9 (9 to 9) | 2 (")
     assert lines[2].endswith("| 4 of 6, 2 |")
     assert lines[3].startswith("| all | 9 (9 to 9) | 2 (")
+
+
+def test_planners_stand_beside_each_other():
+    from eval.bench.regret_report import Row, beside, rates
+
+    def row(family, planner, budget, percent, ms):
+        of_instance = ([0, 1], [percent, percent], [0.0, 0.0], [True, True], [0.0, 0.0], [False, False])
+        return Row("test", family, 8, planner, budget, ms, *of_instance)
+
+    rows = [
+        row("find", "best-first", 300, 0.5, 2.0),
+        row("find", "best-first", 1000, 0.0, 4.0),
+        row("find", "mctx", 300, 7.0, 10.0),
+        row("two", "best-first", 300, 2.5, 3.0),
+        row("two", "best-first", 1000, 1.0, 5.0),
+        row("two", "mctx", 300, 0.25, 40.0),
+    ]
+    lines = beside(rows).splitlines()
+    assert lines[0] == "| family | best-first, 300 and 1,000 | within 1 %, ms | mctx, 300 and 300 | within 1 %, ms |"
+    assert lines[2] == "| find | 0.5 and 0 | 1 of 1, 2 | 7 and 7 | 0 of 1 |"
+    assert lines[3] == "| two | 2.5 and 1 | 1 of 1, 5 | 0.25 and 0.25 | 1 of 1, 40 |"
+    assert lines[4] == "| all | 1.5 and 0.5 | 2 of 2, 3.5 | 3.6 and 3.6 | 1 of 2, 40 |"
+    assert rates(rows).splitlines()[2:] == ["| find | 500 (300) | – |", "| two | 200 (1,000) | 25 (300) |"]

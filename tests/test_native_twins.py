@@ -12,6 +12,7 @@ from potlp_jax import Task
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.learning.labels import true_labels
+from potlp_jax.learning.painting import blank_painting, paint
 from potlp_jax.learning.square_ways import cheapest_ways, ways_to_sides
 from potlp_jax.native import is_usable, twin_only
 from potlp_jax.planning.distances.paths import shortest_path
@@ -26,8 +27,10 @@ from potlp_jax.planning.situation import assess
 from potlp_jax.task.task import TaskSizes
 from potlp_jax.trials.config import trial_config_for
 from potlp_jax.types import NO_STATE
+from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy
+from potlp_jax.world.renderer import obstacle_distances
 from potlp_jax.world.sensing import SensorConfig, observe, visible
 
 SHAPE = (19, 26)
@@ -144,6 +147,29 @@ def test_sight_equals_the_tables(range_cells):
         cells = jnp.asarray(rng.integers(0, shape, (12, 2)), jnp.int32)
         maps = jnp.asarray(rng.random((12, *shape)) < rng.choice([0.05, 0.2, 0.5]))
         _same(jax.vmap(see), maps, cells)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.03, 0.3])
+def test_looks_and_paintings_equal_those_of_their_tables(share):
+    _needs("camera")
+    camera = CameraConfig(height=16, width=64, horizon=6.0, fold=3.0)
+    rng = np.random.default_rng(round(100 * share))
+    for shape in ((1, 1), (9, 31), (24, 17)):
+        cells = jnp.asarray(rng.integers(0, shape, (8, 2)), jnp.int32)
+        maps = rng.choice([-1, 0, 1], (8, *shape), p=[(1 - share) / 2, (1 - share) / 2, share])
+        each = [belief_from_numpy(cells, np.zeros(shape, np.int32)) for cells in maps]
+        beliefs = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+        # Of a building smaller than its array: beyond the extent nothing is painted.
+        beliefs = dataclasses.replace(beliefs, extent=jnp.asarray(rng.integers(1, np.add(shape, 1), (8, 2)), jnp.int32))
+        far = _same(jax.vmap(lambda occupied, cell: obstacle_distances(occupied, cell, camera)), beliefs.occupied, cells)
+        assert far.shape == (8, 64)
+        # Two looks from different places, so that nearer ones meet what was seen from afar.
+        paintings = jax.vmap(lambda _: blank_painting(*shape))(cells)
+        for at in (cells, cells[::-1]):
+            pictures = jnp.asarray(rng.integers(0, 256, (8, 16, 64, 3)), jnp.uint8)
+            look = jax.vmap(functools.partial(paint, camera=camera))
+            paintings = _same(look, paintings, pictures, beliefs, at)
+        assert np.isfinite(np.asarray(paintings.distance)).any()
 
 
 @pytest.mark.parametrize("seed", range(3))

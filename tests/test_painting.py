@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from potlp_jax.learning.painting import Painting, blank_painting, column_of, paint
+from potlp_jax.learning.painting import Painting, blank_painting, paint
 from potlp_jax.world.camera import CameraConfig, column_bearings, floor_rows
 from potlp_jax.world.grid import Appearance, BeliefMap, belief_from_numpy, make_world
 from potlp_jax.world.renderer import obstacle_distances, render
@@ -117,10 +117,18 @@ def test_the_corner_of_a_wall_does_not_paint_what_it_hides():
     assert (floor[seen] > 0).mean() < 0.01
 
 
-def test_columns_are_those_that_look_along_the_bearing():
-    bearings = column_bearings(CameraConfig())
-    np.testing.assert_array_equal(column_of(jnp.asarray(bearings, jnp.float32), 512), np.arange(512))
-    assert int(column_of(jnp.float32(math.pi), 512)) == int(column_of(jnp.float32(-math.pi), 512)) == 0
+def test_cells_are_painted_from_the_column_that_looks_along_their_bearing():
+    height, width, camera = 40, 70, CameraConfig()
+    # Each column has a colour of its own, and nothing hides anything.
+    panorama = np.zeros((camera.height, camera.width, 3), np.uint8)
+    panorama[:, :, 0], panorama[:, :, 1] = np.arange(512) % 256, np.arange(512) // 256
+    belief = BeliefMap.unobserved(make_world(_room(height, width), np.zeros((height, width), np.int32), (2, 2)))
+    for cell in ((20, 31), (2, 2), (37, 68)):
+        painting = paint_jit(blank_painting(height, width), jnp.asarray(panorama), belief, jnp.asarray(cell), camera)
+        found = np.asarray(painting.floor, int)
+        rows, columns = np.mgrid[:height, :width] - np.reshape(cell, (2, 1, 1))
+        expected = np.floor((np.arctan2(rows, columns) + math.pi) * (512 / (2 * math.pi)) + 1e-9).astype(int) % 512
+        np.testing.assert_array_equal(found[..., 0] + 256 * found[..., 1], expected)
 
 
 def _coloured_world():

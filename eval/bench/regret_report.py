@@ -20,6 +20,9 @@ WRONG_PERCENT = 0.05
 
 RESAMPLES = 10_000
 
+RATED = 8
+"""Subgoals of the problems whose decisions a second are given."""
+
 
 @dataclass(frozen=True)
 class Row:
@@ -75,13 +78,15 @@ def time_to_goal(rows: Sequence[Row]) -> float:
 
 def tables(rows: Sequence[Row]) -> str:
     """Markdown: for each planner its families by number of subgoals at the default budget, and over all by budget; then
-    CPU time to the goal, and everything."""
+    the planners beside each other, CPU time to the goal, and everything."""
     default = BestFirstConfig().simulations
     parts = []
     for planner in dict.fromkeys(row.planner for row in rows):
         own = [row for row in rows if row.planner == planner]
         parts += [f"{planner}, {default} simulations, mean (worst) regret in %:\n\n{by_subgoals(own, default)}"]
         parts += [f"{planner}, over all S, mean (95 %) regret in % by simulations:\n\n{by_budget(own)}"]
+    parts += [f"Over all S, mean regret in %, and where it stays within {GOAL_PERCENT:g} %:\n\n{beside(rows)}"]
+    parts += [f"Decisions a CPU second within {GOAL_PERCENT:g} %, S = {RATED} (simulations):\n\n{rates(rows)}"]
     return "\n".join([*parts, _every_row(rows)])
 
 
@@ -116,6 +121,53 @@ def by_budget(rows: Sequence[Row]) -> str:
         ended, wrong = sum(sum(row.ended) for row in last), sum(row.ended_wrong for row in last)
         lines.append(f"| {family} | {' | '.join(cells)} | {ended} of {sum(len(row.ended) for row in last)}, {wrong} |")
     return "\n".join(lines) + "\n"
+
+
+def beside(rows: Sequence[Row]) -> str:
+    """Markdown: a line a family, over all numbers of subgoals; of every planner its mean regret at the default and at
+    its largest budget, in how many groups of family and number of subgoals it gets to the goal, and the median CPU time
+    that it takes there."""
+    default, planners = BestFirstConfig().simulations, list(dict.fromkeys(row.planner for row in rows))
+    largest = {name: max(row.budget for row in rows if row.planner == name) for name in planners}
+    heads = [f"{name}, {default} and {largest[name]:,} | within {GOAL_PERCENT:g} %, ms" for name in planners]
+    lines = ["| family | " + " | ".join(heads) + " |", "|---" * (2 * len(planners) + 1) + "|"]
+    for family in [*dict.fromkeys(row.family for row in rows), "all"]:
+        cells = []
+        for name in planners:
+            own = [row for row in rows if row.planner == name and family in (row.family, "all")]
+            means = [
+                np.mean([regret for row in own if row.budget == budget for regret in row.percent])
+                for budget in (default, largest[name])
+            ]
+            times = [time_to_goal(group) for group in _groups(own)]
+            reached = [time for time in times if np.isfinite(time)]
+            median = f", {np.median(reached):.2g}" if reached else ""
+            cells += [" and ".join(_short(float(mean)) for mean in means), f"{len(reached)} of {len(times)}{median}"]
+        lines.append(f"| {family} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def rates(rows: Sequence[Row]) -> str:
+    """Markdown: decisions a CPU second of every planner at the least budget that keeps to the goal, which stands beside
+    it, by family, with ``RATED`` subgoals; – where no budget does."""
+    rows = [row for row in rows if row.subgoals == RATED]
+    planners = list(dict.fromkeys(row.planner for row in rows))
+    lines = ["| family | " + " | ".join(planners) + " |", "|---" * (len(planners) + 1) + "|"]
+    for family in dict.fromkeys(row.family for row in rows):
+        cells = []
+        for name in planners:
+            own = [row for row in rows if (row.family, row.planner) == (family, name)]
+            least = time_to_goal(own)
+            budget = next((row.budget for row in own if row.cpu_ms == least), None)
+            cells.append("–" if budget is None else f"{1e3 / least:,.0f} ({budget:,})")
+        lines.append(f"| {family} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _groups(rows: Sequence[Row]) -> list[list[Row]]:
+    """The rows of each family and number of subgoals."""
+    keys = dict.fromkeys((row.family, row.subgoals) for row in rows)
+    return [[row for row in rows if (row.family, row.subgoals) == key] for key in keys]
 
 
 def _mean_and_interval(rows: Sequence[Row]) -> str:

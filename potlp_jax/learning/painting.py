@@ -9,17 +9,24 @@ stands in front of it. Which of these it is, and what haze in between says, is l
 painting. The nearest look at a cell is kept.
 """
 
+import functools
 import math
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
-from jaxtyping import Array, Float32, Int32, UInt8
+from jaxtyping import Array, Bool, Float32, Int32, UInt8
 
-from potlp_jax.world.camera import CameraConfig, floor_rows
+from potlp_jax.native import by_platform, target
+from potlp_jax.world.camera import CameraConfig, rows_at_slopes
 from potlp_jax.world.grid import BeliefMap
 from potlp_jax.world.renderer import obstacle_distances
 
 _HALF_DIAGONAL = math.sqrt(0.5)
+
+# Entries of the table of looks (``_looks``).
+_COLUMNS, _ON_BORDER, _ROW_SHIFT = (1 << 15) - 1, 1 << 15, 16
 
 
 @struct.dataclass(kw_only=True)
@@ -65,27 +72,86 @@ def paint(
     Returns:
         The painting in which every cell in sight, nearer than ever before, has its colours of this panorama.
     """
-    height, width = belief.cells.shape
-    rows = (jnp.arange(height, dtype=jnp.int32) - cell[0]).astype(jnp.float32)[:, None]
-    columns = (jnp.arange(width, dtype=jnp.int32) - cell[1]).astype(jnp.float32)[None, :]
-    distance = jnp.sqrt(rows**2 + columns**2)
-    column = column_of(jnp.arctan2(rows, columns), panorama.shape[1])
-    row = jnp.clip(jnp.round(floor_rows(camera, distance)).astype(jnp.int32), 0, panorama.shape[0] - 1)
-    free_until = obstacle_distances(belief.occupied, cell, camera)[column]
+    looks = jnp.asarray(_looks(camera, *belief.cells.shape))
+    free_until = obstacle_distances(belief.occupied, cell, camera)
+    known = (panorama, belief.occupied, cell, belief.extent, free_until, looks)
+    ways = (functools.partial(way, horizon=math.floor(camera.horizon)) for way in (_painted_natively, _painted))
+    floor, beyond, distance = by_platform("camera", *ways, painting.floor, painting.beyond, painting.distance, *known)
+    return Painting(floor=floor, beyond=beyond, distance=distance)
+
+
+_Layers = tuple[UInt8[Array, "H W 3"], UInt8[Array, "H W 3"], Float32[Array, "H W"]]
+
+
+def _painted_natively(
+    floor: UInt8[Array, "H W 3"],
+    beyond: UInt8[Array, "H W 3"],
+    distance: Float32[Array, "H W"],
+    *known: Array,
+    horizon: int,
+) -> _Layers:
+    """In native code (``native/kernels/camera.cc``)."""
+    layers = (floor, beyond, distance)
+    results = [jax.ShapeDtypeStruct(layer.shape, layer.dtype) for layer in layers]
+    # In place: only cells that are seen nearer than ever are written.
+    aliases = {number: number for number in range(len(layers))}
+    call = jax.ffi.ffi_call(target("paint"), results, vmap_method="sequential", input_output_aliases=aliases)
+    return tuple(call(*layers, *known, horizon=np.int64(horizon)))
+
+
+def _painted(
+    floor: UInt8[Array, "H W 3"],
+    beyond: UInt8[Array, "H W 3"],
+    distance: Float32[Array, "H W"],
+    panorama: UInt8[Array, "rows columns 3"],
+    occupied: Bool[Array, "H W"],
+    cell: Int32[Array, "2"],
+    extent: Int32[Array, "2"],
+    free_until: Float32[Array, " columns"],
+    looks: Int32[Array, "H W"],
+    *,
+    horizon: int,
+) -> _Layers:
+    height, width = occupied.shape
+    rows, columns = jnp.arange(height, dtype=jnp.int32), jnp.arange(width, dtype=jnp.int32)
+    down, right = rows - cell[0], columns - cell[1]
+    away = jnp.sqrt(jnp.square(down)[:, None].astype(jnp.float32) + jnp.square(right)[None, :].astype(jnp.float32))
+    look = looks[jnp.minimum(jnp.abs(down), height - 1)][:, jnp.minimum(jnp.abs(right), width - 1)]
+    column = _column_of(look, down[:, None], right[None, :], panorama.shape[1])
     # An obstacle is met at its side, and may be seen across up to half a diagonal of it.
-    in_sight = distance <= free_until + jnp.where(belief.occupied, _HALF_DIAGONAL, 0.0)
+    in_sight = away <= free_until[column] + jnp.where(occupied, jnp.float32(_HALF_DIAGONAL), 0.0)
     # What pads the map to an array is no part of the building, although nothing that is known hides it.
-    inside = (jnp.arange(height)[:, None] < belief.extent[0]) & (jnp.arange(width)[None, :] < belief.extent[1])
-    nearer = in_sight & inside & (distance < painting.distance)
-    return Painting(
-        floor=jnp.where(nearer[:, :, None], panorama[row, column], painting.floor),
-        beyond=jnp.where(nearer[:, :, None], panorama[math.floor(camera.horizon), column], painting.beyond),
-        distance=jnp.where(nearer, distance, painting.distance),
+    inside = (rows[:, None] < extent[0]) & (columns[None, :] < extent[1])
+    nearer = in_sight & inside & (away < distance)
+    return (
+        jnp.where(nearer[:, :, None], panorama[look >> _ROW_SHIFT, column], floor),
+        jnp.where(nearer[:, :, None], panorama[horizon, column], beyond),
+        jnp.where(nearer, away, distance),
     )
 
 
-def column_of(bearing: Float32[Array, "*shape"], columns: int) -> Int32[Array, "*shape"]:
-    """The column of a panorama of so many columns that looks along a bearing."""
-    # The inverse of ``camera.column_bearings``: column c covers the bearings from 2 pi c / columns - pi to the next.
-    turned = bearing * jnp.float32(columns / (2 * math.pi)) + jnp.float32(columns / 2)
-    return jnp.floor(turned).astype(jnp.int32) % columns
+def _column_of(
+    look: Int32[Array, "H W"], down: Int32[Array, "H 1"], right: Int32[Array, "1 W"], columns: int
+) -> Int32[Array, "H W"]:
+    """The column that looks at each cell: the quadrant of the table, mirrored to the others."""
+    turn = look & _COLUMNS
+    # The other way round a bearing within a column is in the column before; one on the border of two is in the later.
+    back = turn + jnp.where(look & _ON_BORDER, 0, 1)
+    below = jnp.where(right >= 0, columns // 2 + turn, (columns - back) % columns)
+    return jnp.where(down >= 0, below, jnp.where(right >= 0, columns // 2 - back, turn))
+
+
+@functools.lru_cache(maxsize=32)
+def _looks(camera: CameraConfig, height: int, width: int) -> Int32[np.ndarray, "H W"]:
+    """Where a panorama shows the floor of cells by their offset from the robot, in the quadrant of growing rows and
+    columns: bits 0 to 14 columns from the bearing 0, bit 15 whether the cell's bearing is the border of two columns,
+    from bit 16 on the row."""
+    down, right = np.meshgrid(np.arange(height), np.arange(width), indexing="ij")
+    turn = np.arctan2(down, right) * (camera.width / (2 * math.pi))
+    # Of the borders between columns those at multiples of 45 degrees alone meet the middle of cells (``CameraConfig``).
+    on_border = (down == 0) | (right == 0) | (down == right)
+    whole = np.where(on_border, np.round(turn), np.floor(turn)).astype(np.int32)
+    # Nearer than one cell as at one cell: the robot does not see the floor under itself.
+    slope = -camera.eye_height / np.maximum(np.hypot(down, right), 1.0)
+    row = np.clip(np.round(rows_at_slopes(camera, slope)), 0, camera.height - 1).astype(np.int32)
+    return whole | np.where(on_border, _ON_BORDER, 0).astype(np.int32) | (row << _ROW_SHIFT)

@@ -23,6 +23,7 @@ SWITCH: str = "POTLP_NATIVE"
 """Environment variable that turns all native kernels off where it is 0; read once in a process."""
 
 LIBRARIES: dict[str, tuple[str, ...]] = {
+    "camera": ("obstacle_distances", "paint"),
     "distances": ("product_distances", "distance_table"),
     "frontiers": ("find_components",),
     "labels": ("true_labels",),

@@ -113,7 +113,7 @@ def row_slopes(config: CameraConfig) -> Float[np.ndarray, " rows"]:
     return -config.eye_height / config.far * np.sinh(below)
 
 
-def rows_at_slopes(config: CameraConfig, slopes: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def rows_at_slopes(config: CameraConfig, slopes: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
     """Row coordinate, 0 in the middle of the first row, at which the tangent of the elevation has each value."""
     # The inverse of ``row_slopes``; the half row lies between the upper edge of a row and its middle.
     return config.horizon + config.fold * np.arcsinh(-slopes * config.far / config.eye_height) - 0.5

@@ -9,7 +9,8 @@ the map it was taken.
 One ray a column is followed through the lattice of cells. Because the robot stands in the middle of a cell, the cells
 that a ray crosses, where it crosses them, and the piece of floor that a pixel shows are the same for every cell and
 world, relative to the robot: they are static tables (``_Rays``, ``_Planes``), and what remains for the device are
-gathers and one running product along the rays. Where a row or column looks is in ``camera``.
+gathers and one running product along the rays, until a wall has stopped all of them. Where a row or column looks is in
+``camera``.
 
 References:
     Amanatides and Woo, A fast voxel traversal algorithm for ray tracing, Eurographics 1987 (cells crossed by a ray).
@@ -19,15 +20,16 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Float32, Int, Int32, UInt8
+from jaxtyping import Array, Bool, Float, Float32, Int, Int32, Shaped, UInt8
 
 from potlp_jax import plugins
 from potlp_jax.errors import PluginError
+from potlp_jax.native import by_platform, target
 from potlp_jax.world.camera import CameraConfig, column_bearings, finer, row_slopes
 from potlp_jax.world.grid import World
 
@@ -49,6 +51,8 @@ _LONGEST_SIGHT = 1e6
 """Distance in cells at which a row on the horizon is taken to meet the floor: farther than any grid."""
 _SAMPLES = 6
 """Samples a side of a pixel by which edges of tiles are averaged."""
+_BLOCK = 16
+"""Steps of all rays that are followed between two tests for rays that still go on."""
 
 # exp(-x) around half the diagonal of a cell, the middle of what can occur (see ``_passed``).
 _HALF_DIAGONAL = math.sqrt(0.5)
@@ -94,6 +98,20 @@ class _Planes:
     """Length of the sight line in the cell that is shown."""
     shade: Float[np.ndarray, "rows columns"]
     """Brightness of the texture, 1 where no edge of a tile is shown."""
+
+
+class _Followed(NamedTuple):
+    """The rays up to the walls; what comes after the block in which the last ray met one is 0.
+
+    Attributes:
+        crossed: packed optics of the cells.
+        sight: where a ray enters a cell, the light that comes through and the glow of the smoke (``_pack_sight``).
+        first: step of the first obstacle, the last step where there is none.
+    """
+
+    crossed: Int32[Array, "steps columns"]
+    sight: Int32[Array, "steps columns"]
+    first: Int32[Array, " columns"]
 
 
 class _Walls(NamedTuple):
@@ -154,14 +172,46 @@ def obstacle_distances(
     Returns:
         Distances in cells.
     """
+    height, width = occupied.shape
     # Beyond the array everything hides: rays end there, as the tables want it.
+    rays, _ = _tables(config, height + 2, width + 2)
+    tables = jnp.asarray(rays.offset), jnp.asarray(rays.enter)
+    return by_platform("camera", _looked_natively, _looked, occupied, cell, *tables)
+
+
+def _looked_natively(
+    occupied: Bool[Array, "H W"],
+    cell: Int32[Array, "2"],
+    offset: Int32[Array, "steps columns"],
+    enter: Float32[Array, "steps columns"],
+) -> Float32[Array, " columns"]:
+    """In native code (``native/kernels/camera.cc``), by tables of the rays in the array with a border."""
+    result = jax.ShapeDtypeStruct(enter.shape[1:], jnp.float32)
+    call = jax.ffi.ffi_call(target("obstacle_distances"), result, vmap_method="sequential")
+    return call(occupied, cell, offset, enter)
+
+
+def _looked(
+    occupied: Bool[Array, "H W"],
+    cell: Int32[Array, "2"],
+    offset: Int32[Array, "steps columns"],
+    enter: Float32[Array, "steps columns"],
+) -> Float32[Array, " columns"]:
     closed = jnp.pad(occupied, 1, constant_values=True)
-    rays, _ = _tables(config, *closed.shape)
     base = (cell[0] + 1) * jnp.int32(closed.shape[1]) + cell[1] + 1
-    hides = jnp.take(closed.ravel(), base + rays.offset, mode="clip")
-    # The robot's own cell, step 0, hides nothing.
-    first = jnp.argmax(hides[1:], axis=0).astype(jnp.int32) + 1
-    return jnp.take_along_axis(jnp.asarray(rays.enter), first[None], axis=0)[0]
+    steps, columns = offset.shape
+    blocks = _in_blocks(offset)
+
+    def follow_block(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        block, first = state
+        hides = jnp.take(closed.ravel(), base + blocks[block], mode="clip")
+        return block + 1, jnp.minimum(first, _first_in_block(hides, block, steps))
+
+    start = (jnp.int32(0), jnp.full(columns, steps - 1, jnp.int32))
+    _, first = jax.lax.while_loop(
+        lambda state: (state[0] < blocks.shape[0]) & jnp.any(state[1] == steps - 1), follow_block, start
+    )
+    return jnp.take_along_axis(enter, first[None], axis=0)[0]
 
 
 def _render_elsewhere(world: World, cell: Int32[Array, "2"], config: CameraConfig) -> UInt8[Array, "rows columns 3"]:
@@ -216,13 +266,12 @@ def _render(
     rays, planes = _tables(config, *optics.shape)
     base = cell[0] * jnp.int32(optics.shape[1]) + cell[1]
     # Indices outside of the grid belong to steps behind the closed border; any cell will do for them.
-    crossed = jnp.take(optics.ravel(), base + rays.offset, mode="clip")
-    sight = _pass_smoke(crossed, rays)
-    walls = _find_walls(crossed, sight, colours.ravel(), base, rays)
+    followed = _follow(optics.ravel(), base, rays)
+    walls = _find_walls(followed, colours.ravel(), base, rays)
     # A sight line that would meet floor or ceiling only behind the wall shows the wall.
     is_wall = planes.distance[:, None] >= walls.distance[None, :]
-    shown = jnp.take(crossed.ravel(), planes.step, mode="clip")
-    transmission, glow = _see_planes(shown, sight, planes)
+    shown = jnp.take(followed.crossed.ravel(), planes.step, mode="clip")
+    transmission, glow = _see_planes(shown, followed.sight, planes)
     transmission = jnp.where(is_wall, walls.transmission[None, :], transmission)
     glow = jnp.where(is_wall, walls.glow[None, :], glow)
     shade = jnp.where(is_wall, _shade_walls(walls, planes, config), _brightness(shown) * planes.shade)
@@ -286,8 +335,11 @@ def _passed(optics: Int32[Array, "*shape"], length: Float32[Array, "*shape"]) ->
     return jnp.minimum(value, 1.0)
 
 
-def _pass_smoke(crossed: Int32[Array, "steps columns"], rays: _Rays) -> Int32[Array, "steps columns"]:
-    """Where each ray enters each cell: the light that comes through and the glow of the smoke, see ``_pack_sight``."""
+def _follow(optics: Int32[Array, " cells"], base: Int32[Array, ""], rays: _Rays) -> _Followed:
+    """Follow all rays, block by block, until each has met an obstacle."""
+    steps, columns = rays.offset.shape
+    blocks = -(-steps // _BLOCK)
+    offsets, lengths = (_in_blocks(table) for table in (rays.offset, rays.length))
 
     def cross(state: tuple[Array, Array], cell: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
         transmission, glow = state
@@ -296,8 +348,36 @@ def _pass_smoke(crossed: Int32[Array, "steps columns"], rays: _Rays) -> Int32[Ar
         # What the cell takes away it replaces by white, as bright as the cell, seen through the smoke in front of it.
         return (after, glow + (transmission - after) * _brightness(optics)), _pack_sight(transmission, glow)
 
-    clear = jnp.ones(crossed.shape[1:], jnp.float32)
-    return jax.lax.scan(cross, (clear, jnp.zeros_like(clear)), (crossed, jnp.asarray(rays.length)))[1]
+    def follow_block(state: tuple[Any, ...]) -> tuple[Any, ...]:
+        block, light, crossed, sight, first = state
+        # Indices outside of the grid belong to steps behind the closed border; any cell will do for them.
+        entered = jnp.take(optics, base + offsets[block], mode="clip")
+        light, seen = jax.lax.scan(cross, light, (entered, lengths[block]))
+        first = jnp.minimum(first, _first_in_block(entered >= _SOLID, block, steps))
+        return block + 1, light, crossed.at[block].set(entered), sight.at[block].set(seen), first
+
+    clear, nothing = jnp.ones(columns, jnp.float32), jnp.zeros((blocks, _BLOCK, columns), jnp.int32)
+    start = (jnp.int32(0), (clear, jnp.zeros_like(clear)), nothing, nothing, jnp.full(columns, steps - 1, jnp.int32))
+    _, _, crossed, sight, first = jax.lax.while_loop(
+        lambda state: (state[0] < blocks) & jnp.any(state[4] == steps - 1), follow_block, start
+    )
+    flat = (blocks * _BLOCK, columns)
+    return _Followed(crossed=crossed.reshape(flat), sight=sight.reshape(flat), first=first)
+
+
+def _in_blocks(table: Shaped[Array | np.ndarray, "steps columns"]) -> Shaped[Array, "K block columns"]:
+    """A table of the rays in blocks of ``_BLOCK`` steps; what fills up the last one is 0."""
+    steps, columns = table.shape
+    return jnp.pad(table, ((0, -steps % _BLOCK), (0, 0))).reshape(-1, _BLOCK, columns)
+
+
+def _first_in_block(
+    solid: Bool[Array, "block columns"], block: Int32[Array, ""], steps: int
+) -> Int32[Array, " columns"]:
+    """The first step of a block at which each ray meets an obstacle, the last of all steps where it meets none."""
+    step = block * _BLOCK + jnp.arange(_BLOCK, dtype=jnp.int32)[:, None]
+    # Step 0 is the robot's own cell, which hides nothing.
+    return jnp.min(jnp.where(solid & (step > 0), step, jnp.int32(steps - 1)), axis=0)
 
 
 def _pack_sight(transmission: Float32[Array, "*shape"], glow: Float32[Array, "*shape"]) -> Int32[Array, "*shape"]:
@@ -313,22 +393,13 @@ def _unpack_sight(packed: Int32[Array, "*shape"]) -> tuple[Float32[Array, "*shap
     return transmission, (packed & 0xFFFF).astype(jnp.float32) * (1 / 65535)
 
 
-def _find_walls(
-    crossed: Int32[Array, "steps columns"],
-    sight: Int32[Array, "steps columns"],
-    colours: Int32[Array, " cells"],
-    base: Int32[Array, ""],
-    rays: _Rays,
-) -> _Walls:
+def _find_walls(followed: _Followed, colours: Int32[Array, " cells"], base: Int32[Array, ""], rays: _Rays) -> _Walls:
     """The first obstacle on each ray, and what the smoke in front of it does."""
-    steps, columns = crossed.shape
-    step = jnp.arange(steps, dtype=jnp.int32)[:, None]
-    # Step 0 is the robot's own cell, which is free. Without any obstacle a ray would end at the last step.
-    first = jnp.min(jnp.where(crossed >= _SOLID, step, jnp.int32(steps - 1))[1:], axis=0)
-    at = first * jnp.int32(columns) + jnp.arange(columns, dtype=jnp.int32)
+    columns = rays.offset.shape[1]
+    at = followed.first * jnp.int32(columns) + jnp.arange(columns, dtype=jnp.int32)
     # A wall is lit by the free cell in front of it, which the ray crossed one step before.
-    before = jnp.take(crossed.ravel(), at - jnp.int32(columns), mode="clip")
-    transmission, glow = _unpack_sight(jnp.take(sight.ravel(), at, mode="clip"))
+    before = jnp.take(followed.crossed.ravel(), at - jnp.int32(columns), mode="clip")
+    transmission, glow = _unpack_sight(jnp.take(followed.sight.ravel(), at, mode="clip"))
     colour = jnp.take(colours, base + jnp.take(rays.offset.ravel(), at, mode="clip"), mode="clip")
     return _Walls(
         distance=jnp.take(rays.enter.ravel(), at, mode="clip"),
