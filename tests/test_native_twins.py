@@ -160,11 +160,12 @@ def test_looks_and_paintings_equal_those_of_their_tables(share):
         each = [belief_from_numpy(cells, np.zeros(shape, np.int32)) for cells in maps]
         beliefs = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
         # Of a building smaller than its array: beyond the extent nothing is painted.
-        beliefs = dataclasses.replace(beliefs, extent=jnp.asarray(rng.integers(1, np.add(shape, 1), (8, 2)), jnp.int32))
-        far = _same(jax.vmap(lambda occupied, cell: obstacle_distances(occupied, cell, camera)), beliefs.occupied, cells)
+        extent = jnp.asarray(rng.integers(1, np.add(shape, 1), (8, 2)), jnp.int32)
+        beliefs = dataclasses.replace(beliefs, extent=extent)
+        far = _same(jax.vmap(functools.partial(obstacle_distances, config=camera)), beliefs.occupied, cells)
         assert far.shape == (8, 64)
         # Two looks from different places, so that nearer ones meet what was seen from afar.
-        paintings = jax.vmap(lambda _: blank_painting(*shape))(cells)
+        paintings = jax.tree.map(lambda layer: jnp.repeat(layer[None], 8, axis=0), blank_painting(*shape))
         for at in (cells, cells[::-1]):
             pictures = jnp.asarray(rng.integers(0, 256, (8, 16, 64, 3)), jnp.uint8)
             look = jax.vmap(functools.partial(paint, camera=camera))
