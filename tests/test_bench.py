@@ -355,7 +355,7 @@ def test_regrets_are_summed_up_by_subgoals_and_by_budget():
 
 
 def test_planners_stand_beside_each_other():
-    from eval.bench.regret_report import Row, beside, rates
+    from eval.bench.regret_report import Row, beside, rates, times_as_fast
 
     def row(family, planner, budget, percent, ms):
         of_instance = ([0, 1], [percent, percent], [0.0, 0.0], [True, True], [0.0, 0.0], [False, False])
@@ -374,4 +374,17 @@ def test_planners_stand_beside_each_other():
     assert lines[2] == "| find | 0.5 and 0 | 1 of 1, 2 | 7 and 7 | 0 of 1 |"
     assert lines[3] == "| two | 2.5 and 1 | 1 of 1, 5 | 0.25 and 0.25 | 1 of 1, 40 |"
     assert lines[4] == "| all | 1.5 and 0.5 | 2 of 2, 3.5 | 3.6 and 3.6 | 1 of 2, 40 |"
+    assert list(times_as_fast(rows)) == ["- best-first is 8 times as fast as mctx (geometric mean of 1 groups)"]
     assert rates(rows).splitlines()[2:] == ["| find | 500 (300) | – |", "| two | 200 (1,000) | 25 (300) |"]
+
+
+def test_runs_on_two_devices_are_compared_trial_by_trial():
+    from eval.bench.accelerator import agreement
+
+    def found(costs, decisions):
+        return {
+            "rows": [{"part": "search"}, {"part": "trials", "policy": "potlp", "costs": costs, "decisions": decisions}]
+        }
+
+    mine, its = found([10.0, 20.0, 30.0], [3, 4, 5]), found([10.0, 20.0, 33.0], [3, 5, 5])
+    assert list(agreement(mine, its)) == ["potlp: 1 of 3 trials the same, mean cost 20.00 and 21.00"]

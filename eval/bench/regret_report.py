@@ -1,6 +1,6 @@
 """What ``eval.bench.regret`` says: its rows with their intervals, the table and the plots."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -86,6 +86,7 @@ def tables(rows: Sequence[Row]) -> str:
         parts += [f"{planner}, {default} simulations, mean (worst) regret in %:\n\n{by_subgoals(own, default)}"]
         parts += [f"{planner}, over all S, mean (95 %) regret in % by simulations:\n\n{by_budget(own)}"]
     parts += [f"Over all S, mean regret in %, and where it stays within {GOAL_PERCENT:g} %:\n\n{beside(rows)}"]
+    parts += [f"{line}\n" for line in times_as_fast(rows)]
     parts += [f"Decisions a CPU second within {GOAL_PERCENT:g} %, S = {RATED} (simulations):\n\n{rates(rows)}"]
     return "\n".join([*parts, _every_row(rows)])
 
@@ -141,10 +142,24 @@ def beside(rows: Sequence[Row]) -> str:
             ]
             times = [time_to_goal(group) for group in _groups(own)]
             reached = [time for time in times if np.isfinite(time)]
-            median = f", {np.median(reached):.2g}" if reached else ""
+            median = f", {_milliseconds(float(np.median(reached)))}" if reached else ""
             cells += [" and ".join(_short(float(mean)) for mean in means), f"{len(reached)} of {len(times)}{median}"]
         lines.append(f"| {family} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def times_as_fast(rows: Sequence[Row]) -> Iterator[str]:
+    """How many times as fast as each other planner the first one gets to the goal, where both do."""
+    first, *others = dict.fromkeys(row.planner for row in rows)
+    for other in others:
+        ratios = []
+        for group in _groups(rows):
+            times = [time_to_goal([row for row in group if row.planner == name]) for name in (first, other)]
+            if np.isfinite(times).all():
+                ratios.append(times[1] / times[0])
+        if ratios:
+            mean = np.exp(np.log(ratios).mean())
+            yield f"- {first} is {mean:.2g} times as fast as {other} (geometric mean of {len(ratios)} groups)"
 
 
 def rates(rows: Sequence[Row]) -> str:
@@ -174,6 +189,10 @@ def _mean_and_interval(rows: Sequence[Row]) -> str:
     percent = [regret for row in rows for regret in row.percent]
     low, high = bootstrap_interval(percent)
     return f"{_short(float(np.mean(percent)))} ({_short(low)} to {_short(high)})"
+
+
+def _milliseconds(time: float) -> str:
+    return f"{time:.2g}" if time < 10 else f"{time:,.0f}"
 
 
 def _short(percent: float) -> str:
