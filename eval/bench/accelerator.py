@@ -81,7 +81,7 @@ def trial_rows(policies: Sequence[Policy], slots: Sequence[int], worlds: int) ->
             began = time.perf_counter()
             finished = list(run_batch(_numbered(trials), policy, slots=count))
             seconds = time.perf_counter() - began
-            finished.sort(key=lambda trial: trial.name)
+            finished.sort(key=lambda trial: int(str(trial.name)))
             yield {
                 "part": "trials",
                 "policy": policy.value,

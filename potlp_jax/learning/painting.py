@@ -96,7 +96,8 @@ def _painted_natively(
     # In place: only cells that are seen nearer than ever are written.
     aliases = {number: number for number in range(len(layers))}
     call = jax.ffi.ffi_call(target("paint"), results, vmap_method="sequential", input_output_aliases=aliases)
-    return tuple(call(*layers, *known, horizon=np.int64(horizon)))
+    floor, beyond, distance = call(*layers, *known, horizon=np.int64(horizon))
+    return floor, beyond, distance
 
 
 def _painted(
