@@ -172,6 +172,13 @@ def test_looks_and_paintings_equal_those_of_their_tables(share):
             paintings = _same(look, paintings, pictures, beliefs, at)
         assert np.isfinite(np.asarray(paintings.distance)).any()
 
+        # Layers that begin as one constant stay apart.
+        def first(picture, belief, at, shape=shape):
+            return paint(blank_painting(*shape), picture, belief, at, camera)
+
+        alone = [_same(first, pictures[row], each[row], cells[row]) for row in range(8)]
+        assert any((np.asarray(one.floor) != np.asarray(one.beyond)).any() for one in alone)
+
 
 @pytest.mark.parametrize("seed", range(3))
 def test_paths_equal_those_walked_in_jax(seed):

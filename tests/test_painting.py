@@ -173,3 +173,21 @@ def test_a_nearer_look_replaces_one_from_afar_and_a_farther_one_does_not():
     assert np.asarray(both.floor)[2, 3, 0] == 10
     again = paint_jit(both, jnp.asarray(far), belief, jnp.array([2, 2]), CAMERA)
     np.testing.assert_array_equal(again.floor, both.floor)
+
+
+@pytest.mark.parametrize("horizon", [-3.0, 24.0, 200.0])
+def test_a_picture_without_a_horizon_gives_its_nearest_row(horizon):
+    camera = CameraConfig(height=64, width=128, horizon=horizon, fold=8.0)
+    panorama = np.zeros((64, 128, 3), np.uint8)
+    panorama[:, :, 0] = np.arange(64)[:, None]
+    at = jnp.array([3, 3])
+    painting = paint_jit(blank_painting(14, 20), jnp.asarray(panorama), _belief(_room(), 20), at, camera)
+    seen = np.isfinite(np.asarray(painting.distance))
+    assert set(np.asarray(painting.beyond)[seen][:, 0].tolist()) == {int(np.clip(horizon, 0, 63))}
+
+
+def test_a_panorama_of_another_size_than_the_camera_s_is_refused():
+    with pytest.raises(ValueError, match=r"shape \(64, 64, 3\), must be \(64, 128, 3\)"):
+        paint(
+            blank_painting(14, 20), jnp.zeros((64, 64, 3), jnp.uint8), _belief(_room(), 20), jnp.array([3, 3]), CAMERA
+        )

@@ -71,11 +71,21 @@ def paint(
 
     Returns:
         The painting in which every cell in sight, nearer than ever before, has its colours of this panorama.
+
+    Raises:
+        ValueError: the panorama is not as large as the camera's.
     """
+    # The kernel reads pixels by numbers of the camera.
+    if panorama.shape != (camera.height, camera.width, 3):
+        raise ValueError(
+            f"the panorama has shape {panorama.shape}, must be {(camera.height, camera.width, 3)}: the camera's"
+        )
     looks = jnp.asarray(_looks(camera, *belief.cells.shape))
     free_until = obstacle_distances(belief.occupied, cell, camera)
     known = (panorama, belief.occupied, cell, belief.extent, free_until, looks)
-    ways = (functools.partial(way, horizon=math.floor(camera.horizon)) for way in (_painted_natively, _painted))
+    # A camera may look up or down so far that its picture has no horizon.
+    horizon = min(max(math.floor(camera.horizon), 0), camera.height - 1)
+    ways = (functools.partial(way, horizon=horizon) for way in (_painted_natively, _painted))
     floor, beyond, distance = by_platform("camera", *ways, painting.floor, painting.beyond, painting.distance, *known)
     return Painting(floor=floor, beyond=beyond, distance=distance)
 
