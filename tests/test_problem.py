@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +11,9 @@ import pytest
 from potlp_jax.errors import ProblemError
 from potlp_jax.planning.history import action_terms, initial_history
 from potlp_jax.planning.problem import PlanningProblem, enumerate_actions
+from potlp_jax.planning.search.api import plan_actions
+from potlp_jax.planning.search.config import BestFirstConfig
+from potlp_jax.types import NO_ACTION
 from tests.reference.problems import FORMULAS, SIZES, padded_problem, problem_of, random_fields, random_problem, task_of
 
 TASK = "F a & F b"
@@ -128,3 +132,30 @@ def test_nothing_to_enumerate(formula, subgoals):
     problem = random_problem(formula, subgoals, 0)
     assert enumerate_actions(problem).shape == (subgoals, problem.edge_count)
     assert not np.any(enumerate_actions(problem))
+
+
+def test_a_padded_problem_is_planned_as_it_is_and_shares_a_program_with_others():
+    chex.clear_trace_counter()
+    plan = jax.jit(chex.assert_max_traces(plan_actions, n=1), static_argnames="config")
+    config, key, size = BestFirstConfig(simulations=60), jax.random.key(0), 5
+    for subgoals in (1, 2, 4, size):
+        problem = random_problem("(!f U e) & F f", subgoals, seed=subgoals)
+        mine, its = plan(problem.padded(size), key, config=config), plan_actions(problem, key, config)
+        own = subgoals * problem.edge_count
+        real = [*range(own), size * problem.edge_count]
+        np.testing.assert_array_equal(np.asarray(mine.q_values)[real], its.q_values)
+        assert np.isinf(np.delete(np.asarray(mine.q_values), real)).all()
+        assert (float(mine.value), float(mine.lower_bound)) == (float(its.value), float(its.lower_bound))
+        assert int(mine.action) == (NO_ACTION if its.action == NO_ACTION else real[int(its.action)])
+
+
+def test_a_batch_is_padded_row_by_row_and_nothing_is_cut_off():
+    problems = [random_problem("F a & F b", 2, seed) for seed in range(3)]
+    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *problems).padded(4)
+    for row, problem in enumerate(problems):
+        alone = problem.padded(4)
+        alone.check()
+        for mine, its in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
+            np.testing.assert_array_equal(mine[row], its)
+    with pytest.raises(ProblemError, match="has 2 subgoals and cannot be padded to 1"):
+        problems[0].padded(1)

@@ -112,6 +112,45 @@ class PlanningProblem:
         """A = S * E + 1; the last action is finish."""
         return self.subgoal_count * self.edge_count + 1
 
+    def padded(self, subgoals: int) -> "PlanningProblem":
+        """The same problem, or batch of problems, with room for more subgoals: problems of one size share a program.
+
+        Pure and traceable. With ``Task.padded`` for the task, whatever occurs in a program fits one size. No choice and
+        no value changes. Actions keep their numbers but for finish, which is always the last.
+
+        Args:
+          subgoals: S of the result; what is added is absent.
+
+        Returns:
+          The problem; real subgoals come first, as before.
+
+        Raises:
+          ProblemError: it has more subgoals already, padding included.
+        """
+        added = subgoals - self.subgoal_count
+        if added < 0:
+            raise ProblemError(f"the problem has {self.subgoal_count} subgoals and cannot be padded to {subgoals}")
+
+        def longer(values: Array, axis: int, fill: float | bool) -> Array:
+            shape = list(values.shape)
+            shape[axis] = added
+            return jnp.concatenate([values, jnp.full(shape, fill, values.dtype)], axis=axis)
+
+        def longer_before_robot(values: Array, axis: int) -> Array:
+            # The robot's node stays the last.
+            nodes, robot = jnp.split(values, [self.subgoal_count], axis=axis)
+            return jnp.concatenate([longer(nodes, axis, jnp.inf), robot], axis=axis)
+
+        return dataclasses.replace(
+            self,
+            travel=longer_before_robot(longer(self.travel, -2, jnp.inf), -4),
+            finish=longer_before_robot(self.finish, -2),
+            success_probability=longer(self.success_probability, -2, 0.0),
+            success_cost=longer(self.success_cost, -2, 1.0),
+            failure_cost=longer(self.failure_cost, -2, 0.0),
+            subgoal_mask=longer(self.subgoal_mask, -1, False),
+        )
+
     def check(self) -> None:
         """Validate one unbatched problem on the host: the rules of ``screen``, with a message.
 
