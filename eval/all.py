@@ -203,6 +203,19 @@ EXPERIMENTS: dict[str, Experiment] = {
         "--instances 8 --seconds 2 --budgets 30 300 1000 10000 100000 --out {out}",
         one_core=True,
     ),
+    "rates": Experiment(
+        page="planner",
+        command="python -m eval.bench.regret --planners best-first po-uct po-uct-numba po-uct-pomdp-py mctx --families "
+        "find firefighting two three-single --subgoals 8 --instances 8 --seconds 2 --budgets 30 300 1000 --out {out}",
+        one_core=True,
+    ),
+    "optimism": Experiment(
+        page="planner",
+        command="python -m eval.bench.regret --split tuning --planners best-first --optimism .3 .4 .6 .7 1 "
+        "--subgoals 4 8 --instances 8 --seconds 2 --budgets 30 300 1000 10000 --families find three-single "
+        "three-joint two firefighting reuse random cubes shared rare extreme cheap dear clustered four --out {out}",
+        one_core=True,
+    ),
     "throughput": Experiment(
         page="planner",
         command="python -m eval.bench.throughput --batches 1 64 --simulations 300 --repeats 3 --out {out}",
