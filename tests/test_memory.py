@@ -7,6 +7,7 @@ import numpy as np
 from potlp_jax.learning.memory import (
     NO_OBSERVATION,
     empty_memory,
+    moved_memory,
     observation_of_subgoals,
     remember,
     slots_of_observations,
@@ -117,3 +118,27 @@ def test_a_full_memory_is_flagged():
     memory = remember_jit(memory, jnp.zeros(FEATURES), belief, jnp.array([2, niches[-1]]))
     assert sorted(np.asarray(memory.observation).tolist()) == [1, 3]
     assert int(memory.status) == Status.VIEW_OVERFLOW
+
+
+def test_a_map_that_outgrows_its_array_keeps_what_was_seen_on_it():
+    """Against a memory that had the larger array from the start."""
+    rng = np.random.default_rng(3)
+    small, (top, left) = some_belief(rng), (3, 5)
+    pad = ((top, 4), (left, 2))
+    large = belief_from_numpy(
+        np.pad(np.asarray(small.cells), pad, constant_values=BeliefMap.UNKNOWN), np.pad(np.asarray(small.letters), pad)
+    )
+    found, wanted = empty_memory(4, FEATURES, 12, 16), empty_memory(4, FEATURES, 19, 23)
+    for number in range(8):
+        cell, features = jnp.asarray(free_cell(rng, small)), jnp.full(FEATURES, number, jnp.float32)
+        there = cell + jnp.array([top, left], jnp.int32)
+        wanted = remember_jit(wanted, features, large, there)
+        if number == 5:
+            found = moved_memory(found, (19, 23), top, left)
+        found = (
+            remember_jit(found, features, large, there) if number >= 5 else remember_jit(found, features, small, cell)
+        )
+    # Cells beyond the small array are known to be free in neither.
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert (np.asarray(found.observation_of_cell) >= 0).any()

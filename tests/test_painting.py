@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from potlp_jax.learning.painting import Painting, blank_painting, paint
+from potlp_jax.learning.painting import Painting, blank_painting, moved_painting, paint
 from potlp_jax.world.camera import CameraConfig, column_bearings, floor_rows
 from potlp_jax.world.grid import Appearance, BeliefMap, belief_from_numpy, make_world
 from potlp_jax.world.renderer import obstacle_distances, render
@@ -191,3 +191,32 @@ def test_a_panorama_of_another_size_than_the_camera_s_is_refused():
         paint(
             blank_painting(14, 20), jnp.zeros((64, 64, 3), jnp.uint8), _belief(_room(), 20), jnp.array([3, 3]), CAMERA
         )
+
+
+def test_a_map_that_outgrows_its_array_keeps_what_was_painted_on_it():
+    """Against a painting that had the larger array from the start, where both have cells."""
+    rng, (top, left) = np.random.default_rng(4), (3, 5)
+    small = _belief(_room(), unknown_from=15)
+    pad = ((top, 2), (left, 4))
+    large = belief_from_numpy(
+        np.pad(np.asarray(small.cells), pad, constant_values=BeliefMap.UNKNOWN), np.pad(np.asarray(small.letters), pad)
+    )
+    found, wanted = blank_painting(*small.cells.shape), blank_painting(*large.cells.shape)
+    for cell in ((3, 3), (10, 12)):
+        panorama = jnp.asarray(rng.integers(0, 256, (CAMERA.height, CAMERA.width, 3), np.uint8))
+        found = paint_jit(found, panorama, small, jnp.array(cell, jnp.int32), camera=CAMERA)
+        there = jnp.array([cell[0] + top, cell[1] + left], jnp.int32)
+        wanted = paint_jit(wanted, panorama, large, there, camera=CAMERA)
+    found = moved_painting(found, large.cells.shape, top, left)
+    had = np.s_[top : top + small.cells.shape[0], left : left + small.cells.shape[1]]
+    for one, other, nothing in zip(
+        jax.tree.leaves(found),
+        jax.tree.leaves(wanted),
+        jax.tree.leaves(blank_painting(*large.cells.shape)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(one[had], other[had])
+        rest = np.ones(large.cells.shape, bool)
+        rest[had] = False
+        np.testing.assert_array_equal(np.asarray(one)[rest], np.asarray(nothing)[rest])
+    assert np.isfinite(np.asarray(found.distance)).sum() > 100

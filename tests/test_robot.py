@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 
 import potlp_jax
 from potlp_jax.errors import RobotError
@@ -15,7 +16,7 @@ from potlp_jax.trials.robot import GrowingRobot, Leg
 from potlp_jax.trials.setbacks import SetbackConfig
 from potlp_jax.view.decisions import describe_decision
 from potlp_jax.view.replay_page import replay_data
-from potlp_jax.world.grid import belief_from_numpy
+from potlp_jax.world.grid import belief_from_numpy, moved_layer
 
 PROPOSITIONS = ("fire", "exit")
 TASK = potlp_jax.Task.from_formula("!fire U exit", PROPOSITIONS)
@@ -199,6 +200,80 @@ def test_a_map_that_grows_changes_no_decision():
         found = trial.planned_on(decision)
         assert int((~found.unknown).sum()) == int((~belief.unknown).sum())
         assert np.array_equal(found.extent, belief.extent)
+
+
+@struct.dataclass
+class Footprints:
+    """Remembers in which cells the camera looked, and takes what is beside one for less likely."""
+
+    memory: jax.Array
+
+    @classmethod
+    def of_shape(cls, shape):
+        return cls(memory=jnp.zeros(shape, bool))
+
+    def encode(self, panorama):
+        return panorama
+
+    def remember(self, seen, belief, cell):
+        return dataclasses.replace(self, memory=self.memory.at[cell[0], cell[1]].set(True))
+
+    def __call__(self, belief, subgoals, task):
+        rows, columns = jnp.nonzero(self.memory, size=64, fill_value=10_000)
+        away = jnp.abs(subgoals.cells[:, 0, None] - rows[None]) + jnp.abs(subgoals.cells[:, 1, None] - columns[None])
+        visits = jnp.sum(away < 8, axis=1, dtype=jnp.int32)
+        shape = (subgoals.mask.shape[0], task.class_mask.shape[0])
+        chance = jnp.broadcast_to(0.8 / (1 + visits.astype(jnp.float32))[:, None], shape)
+        return potlp_jax.Estimates(
+            success_probability=jnp.where(task.class_mask[None, :], chance, 0.0),
+            success_cost=jnp.full(shape, 5.0),
+            failure_cost=jnp.full(shape, 5.0),
+        )
+
+
+@struct.dataclass
+class Carried(Footprints):
+    """Goes along with the map."""
+
+    def moved(self, shape, rows, columns):
+        return dataclasses.replace(self, memory=moved_layer(self.memory, shape, rows, columns, False))
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(0, 0), (2, 3), (-2, 1), (1, -4), (-3, -3), (9, 0), (0, -8), (4, 6)])
+def test_a_layer_moves_cell_by_cell(rows, columns):
+    layer = np.arange(6 * 8 * 2, dtype=np.int32).reshape(6, 8, 2)
+    found = np.asarray(moved_layer(jnp.asarray(layer), (7, 9), rows, columns, -1))
+    assert found.shape == (7, 9, 2)
+    for row, column in np.ndindex(7, 9):
+        before = row - rows, column - columns
+        had = 0 <= before[0] < 6 and 0 <= before[1] < 8
+        assert found[row, column].tolist() == (layer[before].tolist() if had else [-1, -1])
+
+
+def looking(kind):
+    """A rover of a kind whose camera shows nothing in particular."""
+
+    class Looking(kind):
+        def panorama(self):
+            return jnp.zeros((4, 8, 3), jnp.uint8)
+
+    return Looking((5, 1))
+
+
+def test_an_estimator_that_moves_with_the_map_answers_as_if_it_had_never_grown(caplog):
+    def chances(robot, estimator):
+        trial = potlp_jax.run_robot(robot, TASK, "potlp", KEY, estimator=estimator)
+        return [[action.success_probability for action in decision.actions] for decision in trial.decisions]
+
+    wanted = chances(looking(Rover), Footprints.of_shape(FLOOR.shape))
+    # What was seen before the map grew counts: only then is no frontier as likely as one that nobody was near.
+    assert any(max(row) < 0.4 for row in wanted[2:] if row)
+    robot = looking(GrowingRover)
+    assert chances(robot, Carried.of_shape(robot.observe()[0].cells.shape)) == wanted
+    assert "forgets" not in caplog.text
+    robot = looking(GrowingRover)
+    potlp_jax.run_robot(robot, TASK, "potlp", KEY, estimator=Footprints.of_shape(robot.observe()[0].cells.shape))
+    assert "forgets" in caplog.text
 
 
 class Shut(Rover):

@@ -29,18 +29,28 @@ class Way:
     Attributes:
         devices: that a processor counts as, in each process.
         processes: that share the fit.
+        slurm: whether Slurm begins the processes, each on a node of its own, and they find each other by it.
     """
 
     devices: int = 1
     processes: int = 1
+    slurm: bool = False
 
     def __str__(self) -> str:
         devices = f"{self.devices} device{'s' if self.devices > 1 else ''}"
+        if self.slurm:
+            return f"{self.processes} nodes of Slurm, {devices} each"
         return devices if self.processes == 1 else f"{self.processes} processes, {devices} each"
+
+    @property
+    def folder(self) -> str:
+        """A name for its files."""
+        return f"{self.processes}{'-nodes' if self.slurm else ''}-{self.devices}"
 
 
 WAYS = (Way(1), Way(2), Way(4), Way(1, 2))
 HANDED_ON = ((Way(1), Way(4)), (Way(4), Way(1, 2)), (Way(1, 2), Way(1)))
+ON_SLURM = Way(1, 2, slurm=True)
 """A fit that was begun in one way, was killed, and was ended in the other."""
 
 
@@ -57,16 +67,24 @@ def begin(data: Mapping[str, Path], out: Path, way: Way, epochs: int) -> list[su
     """The processes of a fit."""
     words = [str(data["training"]), "--validation", str(data["validation"]), "--out", str(out), "--epochs", str(epochs)]
     words += ["--set", "network.kind=panorama", "--set", "training.views_per_batch=8", "--set", "training.patience=0"]
+    command = [*POTLP, "fit", *words]
     address = f"127.0.0.1:{free_port()}"
+    if way.slurm:
+        nodes, tasks = f"--nodes={way.processes}", f"--ntasks={way.processes}"
+        commands = [["srun", "--quiet", nodes, tasks, "--ntasks-per-node=1", *command]]
+    elif way.processes > 1:
+        commands = [[*command, "--join", f"{address},{index},{way.processes}"] for index in range(way.processes)]
+    else:
+        commands = [command]
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={way.devices}".strip()
     return [
         subprocess.Popen(
-            [*POTLP, "fit", *words, *(["--join", f"{address},{index},{way.processes}"] if way.processes > 1 else [])],
+            command,
             env={**os.environ, "XLA_FLAGS": flags},
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        for index in range(way.processes)
+        for command in commands
     ]
 
 
@@ -94,7 +112,8 @@ def kill_after(data: Mapping[str, Path], out: Path, way: Way, epochs: int, rows:
             raise SystemExit(f"{out}: a fit with {way} ended before it could be killed")
         time.sleep(0.2)
     for process in processes:
-        process.kill()
+        # What Slurm began ends by itself only if its command can say so.
+        process.terminate() if way.slurm else process.kill()
         process.wait()
 
 
@@ -106,15 +125,19 @@ def difference(found: Mapping[str, Sequence[float]], like: Mapping[str, Sequence
 
 
 def same_curves(out: Path, epochs: int) -> list[dict[str, Any]]:
-    """The curve of every way, and of every fit that was handed on, with its difference from that of one device."""
+    """The curve of every way, and of every fit that was handed on, with its difference from that of one device.
+
+    Where ``SLURM_CONF`` names a Slurm, its nodes are one way more.
+    """
     data = collected(out / "data")
+    slurm = "SLURM_CONF" in os.environ
     runs = []
-    for way in WAYS:
-        folder = out / f"fit-{way.processes}-{way.devices}"
+    for way in (*WAYS, ON_SLURM) if slurm else WAYS:
+        folder = out / f"fit-{way.folder}"
         shutil.rmtree(folder, ignore_errors=True)
         runs.append({"run": str(way), "curve": fitted(data, folder, way, epochs)})
-    for first, second in HANDED_ON:
-        folder = out / f"fit-{first.processes}-{first.devices}-then-{second.processes}-{second.devices}"
+    for first, second in (*HANDED_ON, (ON_SLURM, Way(4))) if slurm else HANDED_ON:
+        folder = out / f"fit-{first.folder}-then-{second.folder}"
         shutil.rmtree(folder, ignore_errors=True)
         kill_after(data, folder, first, epochs, epochs // 2)
         runs.append({"run": f"{first}, then {second}", "curve": fitted(data, folder, second, epochs)})

@@ -12,7 +12,7 @@ from potlp_jax.learning.exclusion import exclusive_chances
 from potlp_jax.learning.imagined_paths import Outlook, Scenery, outlook_of_first, prospects, scenery
 from potlp_jax.learning.network import require_propositions
 from potlp_jax.learning.overlays import Overlay, imagined_overlay, painting_overlays
-from potlp_jax.learning.painting import Painting, paint
+from potlp_jax.learning.painting import Painting, moved_painting, paint
 from potlp_jax.learning.squares import SQUARE
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.task.task import TaskArrays
@@ -42,6 +42,10 @@ class BuildingEstimator:
     ) -> "BuildingEstimator":
         """The estimator with one panorama more painted on its map (``learning.painting.paint``)."""
         return dataclasses.replace(self, memory=paint(self.memory, seen, belief, cell, self.config.camera))
+
+    def moved(self, shape: tuple[int, int], rows: int, columns: int) -> "BuildingEstimator":
+        """The estimator for another array of the same map (``learning.observing.MovesWithMap``)."""
+        return dataclasses.replace(self, memory=moved_painting(self.memory, shape, rows, columns))
 
     def imagine(self, belief: BeliefMap) -> EncodedMap:
         """The network's first stage: what it makes of the map, also of squares that were not observed."""

@@ -5,13 +5,15 @@ asked of them later. The number of slots is fixed: a new observation takes the s
 any more.
 """
 
+import dataclasses
+
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
 from potlp_jax.types import NO_SUBGOAL, Status, status_array, status_if
 from potlp_jax.world.frontiers import Subgoals, frontier_cells
-from potlp_jax.world.grid import BeliefMap
+from potlp_jax.world.grid import BeliefMap, moved_layer
 from potlp_jax.world.sensing import SensorConfig, visible
 
 NO_OBSERVATION: int = -1
@@ -97,6 +99,15 @@ def remember(
         observation_of_cell=observation_of_cell,
         count=memory.count + 1,
         status=memory.status | status_if(needed[place], Status.VIEW_OVERFLOW),
+    )
+
+
+def moved_memory(memory: PanoramaMemory, shape: tuple[int, int], rows: int, columns: int) -> PanoramaMemory:
+    """The memory for another array of the same map (``world.grid.moved_layer``): nothing is forgotten within it."""
+    return dataclasses.replace(
+        memory,
+        cells=memory.cells + jnp.array([[rows, columns]], jnp.int32),
+        observation_of_cell=moved_layer(memory.observation_of_cell, shape, rows, columns, NO_OBSERVATION),
     )
 
 

@@ -66,6 +66,20 @@ class LooksOnTheWay(Protocol):
         ...
 
 
+@runtime_checkable
+class MovesWithMap(Protocol):
+    """An estimator that keeps what it remembers where a robot's map outgrows its array; others begin anew there."""
+
+    def moved(self, shape: tuple[int, int], rows: int, columns: int) -> "MovesWithMap":
+        """The same estimator for another array of the same map.
+
+        Args:
+            shape: rows and columns of that array.
+            rows, columns: of it that lie above and to the left of the one before (``world.grid.moved_layer``).
+        """
+        ...
+
+
 def looks_on_the_way(estimator: Any) -> bool:
     """Whether an estimator is shown what the camera sees on the way from one decision to the next."""
     return isinstance(estimator, LooksOnTheWay) and estimator.looks_on_the_way

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float32, Int32, UInt8
 
 from potlp_jax.native import by_platform, target
 from potlp_jax.world.camera import CameraConfig, rows_at_slopes
-from potlp_jax.world.grid import BeliefMap
+from potlp_jax.world.grid import BeliefMap, moved_layer
 from potlp_jax.world.renderer import obstacle_distances
 
 _HALF_DIAGONAL = math.sqrt(0.5)
@@ -50,6 +50,15 @@ def blank_painting(height: int, width: int) -> Painting:
         floor=jnp.zeros((height, width, 3), jnp.uint8),
         beyond=jnp.zeros((height, width, 3), jnp.uint8),
         distance=jnp.full((height, width), jnp.inf, jnp.float32),
+    )
+
+
+def moved_painting(painting: Painting, shape: tuple[int, int], rows: int, columns: int) -> Painting:
+    """The painting for another array of the same map (``world.grid.moved_layer``), blank where that is larger."""
+    return Painting(
+        floor=moved_layer(painting.floor, shape, rows, columns, 0),
+        beyond=moved_layer(painting.beyond, shape, rows, columns, 0),
+        distance=moved_layer(painting.distance, shape, rows, columns, jnp.inf),
     )
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float32, Int32, UInt8
 from potlp_jax.learning.exclusion import exclusive_chances
 from potlp_jax.learning.memory import (
     PanoramaMemory,
+    moved_memory,
     observation_of_subgoals,
     remember,
     slots_of_observations,
@@ -123,6 +124,10 @@ class NetworkEstimator:
     ) -> "NetworkEstimator":
         """The estimator with one panorama more in memory (``learning.memory.remember``)."""
         return dataclasses.replace(self, memory=remember(self.memory, seen, belief, cell))
+
+    def moved(self, shape: tuple[int, int], rows: int, columns: int) -> "NetworkEstimator":
+        """The estimator for another array of the same map (``learning.observing.MovesWithMap``)."""
+        return dataclasses.replace(self, memory=moved_memory(self.memory, shape, rows, columns))
 
 
 def _distances(belief: BeliefMap, poses: Int32[Array, "S 2"], subgoals: Subgoals) -> Float32[Array, " S"]:

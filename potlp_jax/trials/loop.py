@@ -18,6 +18,7 @@ from jaxtyping import Array, Int32, PRNGKeyArray
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import TrainedEstimator, identity_of
 from potlp_jax.learning.observing import (
+    MovesWithMap,
     ObservingEstimator,
     look_step,
     looks_between,
@@ -354,7 +355,10 @@ class _Loop:
         # Visits begin anew, as whenever the map has changed.
         visits = jnp.zeros((*_shape(belief), self._tally.visits.shape[2]), jnp.int8)
         self._tally = dataclasses.replace(self._tally, visits=visits, known=jnp.int32(-1))
-        if isinstance(self._estimator, ObservingEstimator):
+        if isinstance(self._estimator, MovesWithMap):
+            # It is what it was, with another memory.
+            self._estimator = cast(Estimator, self._estimator.moved(_shape(belief), rows, columns))
+        elif isinstance(self._estimator, ObservingEstimator):
             logger.warning("the map has outgrown its array: the estimator forgets what it saw on the former one")
             self._estimator = self._first_estimator(_shape(belief))
         return shifted_cells(cells, rows, columns)

@@ -272,6 +272,30 @@ def pad_world(world: World, height: int, width: int) -> World:
 
 
 @in_32_bits
+def moved_layer(
+    layer: Shaped[Array, "H W *rest"], shape: tuple[int, int], rows: int, columns: int, fill: Any
+) -> Shaped[Array, "height width *rest"]:
+    """A layer of a map on another array, as a robot's map needs that outgrows its own.
+
+    Args:
+        layer: one entry for each cell.
+        shape: rows and columns of the other array.
+        rows, columns: of the other array that lie above the first row and left of the first column of this one;
+            negative where it begins farther in.
+        fill: for cells that this one does not have.
+
+    Returns:
+        The layer; cells outside the other array are gone.
+    """
+    height, width = layer.shape[:2]
+    top, left = max(rows, 0), max(columns, 0)
+    bottom, right = min(height + rows, shape[0]), min(width + columns, shape[1])
+    moved = jnp.full((*shape, *layer.shape[2:]), fill, layer.dtype)
+    if top >= bottom or left >= right:
+        return moved
+    return moved.at[top:bottom, left:right].set(layer[top - rows : bottom - rows, left - columns : right - columns])
+
+
 def belief_from_numpy(
     cells: Num[np.ndarray, "H W"],
     letters: Int[np.ndarray, "H W"],
