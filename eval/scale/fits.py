@@ -148,8 +148,9 @@ def same_curves(out: Path, epochs: int) -> list[dict[str, Any]]:
 
 def draw(runs: Sequence[Mapping[str, Any]], file: Path) -> None:
     """All curves on one plot, and below it how far each is from the first."""
-    figure = new_figure(7.0, 5.6)
+    figure = new_figure(9.0, 5.6)
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    figure.subplots_adjust(right=0.66)
     reference = runs[0]["curve"]
     for number, run in enumerate(runs):
         steps, losses = run["curve"]["step"], run["curve"]["validation_loss"]
@@ -160,7 +161,8 @@ def draw(runs: Sequence[Mapping[str, Any]], file: Path) -> None:
         if number:
             below.semilogy(steps, apart, marker="o", color=above.lines[-1].get_color())
     above.set_ylabel("validation loss")
-    for line in above.legend(fontsize=7).get_lines():
+    # Beside the curves: they coincide, and a legend on one of them would hide all.
+    for line in above.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5)).get_lines():
         line.set_linewidth(2)
     below.set_ylabel(f"relative difference\nfrom {runs[0]['run']}")
     below.set_xlabel("steps")

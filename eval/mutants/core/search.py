@@ -198,4 +198,13 @@ MUTANTS = (
         ("tests/test_uct.py",),
         "tried_once or literal",
     ),
+    Mutant(
+        PART,
+        "every row of a batch has the largest budget",
+        "potlp_jax/planning/search/lockstep.py",
+        "return (count < budgets) & search.is_open(context, tree)",
+        "return (count < jnp.max(budgets)) & search.is_open(context, tree)",
+        ("tests/test_native_search.py",),
+        "a_budget_is",
+    ),
 )

@@ -86,4 +86,22 @@ MUTANTS = (
         ("tests/test_trial.py",),
         "lose_nothing or keep_their_promises",
     ),
+    Mutant(
+        PART,
+        "what the robot saw stays where it was when its map outgrows its array",
+        "potlp_jax/trials/loop.py",
+        "self._estimator.moved(_shape(belief), rows, columns)",
+        "self._estimator.moved(_shape(belief), 0, 0)",
+        ("tests/test_robot.py",),
+        "moves_with_the_map",
+    ),
+    Mutant(
+        PART,
+        "panoramas stay where they were taken when the map outgrows its array",
+        "potlp_jax/learning/memory.py",
+        "cells=memory.cells + jnp.array([[rows, columns]], jnp.int32),",
+        "cells=memory.cells,",
+        ("tests/test_memory.py",),
+        "outgrows",
+    ),
 )
