@@ -13,6 +13,7 @@ from potlp_jax.drive.config import DriveConfig, Mode
 from potlp_jax.drive.inbox import Heard, Inbox, Pose
 from potlp_jax.drive.lattice import Lattice, LatticeConfig
 from potlp_jax.drive.movers import Mover
+from potlp_jax.drive.rejoining import rest_of_path
 from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.places import Places, Region, free_cell_beside
 from potlp_jax.errors import RobotError
@@ -146,7 +147,11 @@ class RemoteRobot:
         """Along a path on the lattice; the cells of the leg are on it, too."""
         before, begun = Knowledge.of(self._belief()), self._clock()
         self._end_noticed = math.inf
-        self._mover.begin([self._metres(cell) for cell in planned[1:]], self.frame_id)
+        self._follow(self._inbox.take_poses())
+        ahead = self._ahead(planned)
+        if not ahead:
+            return Leg(tuple(self._entered))
+        self._mover.begin([self._metres(cell) for cell in ahead], self.frame_id)
         while True:
             self._inbox.wait(POLL)
             heard = self._inbox.heard
@@ -160,6 +165,13 @@ class RemoteRobot:
                 return Leg(leg, ended=not self._is_heard_again(heard), failure=failure)
             if self._is_over(heard, planned, leg, before, stop):
                 return Leg(leg)
+
+    def _ahead(self, planned: list[Cell]) -> list[Cell]:
+        """What of a path on the lattice is left to a robot that drove on while it was decided."""
+        values, (top, left) = self._shown(), self._lattice.origin
+        path, entered = ([self._in_window_now(cell) for cell in part] for part in (planned, self._entered))
+        rest = rest_of_path(path, entered, values == BeliefMap.FREE, self._letters(values))
+        return [(row + top, column + left) for row, column in rest]
 
     def _failure(self, heard: Heard, cells: int, begun: float, moved: bool) -> str:
         """Why a robot that is commanded cannot go on, in words; empty where it can."""
