@@ -9,7 +9,7 @@ import pytest
 
 from eval.live.building import REACH, Building
 from eval.live.perturbation import Network, Perturbation
-from eval.live.recorded import on_true_map, problems_of_drive
+from eval.live.recorded import length_to_and_fro, on_true_map, problems_of_drive
 from eval.live.simulator import FLOOR, PICTURES, Behaviour, SimulatedLink, SteppedInbox
 from potlp_jax.drive.config import DriveConfig, Mode, Topics
 from potlp_jax.drive.driving import drive_robot
@@ -86,3 +86,17 @@ def test_a_drive_is_judged_in_the_true_building():
     assert problems_of_drive(trial, building().world) == []
     damaged = dataclasses.replace(trial, cost=trial.cost + 1, word=(*trial.word[:-1], 0))
     assert len(problems_of_drive(damaged, building().world)) == 2
+
+
+@pytest.mark.parametrize(
+    ("columns", "length"),
+    [
+        ((0, 1, 2, 3), 0),
+        ((0, 1, 2, 1, 2, 3), 3),
+        ((3, 4, 5, 6, 5, 4, 3, 2), 6),
+        ((0, 1, 2, 1, 0, -1), 4),
+        ((0, 1, 0, 1, 0), 4),
+    ],
+)
+def test_what_is_driven_to_and_fro_counts_once(columns, length):
+    assert length_to_and_fro([(0, column) for column in columns]) == length

@@ -18,6 +18,7 @@ import argparse
 import contextlib
 import dataclasses
 import json
+import math
 import shlex
 import subprocess
 import sys
@@ -51,7 +52,7 @@ from potlp_jax.view.maps import draw_side_by_side
 from potlp_jax.view.replay_page import replay_page
 from potlp_jax.view.style import save_figure
 from potlp_jax.world.grid import BeliefMap, World
-from potlp_jax.world.moves import as_cell
+from potlp_jax.world.moves import Cell, as_cell
 
 MAPS = ("uma_rooms", "gdc_3ne")
 POLICIES = (Policy.BASELINE.value, Policy.POTLP.value)
@@ -179,6 +180,17 @@ def problems_of_drive(trial: Trial, world: World) -> list[str]:
     return found
 
 
+def length_to_and_fro(path: Sequence[Cell]) -> float:
+    """How much of a path, in cells, was driven to and fro: up to a cell, and the same way back."""
+    moves: set[int] = set()
+    for turn in range(1, len(path) - 1):
+        reach = 0
+        while reach < min(turn, len(path) - 1 - turn) and path[turn - reach - 1] == path[turn + reach + 1]:
+            reach += 1
+        moves.update(range(turn - reach, turn + reach))
+    return sum(math.dist(path[move], path[move + 1]) for move in moves)
+
+
 def row_of(
     name: str, trial: Trial, seconds: Sequence[float], wall: float, building: Building, task: Task
 ) -> dict[str, Any]:
@@ -193,6 +205,7 @@ def row_of(
         "policy": trial.policy,
         "outcome": str(trial.outcome),
         "cost": trial.cost,
+        "to_and_fro": length_to_and_fro(trial.path) * building.frame.resolution,
         "cost_without_network": simulated(trial.policy),
         "cost_known_map": simulated(Policy.KNOWN_MAP.value),
         "decisions": len(trial.decisions),
