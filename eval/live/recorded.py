@@ -197,17 +197,23 @@ def row_of(
     """Figures of one drive, ``trial`` being on the true map."""
     world = building.world
 
-    def simulated(policy: str) -> float:
-        return run_trial(world, task, policy, jax.random.key(0), trial_config_for(world)).cost
+    def simulated(policy: str) -> Trial:
+        return run_trial(world, task, policy, jax.random.key(0), trial_config_for(world))
+
+    def to_and_fro(one: Trial) -> float:
+        return length_to_and_fro(one.path) * building.frame.resolution
+
+    without_network = simulated(trial.policy)
 
     return {
         "map": name,
         "policy": trial.policy,
         "outcome": str(trial.outcome),
         "cost": trial.cost,
-        "to_and_fro": length_to_and_fro(trial.path) * building.frame.resolution,
-        "cost_without_network": simulated(trial.policy),
-        "cost_known_map": simulated(Policy.KNOWN_MAP.value),
+        "to_and_fro": to_and_fro(trial),
+        "cost_without_network": without_network.cost,
+        "to_and_fro_without_network": to_and_fro(without_network),
+        "cost_known_map": simulated(Policy.KNOWN_MAP.value).cost,
         "decisions": len(trial.decisions),
         "failed_legs": sum(bool(decision.failure) for decision in trial.decisions),
         "corrected_cells": len(trial.corrections),
