@@ -30,7 +30,7 @@ OTHERS = {
     "CSS": {"--faint"},
     "XLA": {"--xla"},
     "dask": {"--nthreads", "--host", "--port", "--no-dashboard", "--no-nanny", "--death-timeout"},
-    "Slurm": {"--noheader", "--format", "--full", "--signal", "--user", "--ntasks"},
+    "Slurm": {"--noheader", "--format", "--full", "--signal", "--user", "--ntasks", "--nodes", "--ntasks-per-node"},
 }
 """Options in our texts that are of others; those of the browser that draws pictures stand in one file of their own."""
 MADE = {

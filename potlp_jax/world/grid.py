@@ -274,7 +274,7 @@ def pad_world(world: World, height: int, width: int) -> World:
 @in_32_bits
 def moved_layer(
     layer: Shaped[Array, "H W *rest"], shape: tuple[int, int], rows: int, columns: int, fill: Any
-) -> Shaped[Array, "height width *rest"]:
+) -> Shaped[Array, "_ _ *rest"]:
     """A layer of a map on another array, as a robot's map needs that outgrows its own.
 
     Args:

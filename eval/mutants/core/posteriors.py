@@ -45,4 +45,13 @@ MUTANTS = (
         _TESTS,
         _AS_OFTEN,
     ),
+    Mutant(
+        PART,
+        "of two who share their rooms neither need be in a room that one of them has lit",
+        _PEOPLE,
+        "jnp.where((left[at] == 1)[:, None, None], theirs[rooms][None], True)",
+        "jnp.bool_(True)",
+        _TESTS,
+        _AS_OFTEN,
+    ),
 )
