@@ -7,7 +7,8 @@
 building is a process of its own, whose largest memory is that of the whole: reading, compiling, deciding. A document
 and a package lie in cells drawn at random, whatever the building calls its places, so that every file that can be read
 is a world (of several levels the first); the baseline and PO-TLP, which asks the estimator for parcels, look for both
-in ``--worlds`` of them. Generated families run tasks and estimators of their own, on validation worlds. Seconds a
+in ``--worlds`` of them. Generated families run tasks and estimators of their own, on validation worlds. A map of 4,000
+x 4,000 pixels is drawn, for want of one that may be had (``eval.large_map``). Seconds a
 decision are those of a whole trial, sensing and driving included, divided by its decisions, in the fastest trial:
 others compile for arrays of subgoals that grow. ``--most`` takes so many buildings of each family, spread evenly over
 their sizes in bytes. The same command goes on where it was stopped.
@@ -19,6 +20,7 @@ import json
 import resource
 import subprocess
 import sys
+import tempfile
 import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,6 +31,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from eval.large_map import write_large_map
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.base import Generator, host_generators
 from potlp_jax.environments.campus.delivery import PARCELS_FAMILY, scaled_to
@@ -51,6 +54,7 @@ from potlp_jax.world.grid import World, make_world
 from potlp_jax.world.settings import Settings
 
 GENERATED = ("firefighting", "delivery", "campus-small", "campus-medium", "campus-large")
+LARGE_MAP = "large-map"
 FILES = {
     "plans in XML": "floorplans/*/*.xml",
     "ROS maps": "maps/*.yaml",
@@ -105,7 +109,7 @@ def run_building(source: str, worlds: int) -> dict[str, Any]:
     """What one building costs; call it in a process of its own."""
     enable_compilation_cache()
     warnings.simplefilter("ignore", PotlpWarning)
-    generator = FoundPlaces(Path(source)) if source not in GENERATED else make(source)
+    generator = _generator(source)
     # Buildings of others have test worlds only; nothing is chosen by these figures.
     split = Split.VALIDATION if source in GENERATED else Split.TEST
     keys = [world_key(split, number, generator.name) for number in range(_FIRST_WORLD, _FIRST_WORLD + worlds)]
@@ -130,6 +134,15 @@ def run_building(source: str, worlds: int) -> dict[str, Any]:
     }
 
 
+def _generator(source: str) -> Generator:
+    if source in GENERATED:
+        return make(source)
+    if source != LARGE_MAP:
+        return FoundPlaces(Path(source))
+    with tempfile.TemporaryDirectory() as folder:
+        return FoundPlaces(write_large_map(Path(folder)))
+
+
 def _estimator_for(source: str) -> str:
     return {"firefighting": "firefighting"}.get(source, "delivery") if source in GENERATED else "parcels"
 
@@ -146,7 +159,7 @@ def _row(trial: Trial, seconds: float) -> dict[str, Any]:
 
 def sources(data: Path | None, most: int | None) -> Iterator[tuple[str, str]]:
     """Families and buildings, files by their path within the data."""
-    yield from (("generated", name) for name in GENERATED)
+    yield from (("generated", name) for name in (*GENERATED, LARGE_MAP))
     if data is None:
         return
     for family, pattern in FILES.items():

@@ -8,6 +8,9 @@ import pytest
 
 from eval import buildings
 from eval.buildings import FoundPlaces, markdown, report, sources
+from eval.large_map import write_large_map
+from potlp_jax.environments.ros.buildings import load_building
+from potlp_jax.environments.ros.cleaning import clean_map
 from potlp_jax.environments.splits import Split, world_key
 from tests.test_buildings import TWO_ROOMS
 
@@ -43,11 +46,22 @@ def test_two_places_lie_where_the_robot_can_go(data):
 
 
 def test_buildings_are_spread_over_their_sizes(data):
-    generated = [("generated", name) for name in buildings.GENERATED]
+    generated = [("generated", name) for name in (*buildings.GENERATED, buildings.LARGE_MAP)]
     assert list(sources(None, None)) == generated
     files = [source for family, source in sources(data, None) if family == "Open-RMF"]
     assert files == [f"buildings/rmf/{index}.building.yaml" for index in (0, 1, 3, 2)]
     assert [source for family, source in sources(data, 2) if family == "Open-RMF"] == [files[0], files[-1]]
+
+
+def test_the_large_map_is_rooms_of_ten_metres_that_doors_join(tmp_path):
+    clean = clean_map(load_building(write_large_map(tmp_path, pixels=1000)))
+    side = 50.0
+    # All but the walls, 0.3 m in every 10, and perhaps a room or two that are shut.
+    share = np.count_nonzero(clean.free) * clean.frame.resolution**2 / side**2
+    assert 0.8 < share < 0.97**2
+    # Walls stand in every row of rooms: no line of cells is free from one side to the other.
+    assert not clean.free.all(axis=1).any()
+    assert not clean.free.all(axis=0).any()
 
 
 def _row(source, family, cells, flags=()):
@@ -93,10 +107,10 @@ def test_the_command_goes_on_where_it_was_stopped(data, monkeypatch, capsys):
     command = ["buildings", "--data", str(data), "--out", str(out), "--report", str(data / "found")]
     monkeypatch.setattr(sys, "argv", [*command, "--most", "1"])
     buildings.main()
-    assert len(asked) == len(buildings.GENERATED) + 1
+    assert len(asked) == len(buildings.GENERATED) + 2
     monkeypatch.setattr(sys, "argv", command)
     buildings.main()
-    assert len(asked) == len(set(asked)) == len(buildings.GENERATED) + 4
+    assert len(asked) == len(set(asked)) == len(buildings.GENERATED) + 5
     families = json.loads((data / "found.json").read_text())["families"]
-    assert [entry["family"] for entry in families] == [*buildings.GENERATED, "Open-RMF"]
+    assert [entry["family"] for entry in families] == [*buildings.GENERATED, buildings.LARGE_MAP, "Open-RMF"]
     assert "| Open-RMF | 4 |" in capsys.readouterr().out
