@@ -174,6 +174,17 @@ EXPERIMENTS: dict[str, Experiment] = {
     "scale-fits": Experiment(
         page="scale", command="python -m eval.scale fits --out {out} --report docs/results/scale/fits"
     ),
+    "collected": Experiment(
+        page="scale",
+        command="potlp collect firefighting --split training --worlds 10000 --out {out} --processes {processes} "
+        "--set first_world=60000 --set spacing=[0,8] --set posterior=16 --set look_every=1 --set staying_sets=3 "
+        "--set pursued=1 --set worlds_per_shard=50 --set views_per_world=4 --set driver=explorer",
+    ),
+    "scale-reading": Experiment(
+        page="scale",
+        command="python -m eval.scale reading --data {all}/collected --validation {all}/means --out {out} "
+        "--report docs/results/scale/reading",
+    ),
     "mutants": Experiment(page="mutants", command="python -m eval.mutants --report docs/results/mutants"),
     # Those that measure times come last: nothing else of this list runs beside them.
     "decision": Experiment(

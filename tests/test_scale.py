@@ -8,6 +8,8 @@ import pytest
 from eval.scale.disturbed import Kept, require_same, rows_of
 from eval.scale.fits import Way, curve, difference, draw
 from eval.scale.overhead import efficiency, row, store_of
+from eval.scale.reading import one_in
+from potlp_jax.learning.dataset import finished_shards, samples_file, views_file, worlds_file
 from potlp_jax.sweep.runner import RESULTS
 from potlp_jax.sweep.store import Store
 
@@ -68,3 +70,17 @@ def test_curves_of_fits_are_read_compared_and_drawn(tmp_path):
     draw([{"run": str(Way(1)), "curve": found}, {"run": str(Way(1, 2)), "curve": other}], tmp_path / "curves.png")
     assert (tmp_path / "curves.png").stat().st_size > 1000
     assert [str(way) for way in (Way(1), Way(4), Way(1, 2))] == ["1 device", "4 devices", "2 processes, 1 device each"]
+
+
+def test_a_part_of_a_data_set_has_one_shard_in_so_many(tmp_path):
+    for shard in (0, 1, 2, 3, 7):
+        for named in (worlds_file, views_file, samples_file):
+            named(tmp_path / "whole", shard).parent.mkdir(exist_ok=True)
+            named(tmp_path / "whole", shard).write_text(str(shard))
+    # A shard that was not finished is in no part.
+    worlds_file(tmp_path / "whole", 8).write_text("8")
+    for _ in range(2):
+        part = one_in(tmp_path / "whole", 2, tmp_path / "part")
+        assert finished_shards(part) == {0, 2, 7}
+        assert len(list(part.iterdir())) == 9
+        assert views_file(part, 7).read_text() == "7"
