@@ -8,10 +8,10 @@ building is a process of its own, whose largest memory is that of the whole: rea
 and a package lie in cells drawn at random, whatever the building calls its places, so that every file that can be read
 is a world (of several levels the first); the baseline and PO-TLP, which asks the estimator for parcels, look for both
 in ``--worlds`` of them. Generated families run tasks and estimators of their own, on validation worlds. A map of 4,000
-x 4,000 pixels is drawn, for want of one that may be had (``eval.large_map``). Seconds a
-decision are those of a whole trial, sensing and driving included, divided by its decisions, in the fastest trial:
-others compile for arrays of subgoals that grow. ``--most`` takes so many buildings of each family, spread evenly over
-their sizes in bytes. The same command goes on where it was stopped.
+x 4,000 pixels is drawn, for want of one that may be had (``eval.large_map``); on it both places are within 30 m of the
+start. Seconds a decision are those of a whole trial, sensing and driving included, divided by its decisions, in the
+fastest trial: others compile for arrays of subgoals that grow. ``--most`` takes so many buildings of each family,
+spread evenly over their sizes in bytes. The same command goes on where it was stopped.
 """
 
 import argparse
@@ -70,26 +70,35 @@ LOSSES = Status.SUBGOAL_OVERFLOW | Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW 
 _FIRST_WORLD = 500
 # Metres around a place on which it is met.
 _REACH = 0.5
+# Metres from the start to the places on the large map, all of which would take a robot kilometres to see.
+_NEAR = 30.0
 
 
 class FoundPlaces(Generator):
-    """One building of others with two places to find, in cells drawn at random."""
+    """One building of others with two places to find, in cells drawn at random.
+
+    Args:
+        file: that says what the building is.
+        within: metres from the start within which the places are.
+    """
 
     propositions = PARCELS.propositions
     tasks = PARCELS.tasks
     family = PARCELS_FAMILY
 
-    def __init__(self, file: Path) -> None:
+    def __init__(self, file: Path, within: float = np.inf) -> None:
         clean = clean_map(load_building(file, _first_level(file)))
         self.name = f"found:{file.stem}"
-        self._free, self._resolution = clean.free, clean.frame.resolution
+        self._free, self._resolution, self._within = clean.free, clean.frame.resolution, within
         self.settings = Settings({**NARROW_DOORS, **scaled_to(self._resolution)})
 
     def draw(self, key: PRNGKeyArray) -> World:
         """Start and places, anywhere."""
         (rng,) = host_generators(key, 1)
         free = np.argwhere(self._free)
-        start, *places = (free[index] for index in rng.choice(len(free), 3, replace=False))
+        start = free[rng.choice(len(free))]
+        near = free[np.hypot(*(free - start).T) * self._resolution <= self._within]
+        places = near[rng.choice(len(near), 2, replace=False)]
         letters, reach = np.zeros(self._free.shape, np.int32), max(1, round(_REACH / self._resolution))
         for bit, (row, column) in enumerate(places):
             letters[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1] |= 1 << bit
@@ -140,7 +149,7 @@ def _generator(source: str) -> Generator:
     if source != LARGE_MAP:
         return FoundPlaces(Path(source))
     with tempfile.TemporaryDirectory() as folder:
-        return FoundPlaces(write_large_map(Path(folder)))
+        return FoundPlaces(write_large_map(Path(folder)), within=_NEAR)
 
 
 def _estimator_for(source: str) -> str:

@@ -36,6 +36,12 @@ def test_two_places_lie_where_the_robot_can_go(data):
         assert world.family == "parcels"
         assert world.settings["decision"]["frontiers"]["min_size"] == 1
     assert len({tuple(world.start.tolist()) for world in worlds}) > 1
+    near = FoundPlaces(data / "buildings" / "rmf" / "0.building.yaml", within=1.5).generate(
+        world_key(Split.TEST, 0, generator.name)
+    )
+    # A place's middle is 1.5 m away at most, and half a metre around it belongs to it.
+    apart = (np.argwhere(np.asarray(near.letters)) - np.asarray(near.start)) * float(near.resolution)
+    assert np.hypot(*apart.T).max() <= 1.5 + np.hypot(0.5, 0.5)
     # Of two levels the first.
     two = data / "two.building.yaml"
     level = TWO_ROOMS.replace("DOOR", "hinged").partition("levels:")[2]
