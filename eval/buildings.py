@@ -93,7 +93,7 @@ class FoundPlaces(Generator):
         self.settings = Settings({**NARROW_DOORS, **scaled_to(self._resolution)})
 
     def draw(self, key: PRNGKeyArray) -> World:
-        """Start and places, anywhere."""
+        """Start anywhere, places within the given distance of it."""
         (rng,) = host_generators(key, 1)
         free = np.argwhere(self._free)
         start = free[rng.choice(len(free))]

@@ -376,6 +376,6 @@ def test_a_shard_may_have_no_views(tmp_path):
 def test_a_full_temporary_folder_is_named(tmp_path, monkeypatch):
     _write(tmp_path, [0])
     # Writes to it fail as those to a full disk do.
-    monkeypatch.setattr(tempfile, "TemporaryFile", lambda: Path("/dev/full").open("wb", buffering=0))  # noqa: SIM115
+    monkeypatch.setattr(tempfile, "TemporaryFile", lambda: Path("/dev/full").open("wb", buffering=0))  # noqa: SIM115 - its user closes it
     with pytest.raises(DatasetError, match=r"cannot be kept in .* \(No space left on device\): .*TMPDIR"):
         read_dataset(tmp_path)

@@ -138,9 +138,9 @@ def test_agrees_with_sampled_search():
 
 @pytest.fixture(scope="module")
 def rare_successes():
-    """96 problems in which attempts mostly fail, so that the guess at what follows matters."""
+    """256 problems in which attempts mostly fail, so that the guess at what follows matters."""
     made = []
-    for i in range(96):
+    for i in range(256):
         task = task_of(FORMULAS[i % len(FORMULAS)])
         fields = random_fields(task, SUBGOALS, 1000 + i, finish_chance=0.1)
         chances = np.random.default_rng(i).choice([0.0, 0.05, 0.1, 0.2, 0.5], fields["success_probability"].shape)
@@ -166,7 +166,7 @@ def assert_ended_searches_are_exact(plans, solutions):
 
 def test_an_ended_search_is_exact(rare_successes, rare_solutions):
     plans = plan_many(rare_successes, keys(len(rare_successes)), BestFirstConfig(simulations=400))
-    assert assert_ended_searches_are_exact(plans, rare_solutions) > 40
+    assert assert_ended_searches_are_exact(plans, rare_solutions) > 100
 
 
 @pytest.mark.parametrize("family", ["rare", "shared"])
@@ -323,7 +323,7 @@ def test_the_optimism_gap_says_what_its_description_says(rare_successes, rare_so
     gap, value, optimum = np.asarray(plans.optimism_gap), np.asarray(plans.value), [x.value for x in solutions]
     chooses = np.asarray(plans.action) != NO_ACTION
     closed = chooses & (gap == 0)
-    assert closed.sum() > 40
+    assert closed.sum() > 100
     for i in np.flatnonzero(closed):
         assert value[i] >= solutions[i].q_values[int(plans.action[i])] * (1 - 1e-5)
     # Values that are too low, by more than the gap: what it measures lies on the other side.

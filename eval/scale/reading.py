@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,34 +21,35 @@ def memory_by_size(
     Args:
         data: what is learned from; as large as may be.
         validation: of the fit.
-        out: folder for the parts, which are links, and for what is fitted.
+        out: folder in which the parts, which are links, and what is fitted lie for the time of it.
         parts: each takes one shard in so many.
 
     Returns:
         Of each part, its size and the largest memory of the process that was fitted to it.
     """
     found = []
-    for part in parts:
-        folder = one_in(data, part, out / f"one-in-{part}")
-        samples = read_dataset(folder)
-        row = {
-            "worlds": len(samples.worlds),
-            "views": len(samples.images),
-            "samples": len(samples.view_of),
-            "gigabytes": sum(file.stat().st_size for file in folder.glob("*.parquet")) / 1e9,
-        }
-        found.append(row | _fit(folder, validation, out / f"fit-{part}"))
+    out.mkdir(parents=True, exist_ok=True)
+    # A folder that is new: a fit would go on from what an earlier run left, and be measured by its rest.
+    with tempfile.TemporaryDirectory(dir=out) as folder:
+        for part in parts:
+            here = one_in(data, part, Path(folder) / f"one-in-{part}")
+            samples = read_dataset(here)
+            row = {
+                "worlds": len(samples.worlds),
+                "views": len(samples.images),
+                "samples": len(samples.view_of),
+                "gigabytes": sum(file.stat().st_size for file in here.glob("*.parquet")) / 1e9,
+            }
+            found.append(row | _fit(here, validation, Path(folder) / f"fit-{part}"))
     return found
 
 
 def one_in(data: Path, part: int, folder: Path) -> Path:
-    """One shard in so many of a data set, as links in a folder; returns the folder."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """One shard in so many of a data set, as links in a new folder; returns the folder."""
+    folder.mkdir()
     for shard in sorted(finished_shards(data))[::part]:
         for named in (worlds_file, views_file, samples_file):
-            link = named(folder, shard)
-            if not link.exists():
-                link.symlink_to(named(data, shard).resolve())
+            named(folder, shard).symlink_to(named(data, shard).resolve())
     return folder
 
 
