@@ -20,8 +20,9 @@ def tree(tmp_path):
     (tmp_path / "sums.py").write_text("def add(a, b):\n    return a + b  # a sum\n")
     (tmp_path / "tests").mkdir()
     (tmp_path / "tests" / "test_sums.py").write_text(
-        "from sums import add\n\n\ndef test_sum():\n    assert add(1, 1) == 2\n\n\n"
-        "def test_nothing_much():\n    assert add(0, 0) == 0\n"
+        "import pytest\n\nfrom sums import add\n\n\ndef test_sum():\n    assert add(1, 1) == 2\n\n\n"
+        "def test_nothing_much():\n    assert add(0, 0) == 0\n\n\n"
+        "def test_that_skips():\n    pytest.skip('nothing to add')\n"
     )
     return tmp_path
 
@@ -51,6 +52,7 @@ def test_verdicts(tree):
     assert (found["verdict"], found["by"]) == ("caught", "test_sums.py::test_sum")
     assert judge(dataclasses.replace(SUM, only="nothing_much"), tree)["verdict"] == "survived"
     assert judge(dataclasses.replace(SUM, only="no_such_test"), tree)["verdict"] == "not tested"
+    assert judge(dataclasses.replace(SUM, only="that_skips"), tree)["verdict"] == "not tested"
     # The fault is taken back.
     assert (tree / "sums.py").read_text() == sound
 

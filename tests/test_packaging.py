@@ -3,8 +3,11 @@
 import fnmatch
 import re
 import subprocess
+import sys
 import tomllib
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
@@ -37,3 +40,51 @@ def test_supported_versions_of_python_are_named():
     assert named[0] == lowest
     assert PROJECT["tool"]["ruff"]["target-version"] == f"py{lowest.replace('.', '')}"
     assert PROJECT["tool"]["pyright"]["pythonVersion"] == lowest
+
+
+EXTRAS = ("export", "logs", "drive", "train", "gym", "cluster")
+
+IMPORT_WITHOUT = """
+import importlib, pkgutil, sys
+
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in sys.argv[2].split():
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Absent())
+for prefix in sys.argv[1].split():
+    package = importlib.import_module(prefix)
+    for module in pkgutil.walk_packages(getattr(package, "__path__", []), prefix + "."):
+        importlib.import_module(module.name)
+"""
+
+
+def _modules_of(extra: str) -> set[str]:
+    """What can be imported because of an extra: names of its distributions as Python writes them."""
+    names = (re.split(r"[<>=!;\[ ]", line)[0] for line in PROJECT["project"]["optional-dependencies"][extra])
+    return {name.replace("-", "_") for name in names}
+
+
+# What each extra is for, and what needs none. Data sets from logs (logs.collecting) need two extras, and are left out.
+@pytest.mark.parametrize(
+    ("extra", "packages"),
+    [
+        (None, "potlp_jax.cli potlp_jax.planning potlp_jax.trials potlp_jax.sweep potlp_jax.verify potlp_jax.bench"),
+        ("export", "potlp_jax.export"),
+        ("logs", "potlp_jax.logs.drive potlp_jax.logs.inspection potlp_jax.logs.replaying potlp_jax.logs.writing"),
+        ("drive", "potlp_jax.drive"),
+        ("train", "potlp_jax.learning potlp_jax.recipes"),
+        ("gym", "potlp_jax.rl"),
+        ("cluster", "potlp_jax.engine"),
+    ],
+)
+def test_each_part_needs_its_own_extra_alone(extra, packages):
+    absent = set().union(*(_modules_of(other) for other in EXTRAS if other != extra))
+    command = [sys.executable, "-c", IMPORT_WITHOUT, packages, " ".join(sorted(absent))]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_every_extra_for_users_is_looked_at():
+    assert {*EXTRAS, "dev", "docs", "bench"} == set(PROJECT["project"]["optional-dependencies"])

@@ -221,9 +221,10 @@ class Footprints:
     def __call__(self, belief, subgoals, task):
         rows, columns = jnp.nonzero(self.memory, size=64, fill_value=10_000)
         away = jnp.abs(subgoals.cells[:, 0, None] - rows[None]) + jnp.abs(subgoals.cells[:, 1, None] - columns[None])
-        visits = jnp.sum(away < 8, axis=1, dtype=jnp.int32)
+        # By how near they are, so that a memory that is off by a cell answers otherwise.
+        visits = jnp.sum(jnp.maximum(8 - away, 0), axis=1, dtype=jnp.int32)
         shape = (subgoals.mask.shape[0], task.class_mask.shape[0])
-        chance = jnp.broadcast_to(0.8 / (1 + visits.astype(jnp.float32))[:, None], shape)
+        chance = jnp.broadcast_to(0.8 / (1 + visits.astype(jnp.float32) / 4)[:, None], shape)
         return potlp_jax.Estimates(
             success_probability=jnp.where(task.class_mask[None, :], chance, 0.0),
             success_cost=jnp.full(shape, 5.0),

@@ -49,8 +49,8 @@ def stale(mutant: Mutant, root: Path = ROOT) -> str | None:
     return f"{mutant.says}: there is no {missing[0]}" if missing else None
 
 
-def run_tests(folder: Path, mutant: Mutant) -> tuple[int, str]:
-    """Exit code of a mutant's tests in a copy of the tree, and the first one that failed, or the time limit."""
+def run_tests(folder: Path, mutant: Mutant) -> tuple[str, str]:
+    """The verdict of a mutant's tests in a copy of the tree, and the first one that failed, or the time limit."""
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *mutant.tests]
     command += ["-k", mutant.only] if mutant.only else []
     # The copy is what is imported, whatever is installed.
@@ -65,9 +65,12 @@ def run_tests(folder: Path, mutant: Mutant) -> tuple[int, str]:
         command, cwd=folder, env=environment, preexec_fn=_limit, capture_output=True, text=True, check=False
     )
     if done.returncode == -signal.SIGXCPU:
-        return done.returncode, "the time limit"
+        return "caught", "the time limit"
+    if done.returncode in (0, 5):
+        # Where no test was selected, or each one skipped itself, nothing has looked at the mutant.
+        return "survived" if re.search(r"\b\d+ passed\b", done.stdout) else "not tested", ""
     failed = re.search(r"^(?:FAILED|ERROR) tests/(.+?)(?: - .*)?$", done.stdout, re.M)
-    return done.returncode, failed[1] if failed else ""
+    return "caught", failed[1] if failed else ""
 
 
 def _limit() -> None:
@@ -81,11 +84,9 @@ def judge(mutant: Mutant, folder: Path) -> dict[str, Any]:
     sound = file.read_text()
     try:
         file.write_text(sound.replace(mutant.old, mutant.new))
-        code, failed = run_tests(folder, mutant)
+        verdict, failed = run_tests(folder, mutant)
     finally:
         file.write_text(sound)
-    # 5: no test was selected, which is no survivor but a mutant that nothing has looked at.
-    verdict = {0: "survived", 5: "not tested"}.get(code, "caught")
     return {"verdict": verdict, "by": failed, "seconds": round(time.monotonic() - begun, 1)}
 
 

@@ -16,8 +16,8 @@ from potlp_jax.drive.movers import Mover
 from potlp_jax.drive.rejoining import rest_of_path
 from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.places import Places, Region, free_cell_beside
+from potlp_jax.environments.ros.poses import FARTHEST_SNAP, shortest
 from potlp_jax.errors import RobotError
-from potlp_jax.logs.poses import FARTHEST_SNAP, shortest
 from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.trials.robot import Leg
 from potlp_jax.trials.rules import Knowledge, Stop

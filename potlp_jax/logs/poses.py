@@ -1,21 +1,17 @@
 """Where a robot was, by its log, and the cells that it entered."""
 
-import heapq
-import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 from scipy import ndimage
 
 from potlp_jax.environments.ros.places import component_labels
+from potlp_jax.environments.ros.poses import FARTHEST_SNAP, shortest
 from potlp_jax.errors import LogError
 from potlp_jax.logs.log import SECOND, Log
 from potlp_jax.logs.working_grid import WorkingGrid
-from potlp_jax.world.moves import Cell, legal_moves
-
-FARTHEST_SNAP = 2.0
-"""Cells, beyond the robot's radius, from the nearest free cell at which a pose still counts as being in it."""
+from potlp_jax.world.moves import Cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,23 +119,3 @@ def drive_path(
         path += between
         entered += [number] * len(between)
     return path, np.array(entered)
-
-
-def shortest(free: Bool[np.ndarray, "H W"], start: Cell, goal: Cell) -> list[Cell]:
-    """Cells of a shortest path, the start left out. Raises KeyError where the ends are not in one component."""
-    # A* with the straight distance, which never exceeds the length of a path.
-    best, came_from = {start: 0.0}, {}
-    queue = [(0.0, start)]
-    while queue:
-        _, cell = heapq.heappop(queue)
-        if cell == goal:
-            break
-        for there, length in legal_moves(free, cell):
-            cost = best[cell] + length
-            if cost < best.get(there, math.inf):
-                best[there], came_from[there] = cost, cell
-                heapq.heappush(queue, (cost + math.dist(there, goal), there))
-    path = [goal]
-    while path[-1] != start:
-        path.append(came_from[path[-1]])
-    return path[-2::-1]

@@ -204,7 +204,7 @@ MUTANTS = (
         "potlp_jax/planning/search/lockstep.py",
         "return (count < budgets) & search.is_open(context, tree)",
         "return (count < jnp.max(budgets)) & search.is_open(context, tree)",
-        ("tests/test_native_search.py",),
-        "a_budget_is",
+        ("tests/test_search.py",),
+        "a_search_is_its_verbs",
     ),
 )
