@@ -12,7 +12,7 @@ from potlp_jax.drive.inbox import Inbox
 from potlp_jax.drive.movers import Adviser
 from potlp_jax.drive.rejoining import rest_of_path
 from potlp_jax.drive.robot import RemoteRobot
-from potlp_jax.logs.poses import shortest
+from potlp_jax.environments.ros.poses import shortest
 from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.trials.rules import Stop
 from potlp_jax.world.moves import legal_moves, path_length

@@ -20,7 +20,7 @@ from eval.live.perturbation import Network
 from potlp_jax.drive.inbox import Inbox
 from potlp_jax.drive.messages import Message, make_pose, pose_of
 from potlp_jax.environments.ros.grid_frame import GridFrame
-from potlp_jax.logs.poses import shortest
+from potlp_jax.environments.ros.poses import shortest
 from potlp_jax.world.moves import Cell
 
 STEP = 0.1
