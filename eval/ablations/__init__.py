@@ -1,0 +1,1 @@
+"""What each part of the fire-fighting estimator is good for: networks without it, in answers and in trials."""

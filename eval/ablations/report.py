@@ -1,0 +1,246 @@
+"""The page, its data and its picture."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from eval.ablations.running import POLICIES, SECONDS
+from eval.ablations.variants import FAMILY, VARIANTS
+from eval.gains import Costs, gain
+from eval.provenance import lines_of
+from eval.savings import audit, compare_first, policy_row, read_rows
+from potlp_jax.codec import finite_or_null
+from potlp_jax.environments.registry import make
+from potlp_jax.environments.splits import Split
+from potlp_jax.planning.policies import Policy
+from potlp_jax.recipes.fitting import ESTIMATOR
+from potlp_jax.sweep.rows import provenance
+from potlp_jax.sweep.runner import RESULTS
+from potlp_jax.sweep.store import Row
+from potlp_jax.view.style import new_figure, save_figure
+
+SHIPPED: str = "shipped"
+WHOLE: str = next(iter(VARIANTS))
+TIMES: tuple[str, ...] = ("one-epoch", WHOLE, "nine-epochs")
+"""Variants that differ in time alone."""
+
+
+def results_of(out: Path, views: Sequence[str]) -> dict[str, Any]:
+    """Figures of all variants that are finished.
+
+    Args:
+        out: the folder of ``eval.ablations.running.run``.
+        views: names of the data sets that were evaluated on.
+
+    Returns:
+        For each variant ``says``, ``seconds`` of its fit, ``answers`` by data set, and ``tasks``: the comparison, and
+        points of the share beside the whole network.
+    """
+    # Another process may be at the next one.
+    names = [name for name in (*VARIANTS, SHIPPED) if (out / "trials" / name / RESULTS).is_file()]
+    rows = {name: read_rows(out / "trials" / name) for name in names}
+    everything = [row for found in rows.values() for row in found]
+    return {
+        "provenance": provenance(),
+        "commits": sorted({row.commit for row in everything}),
+        "split": Split.VALIDATION.value,
+        "worlds": sorted({row.item.world for row in everything}),
+        "audited": len(everything),
+        "problems": audit(everything, make(FAMILY), Split.VALIDATION),
+        "variants": {name: _variant(out, name, rows, views) for name in names},
+    }
+
+
+def _variant(out: Path, name: str, rows: Mapping[str, Sequence[Row]], views: Sequence[str]) -> dict[str, Any]:
+    seconds = out / "fits" / name / SECONDS
+    return {
+        "says": VARIANTS[name].says if name in VARIANTS else "the shipped file, for comparison",
+        "epochs": VARIANTS[name].epochs if name in VARIANTS else None,
+        "seconds": json.loads(seconds.read_text()) if seconds.is_file() else None,
+        "bytes": (out / "fits" / name / ESTIMATOR).stat().st_size if name in VARIANTS else None,
+        "answers": {of: found for of in views if (found := _answers(out / "answers" / name / of)) is not None},
+        "tasks": {
+            number: {
+                **compare_first(rows[name], task, POLICIES, len(rows[name]), lambda world: world),
+                "beside": None if name == WHOLE else finite_or_null(_beside(rows[WHOLE], rows[name], task)),
+            }
+            for number, task in make(FAMILY).tasks.items()
+        },
+    }
+
+
+def _answers(folder: Path) -> dict[str, Any] | None:
+    file = folder / "evaluation.json"
+    if not file.is_file():
+        return None
+    overall = json.loads(file.read_text())["figures"]["intact"]["overall"]
+    costs = {name: overall[name]["r2"] for name in ("success_cost", "failure_cost")}
+    return {name: overall[name] for name in ("samples", "brier", "skill", "auc", "calibration_error")} | costs
+
+
+def _beside(whole: Sequence[Row], other: Sequence[Row], task: str) -> list[float]:
+    """Points of the share by which a variant is better than the whole network, with the 95 % interval."""
+    return [100 * value for value in gain(_costs(whole, task), _costs(other, task), task)]
+
+
+def _costs(rows: Sequence[Row], task: str) -> Costs:
+    found: Costs = {}
+    for row in rows:
+        if row.item.task == task:
+            found.setdefault((task, row.item.world), {})[row.item.policy] = row.cost
+    return {key: costs for key, costs in found.items() if len(costs) == len(POLICIES)}
+
+
+def write_report(out: Path, views: Sequence[str], report: Path) -> None:
+    """NAME.json, NAME.png and NAME.md."""
+    found = results_of(out, views)
+    report.parent.mkdir(parents=True, exist_ok=True)
+    report.with_suffix(".json").write_text(json.dumps(found, indent=1) + "\n")
+    draw_times(found, report.with_suffix(".png"))
+    report.with_suffix(".md").write_text(lines_of(page(found, views, report.name), report.parent))
+
+
+PAGE: str = """# What each part of the estimator is good for
+
+**Question.** What do answers and trials lose without the map, without what the camera painted on it, and without drives
+of the policy's own, and what does more time bring?
+
+**Answer.** {answer}
+
+```sh
+python -m eval.ablations --out out/ablations --views {views} --report docs/results/ablations
+```
+
+All but the last line are fitted to the same number of views: 1,200 buildings of the explorer, and 400 drives of PO-TLP
+with a first network. The [shipped estimator](estimator.md#how-it-was-made) had many more. Three epochs where nothing
+else is said; the network of one panorama has the settings of its own recipe.
+
+## In trials
+
+Shares of the attainable savings in the validation worlds {first} to {last}, those among them in which a task is
+possible, with 95 % intervals. {audited:,} trials were audited: {problems} problems.
+
+{shares}
+<!-- made: {data} -->
+
+Points of the share beside the whole network, paired by world:
+
+{points}
+<!-- made: {data} -->
+
+![Share of the attainable savings over minutes of fitting]({picture})
+
+## In answers
+
+[What the figures mean](../estimator.md#what-evaluate-writes). The network of one panorama is asked about the subgoals in
+its view alone, which are fewer and nearer.
+
+{answers}
+<!-- made: {data} -->
+"""
+"""The page of results."""
+
+
+def page(found: Mapping[str, Any], views: Sequence[str], name: str) -> str:
+    """The page about what ``results_of`` gave; ``name``: of the files beside it."""
+    return PAGE.format(
+        answer=_answer(found),
+        views=" ".join(f"{of}=out/{of}" for of in views),
+        first=found["worlds"][0],
+        last=found["worlds"][-1],
+        audited=found["audited"],
+        problems=len(found["problems"]),
+        shares="".join(f"{line}\n" for line in _shares(found)),
+        points="".join(f"{line}\n" for line in _gains(found)),
+        answers="".join(f"{line}\n" for line in _answers_table(found, views)),
+        data=f"{name}.json",
+        picture=f"{name}.png",
+    )
+
+
+def _shares(found: Mapping[str, Any]) -> Iterator[str]:
+    tasks = _tasks(found)
+    yield "| network | minutes of fitting | " + " | ".join(f"task {task}" for task in tasks) + " | mean |"
+    yield "|---|---|" + "---|" * (len(tasks) + 1)
+    for variant, entry in found["variants"].items():
+        cells = [_share(entry["tasks"][task]) for task in tasks]
+        minutes = "" if entry["seconds"] is None else f"{entry['seconds'] / 60:.1f}"
+        yield f"| **{variant}**: {entry['says']} | {minutes} | {' | '.join(cells)} | {100 * mean_share(entry):.1f} % |"
+
+
+def _gains(found: Mapping[str, Any]) -> Iterator[str]:
+    tasks = _tasks(found)
+    yield "| network | " + " | ".join(f"task {task}" for task in tasks) + " |"
+    yield "|---|" + "---|" * len(tasks)
+    for variant, entry in found["variants"].items():
+        if variant != WHOLE:
+            yield f"| {variant} | " + " | ".join(_points(entry["tasks"][task]["beside"]) for task in tasks) + " |"
+
+
+def _answers_table(found: Mapping[str, Any], views: Sequence[str]) -> Iterator[str]:
+    yield "| network | views of | questions | skill | AUC | calibration error | R² of R_S | R² of R_F |"
+    yield "|---|---|---|---|---|---|---|---|"
+    for variant, entry in found["variants"].items():
+        for of in views:
+            if of in entry["answers"]:
+                yield f"| {variant} | {of} | {_answer_cells(entry['answers'][of])} |"
+
+
+def _tasks(found: Mapping[str, Any]) -> list[str]:
+    return list(found["variants"][WHOLE]["tasks"])
+
+
+def _answer(found: Mapping[str, Any]) -> str:
+    means = {name: 100 * mean_share(entry) for name, entry in found["variants"].items()}
+    others = [f"{name} {mean:.0f} %" for name, mean in means.items() if name != WHOLE]
+    return (
+        f"The mean over the tasks of the share of attainable savings is {means[WHOLE]:.0f} % with the whole network; "
+        f"{', '.join(others)}."
+    )
+
+
+def mean_share(entry: Mapping[str, Any]) -> float:
+    """The mean over the tasks of a variant's share; 1 is all of the attainable savings."""
+    rows = [_potlp(task).attainable_share for task in entry["tasks"].values()]
+    return sum(rows) / len(rows)
+
+
+def _potlp(task: Mapping[str, Any]) -> Any:
+    return next(policy_row(row) for row in task["satisfied"]["rows"] if row["policy"] == Policy.POTLP)
+
+
+def _share(task: Mapping[str, Any]) -> str:
+    row = _potlp(task)
+    return f"{100 * row.attainable_share:.1f} % ({100 * row.attainable_low:.0f} to {100 * row.attainable_high:.0f})"
+
+
+def _points(beside: Sequence[float]) -> str:
+    value, low, high = beside
+    return f"{value:+.1f} ({low:+.0f} to {high:+.0f})"
+
+
+def _answer_cells(found: Mapping[str, float]) -> str:
+    return (
+        f"{found['samples']:,} | {found['skill']:.3f} | {found['auc']:.3f} | {found['calibration_error']:.3f} | "
+        f"{found['success_cost']:.2f} | {found['failure_cost']:.2f}"
+    )
+
+
+def draw_times(found: Mapping[str, Any], file: Path) -> None:
+    """Shares over minutes of fitting, a line for each task."""
+    known = [found["variants"][name] for name in TIMES if name in found["variants"]]
+    figure = new_figure(6.0, 3.4)
+    axes = figure.add_subplot()
+    for number in known[0]["tasks"] if known else ():
+        rows = [_potlp(entry["tasks"][number]) for entry in known]
+        axes.plot(
+            [entry["seconds"] / 60 for entry in known],
+            [100 * row.attainable_share for row in rows],
+            marker="o",
+            label=f"task {number}",
+        )
+    axes.set_xlabel("minutes of fitting")
+    axes.set_ylabel("share of the attainable savings, %")
+    axes.legend(frameon=False)
+    save_figure(figure, file)
