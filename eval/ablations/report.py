@@ -133,8 +133,8 @@ Points of the share beside the whole network, paired by world:
 
 ## In answers
 
-[What the figures mean](../estimator.md#what-evaluate-writes). The network of one panorama is asked about the subgoals in
-its view alone, which are fewer and nearer.
+[What the figures mean](../estimator.md#what-evaluate-writes). The network of one panorama is asked about the subgoals
+in its view alone, which are fewer and nearer.
 
 {answers}
 <!-- made: {data} -->
