@@ -74,6 +74,8 @@ def main() -> None:
     chosen = known if options.arms is None else options.arms
     if not set(chosen) <= set(known):
         parser.error(f"{generator.name}: an ideal observer needs a family that says what its worlds can be")
+    if options.report is not None and Arm.POTLP not in chosen:
+        parser.error("a report compares with potlp: name it among the arms, or use eval.limit.beside")
     file, arms = options.out / ROWS, [arm for arm in Arm if arm in (*chosen, *REFERENCES)]
     if not options.as_it_is:
         run(file, experiment, arms, options.worlds)
