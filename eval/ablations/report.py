@@ -22,7 +22,7 @@ from potlp_jax.view.style import new_figure, save_figure
 
 SHIPPED: str = "shipped"
 WHOLE: str = next(iter(VARIANTS))
-TIMES: tuple[str, ...] = ("one-epoch", WHOLE, "nine-epochs")
+TIMES: tuple[str, ...] = ("one-epoch", WHOLE, "six-epochs")
 """Variants that differ in time alone."""
 
 
@@ -113,7 +113,7 @@ python -m eval.ablations --out out/ablations --views {views} --report docs/resul
 ```
 
 All but the last line are fitted to the same number of views: 1,200 buildings of the explorer, and 400 drives of PO-TLP
-with a first network. The [shipped estimator](estimator.md#how-it-was-made) had many more. Three epochs where nothing
+with a first network. The [shipped estimator](estimator.md#how-it-was-made) had many more. Two epochs where nothing
 else is said; the network of one panorama has the settings of its own recipe.
 
 ## In trials

@@ -39,7 +39,7 @@ class Variant:
     says: str
     data: tuple[str, ...] = ("explored", "driven")
     network: tuple[str, ...]
-    epochs: int = 3
+    epochs: int = 2
 
 
 # As in the recipe of the shipped estimator, with another number of views.
@@ -93,8 +93,8 @@ VARIANTS: dict[str, Variant] = {
     "no-contrast": Variant(
         says="no comparison of colours across the building", network=(*_BUILDING, "network.contrast=0")
     ),
-    "one-epoch": Variant(says="a third of the time", network=_WHOLE, epochs=1),
-    "nine-epochs": Variant(says="three times the time", network=_WHOLE, epochs=9),
+    "one-epoch": Variant(says="half of the time", network=_WHOLE, epochs=1),
+    "six-epochs": Variant(says="three times the time", network=_WHOLE, epochs=6),
 }
 """What is fitted, by name; all differences are to the first."""
 
