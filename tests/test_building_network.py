@@ -9,17 +9,12 @@ import numpy as np
 import pytest
 
 from potlp_jax.errors import NetworkError, PropositionsError
+from potlp_jax.learning.building_config import BuildingConfig
 from potlp_jax.learning.building_estimator import BuildingEstimator
-from potlp_jax.learning.building_network import (
-    BuildingConfig,
-    BuildingNetwork,
-    building_operations,
-    channel_count,
-    compared,
-    map_channels,
-)
+from potlp_jax.learning.building_network import BuildingNetwork, building_operations, compared
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.imagined_paths import PROSPECTS, outlook, prospects, scenery
+from potlp_jax.learning.map_channels import channel_count, map_channels
 from potlp_jax.learning.observing import ObservingEstimator, looks_on_the_way, observe_panorama
 from potlp_jax.learning.painting import blank_painting
 from potlp_jax.learning.serialization import load_estimator, save_estimator

@@ -17,8 +17,9 @@ from potlp_jax.cli import app
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.errors import EstimatorError
+from potlp_jax.learning.building_config import BuildingConfig
 from potlp_jax.learning.building_estimator import BuildingEstimator
-from potlp_jax.learning.building_network import BuildingConfig, BuildingNetwork
+from potlp_jax.learning.building_network import BuildingNetwork
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.overlays import (
     Imagined,

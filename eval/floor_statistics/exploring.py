@@ -15,7 +15,8 @@ from eval.floor_statistics.sources import generator_of
 from potlp_jax.environments.base import host_generators
 from potlp_jax.environments.campus.furnishing import PEOPLE, Floor, FurnishConfig, Kind, furnish
 from potlp_jax.environments.splits import Split, world_key
-from potlp_jax.learning.building_network import BuildingConfig, building_operations
+from potlp_jax.learning.building_config import BuildingConfig
+from potlp_jax.learning.building_network import building_operations
 from potlp_jax.learning.painting import blank_painting, paint
 from potlp_jax.planning.situation import assess
 from potlp_jax.trials.config import TrialConfig, trial_config_for

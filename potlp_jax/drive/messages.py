@@ -184,7 +184,15 @@ def text_of(message: Message) -> str:
 
 
 def make_pose(x: float, y: float, yaw: float) -> dict[str, Any]:
-    """A ``geometry_msgs/Pose``."""
+    """A ``geometry_msgs/Pose`` on the ground.
+
+    Args:
+        x, y: metres in the frame that the message is published with.
+        yaw: radians, counter-clockwise from the x axis.
+
+    Returns:
+        JSON-able values: the position, with a height of 0, and the orientation as a quaternion.
+    """
     qx, qy, qz, qw = quaternion_of(yaw)
     return {"position": {"x": x, "y": y, "z": 0.0}, "orientation": {"x": qx, "y": qy, "z": qz, "w": qw}}
 

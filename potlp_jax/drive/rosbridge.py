@@ -52,17 +52,38 @@ class RosbridgeLink:
         return bool(self._ros.is_connected)
 
     def subscribe(self, topic: str, kind: str, callback: Callable[[Message], None]) -> None:
-        """Call back with each message of a topic."""
+        """Call back with each message of a topic, and go on when a lost connection is back.
+
+        Args:
+            topic, kind: name and type. A topic has one subscription: a second one is ignored.
+            callback: is called from the thread of roslibpy, which hears nothing until it returns.
+        """
         self._topic(topic, kind).subscribe(callback)
 
     def publish(self, topic: str, kind: str, message: dict[str, Any]) -> None:
-        """Publish a message; the last one is kept for those that subscribe later."""
+        """Publish a message, or drop it while the connection is lost.
+
+        Args:
+            topic, kind: name and type.
+            message: JSON-able values. The topic is latched: rosbridge keeps the last one for those that subscribe
+                later.
+        """
         # While the connection is lost roslibpy would keep what is published, and send old advice later.
         if self.is_connected:
             self._topic(topic, kind).publish(self._library.Message(message))
 
     def send_goal(self, action: str, kind: str, goal: dict[str, Any], done: Callable[[bool, str], None]) -> str:
-        """Send an action's goal; ``done`` is told once whether it was reached, and in words how it ended."""
+        """Send an action's goal; while the connection is lost roslibpy keeps it, and sends it when it is back.
+
+        Args:
+            action, kind: name and type. An action of this name keeps the type that it was first used with.
+            goal: the message, JSON-able values.
+            done: told whether ROS calls the goal succeeded, and in words how it ended; from the thread of roslibpy,
+                and never where the connection is lost before the result has come.
+
+        Returns:
+            The id that rosbridge knows the goal by, for ``cancel``.
+        """
         client = self._actions.setdefault(action, self._library.ActionClient(self._ros, action, kind))
 
         def ended(result: Message) -> None:

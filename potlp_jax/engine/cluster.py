@@ -100,7 +100,23 @@ class DaskEngine:
     def run(
         self, work: Callable[[Shared, Unit], Iterable[Result]], shared: Shared, units: Iterable[Unit]
     ) -> Iterator[tuple[Unit, list[Result] | Broken]]:
-        """Each unit's results when it is done, in whatever order."""
+        """Do ``work(shared, unit)`` for every unit, on the workers of the cluster.
+
+        Args:
+            work: a function of a module that workers can import; pure, because a unit whose worker or scheduler is lost
+                begins again. It is given up when ``MOST_KILLED`` workers have died of it.
+            shared: picklable; goes to each worker once, also to those that join later.
+            units: picklable; asked for one by one, so that each worker has one in hand and one to go on with.
+
+        Yields:
+            Each unit with all of its results, in the order in which units are done; one without results comes with an
+            empty list. Units that are suspected of killing workers come last, done alone; those that are given up with
+            ``Broken``.
+
+        Raises:
+            Exception: whatever ``work`` raised; what has not ended by then is cancelled.
+            EngineError: a scheduler that was lost has not come back within five minutes.
+        """
         running = _Running(self, work, shared)
         suspects: list[Unit] = []
         try:
@@ -143,7 +159,18 @@ class DaskEngine:
                 return
 
     def prepare(self, name: str, shared: Any, deaths: int) -> None:
-        """Tell workers, also those that come later, what units share, and the scheduler when a unit is given up."""
+        """Tell workers, also those that come later, what units share, and the scheduler when a unit is given up.
+
+        Args:
+            name: under which workers find what is shared; another one for every run, because others may use the same
+                scheduler.
+            shared: what ``work`` is given beside each unit; picklable.
+            deaths: how many workers may die of a unit: at the last of these it is given up. A setting of the scheduler,
+                for everybody who uses it.
+
+        Raises:
+            OSError, TimeoutError, FutureCancelledError: the scheduler does not answer (``LOST``).
+        """
         self.client.run_on_scheduler(_give_up_after, deaths)
         self.client.register_plugin(_Prepared(name, self._cores, shared))
 

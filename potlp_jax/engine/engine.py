@@ -45,7 +45,8 @@ class Engine(Protocol):
 
         Returns:
             Units with some of their results, as they come: one that gives them one by one may come several times, in
-            the order of its results, and one that has none never. A unit that was given up comes with ``Broken``.
+            the order of its results, and one that has none comes with an empty list or not at all. A unit that was
+            given up comes with ``Broken``.
 
         Raises:
             Exception: whatever ``work`` raised.
@@ -66,7 +67,19 @@ class Here:
     def run(
         self, work: Callable[[Shared, Unit], Iterable[Result]], shared: Shared, units: Iterable[Unit]
     ) -> Iterator[tuple[Unit, list[Result] | Broken]]:
-        """Each result as soon as there is one."""
+        """Do ``work(shared, unit)`` for every unit, in their order.
+
+        Args:
+            work: any function; an iterator's results are passed on as soon as they are there.
+            shared: the very object that ``work`` is given each time.
+            units: asked for one by one, each when the one before is done.
+
+        Yields:
+            The unit with one result at a time; a unit without results never comes, and none is ever ``Broken``.
+
+        Raises:
+            Exception: whatever ``work`` raised; units after that one are not begun.
+        """
         for unit in units:
             for result in work(shared, unit):
                 yield unit, [result]

@@ -62,7 +62,18 @@ class Firefighting(Generator):
         return self.generate_with_layout(key)[0]
 
     def posterior(self, key: PRNGKeyArray, noise: PRNGKeyArray, count: int) -> FirefightingPosterior:
-        """What the building of this key can be, to a robot that knows in which room it is."""
+        """What the building of this key can be, to a robot that knows in which room it is.
+
+        Args:
+            key: of the world, as of ``generate``: the room of the robot is known from the start; the rest of the
+                building is read as it comes in sight.
+            noise: another key; decides which buildings are drawn.
+            count: how many buildings are drawn at a time.
+
+        Returns:
+            The posterior before the first panorama: the generator's own probabilities of hallways, alarm and fire, and
+            all places of extinguisher and exit in the far room alike.
+        """
         return firefighting_posterior(self.config, self._layout(key), noise, count)
 
     def generate_with_layout(self, key: PRNGKeyArray) -> tuple[World, FirefightingLayout]:

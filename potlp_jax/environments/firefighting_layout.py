@@ -229,7 +229,18 @@ def building_of(config: FirefightingConfig, layout: FirefightingLayout) -> Build
 
 
 def room_cells(config: FirefightingConfig, room: Room, margin: int) -> Int32[np.ndarray, "cells 2"]:
-    """The cells of a room that are at least ``margin`` cells away from its sides."""
+    """The cells of a room at a distance from its walls.
+
+    Args:
+        config: sizes.
+        room: which one.
+        margin: cells of the room, at least, between a cell and the walls around it; 0 for all cells. The middle of a
+            patch keeps ``patch_radius``, so that the patch lies inside of the room.
+
+    Returns:
+        Row and column of each on the grid, whose outermost cells are walls, in row-major order; none where the margin
+        leaves none.
+    """
     first, last = room_columns(config, room)
     rows = np.arange(1 + margin, 1 + config.room_height - margin)
     columns = np.arange(first + margin, last - margin)

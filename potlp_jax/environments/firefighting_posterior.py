@@ -199,7 +199,16 @@ def firefighting_posterior(
 
 
 def draw_noise(key: PRNGKeyArray, count: int, shape: tuple[int, int]) -> Noise:
-    """Noise for so many buildings of a shape."""
+    """What buildings are drawn with: exponential variables, of which the first to arrive is the cell of a patch.
+
+    Args:
+        key: of the noise; it is split, and not to be used again.
+        count: N, the number of buildings.
+        shape: rows and columns of a building.
+
+    Returns:
+        Independent variables of mean 1, one for each building and cell, for the extinguisher and for the exit.
+    """
     one, other = jax.random.split(key)
     return Noise(
         extinguisher=jax.random.exponential(one, (count, *shape), jnp.float32),
@@ -208,7 +217,19 @@ def draw_noise(key: PRNGKeyArray, count: int, shape: tuple[int, int]) -> Noise:
 
 
 def posterior(prior: Prior, belief: BeliefMap, evidence: Evidence) -> Float32[Array, " K"]:
-    """The probability of each combination of the prior; zeros where none agrees with what was seen."""
+    """The probability of each combination of dead end, mouth and fire, given what was seen.
+
+    Observation is perfect, so that a combination which contradicts a cell drops out, and the others keep their
+    proportions. What was seen of extinguisher and exit is not looked at: it says nothing of the hallways.
+
+    Args:
+        prior: of the robot's room.
+        belief: the map, of the building's shape; walls, fire and alarm are compared where a cell was observed.
+        evidence: what the camera showed; tiles and smoke are compared where a cell was in sight.
+
+    Returns:
+        Probabilities that add up to 1; all 0 where no combination agrees.
+    """
     weight = jnp.where(_agrees(prior, belief, evidence), prior.probability, 0.0)
     total = jnp.sum(weight)
     return weight / jnp.where(total > 0.0, total, 1.0)

@@ -5,8 +5,9 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
+from potlp_jax.learning.building_config import BuildingConfig
 from potlp_jax.learning.building_estimator import BuildingEstimator
-from potlp_jax.learning.building_network import BuildingConfig, BuildingNetwork, building_operations
+from potlp_jax.learning.building_network import BuildingNetwork, building_operations
 from potlp_jax.learning.memory import empty_memory
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig, Params, operation_counts
 from potlp_jax.learning.observing import ObservingEstimator

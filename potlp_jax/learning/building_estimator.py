@@ -7,9 +7,11 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int8, Int32, UInt8
 
-from potlp_jax.learning.building_network import BuildingConfig, BuildingNetwork, EncodedMap, Params, map_channels
+from potlp_jax.learning.building_config import BuildingConfig
+from potlp_jax.learning.building_network import BuildingNetwork, EncodedMap, Params
 from potlp_jax.learning.exclusion import exclusive_chances
 from potlp_jax.learning.imagined_paths import Outlook, Scenery, outlook_of_first, prospects, scenery
+from potlp_jax.learning.map_channels import map_channels
 from potlp_jax.learning.network import require_propositions
 from potlp_jax.learning.overlays import Overlay, imagined_overlay, painting_overlays
 from potlp_jax.learning.painting import Painting, moved_painting, paint

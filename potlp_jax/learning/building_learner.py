@@ -13,10 +13,12 @@ from jaxtyping import Array, Bool, Float32, Int8, Int32, PRNGKeyArray, UInt8
 from potlp_jax.codec import KIND
 from potlp_jax.learning.augmentation import Augmentation, draw_gains, draw_mirrors
 from potlp_jax.learning.batches import Choice
-from potlp_jax.learning.building_network import BuildingConfig, BuildingNetwork, Params, map_channels
+from potlp_jax.learning.building_config import BuildingConfig
+from potlp_jax.learning.building_network import BuildingNetwork, Params
 from potlp_jax.learning.data_figures import camera_geometry, cost_scales, image_shape
 from potlp_jax.learning.dataset import Samples
 from potlp_jax.learning.imagined_paths import Outlook, outlook_of_first, prospects, scenery
+from potlp_jax.learning.map_channels import map_channels
 from potlp_jax.learning.map_images import DecodedView, decode_view
 from potlp_jax.learning.network import Answers
 from potlp_jax.learning.painting import Painting

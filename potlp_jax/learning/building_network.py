@@ -1,8 +1,8 @@
 """The building network: P_S, R_S and R_F from all that the robot has seen, the map and what is painted on it.
 
-The belief and the painting (``learning.painting``) are one picture of the building from above. A U-Net encodes it once
-a decision, for all frontiers and all classes (the first stage). Colours are compared across the building first: each
-building has its own shade of all of them, and thin smoke in one hallway shows beside the others. What a subgoal is
+The belief and the painting are one picture of the building from above (``learning.map_channels``). A U-Net encodes it
+once a decision, for all frontiers and all classes (the first stage). Colours are compared across the building first:
+each building has its own shade of all of them, and thin smoke in one hallway shows beside the others. What a subgoal is
 asked about is read off around its cell at every scale, together with one vector of the whole building; a small head per
 (subgoal, class) answers, its units scaled and shifted by phi (the second stage).
 
@@ -23,7 +23,6 @@ References:
 
 import dataclasses
 import itertools
-import math
 from typing import Any
 
 import flax.linen as nn
@@ -31,23 +30,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float32, Int8, Int32, PRNGKeyArray
+from jaxtyping import Array, Float32, Int8, Int32, PRNGKeyArray
 
-from potlp_jax.errors import NetworkError
+from potlp_jax.learning.building_config import BuildingConfig
 from potlp_jax.learning.imagined_paths import PROSPECTS
+from potlp_jax.learning.map_channels import PAINTED, channel_count, of_painting
 from potlp_jax.learning.network import Answers, require_phi
-from potlp_jax.learning.painting import Painting
 from potlp_jax.learning.squares import SQUARE, Squares, numbers_per_square, split
-from potlp_jax.world.camera import CameraConfig
-from potlp_jax.world.frontiers import frontier_cells
-from potlp_jax.world.grid import BeliefMap
 
 Params = Any
 """Parameters of the network: nested dictionaries of float32 arrays."""
-
-ABLATABLE: tuple[str, ...] = ("painting", "paths", "position")
-"""What a network can be made without: the colours on its map, the paths through what it imagines, and where in the
-array a subgoal lies, which says something only where all buildings lie alike."""
 
 # The logit of P_S, and R_S and R_F before they are made positive.
 _OUTPUTS = 3
@@ -57,84 +49,8 @@ _MODULATED = 3
 _SLOPE = 0.1
 # Cells to each side of a subgoal, in features of the first scale and of the others, that its head reads.
 _CLOSE, _NEAR = 2, 1
-# Cells over which the weight of what was seen from afar falls by a factor of e; not tuned.
-_PAINT_REACH = 20.0
-# The channel of ``map_channels`` that says whether a cell was painted.
-_PAINTED = 4
 # A coordinate of 100 cells enters the head as 1.
 _COORDINATE = 100.0
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class BuildingConfig:
-    """Everything that, with the parameters, defines the answers; it is stored in every estimator's file.
-
-    Attributes:
-        propositions: Sigma: the meaning of the entries of both phi, in order.
-        image_shape: rows and columns of the panorama.
-        horizon, far, fold: of the camera (``CameraConfig``), for where on the map a pixel looks.
-        widths: channels of the encoder, one number a scale: squares of 2, 4, 8, ... cells.
-        blocks: residual blocks of each scale.
-        decoder: channels at least, on the way back to squares of ``SQUARE`` cells.
-        head: units of each layer of the head; condition: of the layer that reads phi.
-        contrast: channels in which squares are compared with others of their kind in the building; 0 for none.
-        success_cost_scale, failure_cost_scale: unit of the outputs R_S and R_F, and of their errors in the loss
-            (standard deviations over the training data).
-        step: the least R_S, one step of the grid, in the unit of cost.
-        exclusive_within: as in ``NetworkConfig``.
-        without: of ``ABLATABLE``, what the network is not shown; for measuring what each is good for, and for
-            buildings of all sizes, among which a position says nothing.
-    """
-
-    propositions: tuple[str, ...]
-    image_shape: tuple[int, int] = (CameraConfig.height, CameraConfig.width)
-    horizon: float = CameraConfig.horizon
-    far: float = CameraConfig.far
-    fold: float = CameraConfig.fold
-    widths: tuple[int, ...] = (32, 48, 64, 96, 128)
-    blocks: tuple[int, ...] = (0, 0, 1, 2, 3)
-    decoder: int = 48
-    head: int = 128
-    condition: int = 64
-    contrast: int = 24
-    success_cost_scale: float = 30.0
-    failure_cost_scale: float = 30.0
-    step: float = 1.0
-    exclusive_within: float = 0.0
-    without: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        if not self.propositions:
-            raise NetworkError("propositions is empty; name at least one")
-        # Squares of SQUARE cells are the second scale, and the decoder begins below them.
-        if len(self.widths) < 3 or min(self.widths) < 1:
-            raise NetworkError(f"widths is {self.widths}; give three positive numbers or more")
-        if len(self.blocks) != len(self.widths) or min(self.blocks) < 0:
-            raise NetworkError(f"blocks is {self.blocks}; give a number for each of the {len(self.widths)} widths")
-        for name in ("decoder", "head", "condition"):
-            if getattr(self, name) < 1:
-                raise NetworkError(f"{name} is {getattr(self, name)}; give a positive number")
-        if self.contrast < 0:
-            raise NetworkError(f"contrast is {self.contrast}; give a number of channels, 0 for none")
-        for name in ("success_cost_scale", "failure_cost_scale", "step", "far", "fold"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise NetworkError(f"{name} is {getattr(self, name)}; give a positive number")
-        if not (math.isfinite(self.exclusive_within) and self.exclusive_within >= 0):
-            raise NetworkError(f"exclusive_within is {self.exclusive_within}; give a number of cells, 0 for none")
-        unknown = [name for name in self.without if name not in ABLATABLE]
-        if unknown:
-            raise NetworkError(f"without has {', '.join(unknown)}; known: {', '.join(ABLATABLE)}")
-
-    @property
-    def camera(self) -> CameraConfig:
-        """The geometry of the camera that the network was trained with."""
-        rows, columns = self.image_shape
-        return CameraConfig(height=rows, width=columns, horizon=self.horizon, far=self.far, fold=self.fold)
-
-    @property
-    def side(self) -> int:
-        """Cells of a square of the coarsest scale, to whose multiples maps are padded."""
-        return 2 ** len(self.widths)
 
 
 @struct.dataclass(kw_only=True)
@@ -154,30 +70,6 @@ class EncodedMap:
     squares: Squares
 
 
-def map_channels(belief: BeliefMap, painting: Painting) -> Float32[Array, "H W K"]:
-    """The picture of the building that the first stage reads; see the code for the order of its channels."""
-    letters = jnp.stack([(belief.letters >> bit) & 1 for bit in range(len(belief.propositions))], axis=-1)
-    painted = jnp.isfinite(painting.distance)
-    flags = (belief.free, belief.occupied, belief.unknown, frontier_cells(belief, belief.free), painted)
-    colours = jnp.concatenate([painting.floor, painting.beyond], axis=-1).astype(jnp.float32)
-    # Pixels in [0, 1] enter as (pixel - 0.5) / 0.25; where nothing was painted, 0.
-    colours = jnp.where(painted[:, :, None], (colours / 255 - 0.5) * 4, 0.0)
-    near = jnp.where(painted, jnp.exp(-painting.distance / _PAINT_REACH), 0.0)
-    parts = (jnp.stack(flags, axis=-1), letters, near[:, :, None], colours)
-    return jnp.concatenate([part.astype(jnp.float32) for part in parts], axis=-1)
-
-
-def channel_count(config: BuildingConfig) -> int:
-    """Channels of ``map_channels``: five flags, one for each proposition, the nearness and two colours."""
-    return 5 + len(config.propositions) + 1 + 6
-
-
-def _of_painting(channels: int) -> Bool[np.ndarray, " K"]:
-    """Which of the channels of ``map_channels`` hold what was painted: a flag, the nearness and the colours."""
-    index = np.arange(channels)
-    return (index == _PAINTED) | (index >= channels - 7)
-
-
 def _dense(width: int, gain: float) -> nn.Dense:
     return nn.Dense(width, kernel_init=nn.initializers.variance_scaling(gain, "fan_in", "normal"))
 
@@ -188,7 +80,7 @@ def _convolution(width: int, gain: float) -> nn.Conv:
 
 def _painted_share(channels: Array) -> Array:
     """Of each square of two by two, the share that was painted, ``[..., rows, columns, 1]``."""
-    return jnp.mean(_halved(channels[..., _PAINTED, None]), axis=-1, keepdims=True)
+    return jnp.mean(_halved(channels[..., PAINTED, None]), axis=-1, keepdims=True)
 
 
 def _activated(x: Array) -> Array:
@@ -336,7 +228,7 @@ class _Network(nn.Module):
 
     def encode(self, channels: Array) -> EncodedMap:
         if "painting" in self.config.without:
-            channels = jnp.where(_of_painting(channels.shape[-1]), 0.0, channels)
+            channels = jnp.where(of_painting(channels.shape[-1]), 0.0, channels)
         rows, columns = channels.shape[-3:-1]
         batch = ((0, 0),) * (channels.ndim - 3)
         side = self.config.side
@@ -393,7 +285,7 @@ class BuildingNetwork:
         return initial(key, channels, *asked)["params"]
 
     def encode(self, params: Params, channels: Float32[Array, "*B H W K"]) -> EncodedMap:
-        """The first stage, of ``map_channels``."""
+        """The first stage, of ``map_channels.map_channels``."""
         return self._apply(params, "encode", channels)
 
     def places(self, params: Params, encoded: EncodedMap, cells: Int32[Array, "*B S 2"]) -> Float32[Array, "*B S U"]:

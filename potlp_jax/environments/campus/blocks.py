@@ -221,10 +221,18 @@ class BlockBuilder:
         return self.chance(block.height**2 / (block.height**2 + block.width**2))
 
     def cut(self, block: Box, turned: bool, *, first: bool = False) -> bool:
-        """Run a hallway from the first to the last row of the block (column if ``turned``), divide what is left.
+        """Run a hallway through a block, from its first row to its last, and divide what lies on both sides of it.
 
-        Returns False, and does nothing, where the block is too narrow, or the hallway would meet no other. The first
-        hallway need not.
+        Width and place are drawn; of a few places the one counts that leaves rows of rooms the best depths.
+
+        Args:
+            block: its outermost cells are its walls.
+            turned: whether the hallway runs from the first column to the last instead.
+            first: whether it is the first one of a building, which need not meet another.
+
+        Returns:
+            Whether it was possible. Nothing is built where the block is too narrow for a room on each side, or the
+            hallway would meet no other in any of these places.
         """
         width = int(self.rng.integers(self.style.hallway_width[0], self.style.hallway_width[1] + 1))
         box = block.turned if turned else block
@@ -257,9 +265,17 @@ class BlockBuilder:
         return before, after
 
     def carve_hallway(self, hallway: Box, turned: bool, *, severable: bool = True) -> None:
-        """Open the hallway up to the hallways that it meets; it may stop short, or be closed in its middle.
+        """Open a hallway up to the hallways that it meets; it may stop short, or be closed in its middle.
 
-        One that is ``severable`` joins hallways that are connected without it.
+        One that meets another at one end only, 24 cells long or more, stops short by the style's chance ``dead_end``,
+        with a room behind its end.
+
+        Args:
+            hallway: its cells, from its first row to its last; rows and columns change places if ``turned``. Its first
+                and last row become part of it where it meets another hallway there, and stay wall otherwise.
+            turned: whether it runs from the left of the floor to its right, not from top to bottom.
+            severable: whether the hallways that it joins are connected without it. Then one that meets others at both
+                ends, 40 cells long or more, is closed by a room in its middle by the style's chance ``severed``.
         """
         rooms, meets = self.rooms.T if turned else self.rooms, self.meets(hallway, turned)
         top, bottom = hallway.top + (not meets[0]), hallway.bottom - (not meets[1])
@@ -328,7 +344,17 @@ class BlockBuilder:
                     rooms[line, columns[rooms[beyond, columns] == HALLWAYS]] = HALLWAYS
 
     def fill_row(self, row: Box, turned: bool, front_first: bool) -> None:
-        """Rooms side by side along the columns of ``row``, which has no walls of its own; turned back if ``turned``."""
+        """Rooms side by side along the columns of a row, with a wall one cell thick between them.
+
+        What the row is for is drawn first (``draw_mix``), then kind and width of each room. The last room takes what
+        would be too narrow for another.
+
+        Args:
+            row: the cells of the rooms, without the walls around them; rows and columns change places if ``turned``.
+            turned: whether the row runs from the top of the floor to its bottom, not from left to right.
+            front_first: whether the hallway is before the first row of ``row``, not after its last: of two rooms one
+                behind the other the front one lies there.
+        """
         mix = self.draw_mix(row.height)
         left = row.left
         while left < row.right:
@@ -410,7 +436,17 @@ class BlockBuilder:
             yield Wall(wall_rows, wall_columns, beyond)
 
     def open_door(self, walls: list[Wall], number: int, target: int) -> bool:
-        """A door from a room to another, anywhere along their common walls; False where they have none."""
+        """Open a door from a room to another, anywhere along their common walls.
+
+        Args:
+            walls: those of the room (``walls_of``).
+            number: of the room; the door's cells belong to it from then on, and its ``door_width`` is taken.
+            target: number of the room beyond, ``HALLWAYS`` for a hallway.
+
+        Returns:
+            Whether there is one. There is none where no stretch of the walls, as long as the door is wide, has the
+            other room behind it; cells of doors are no wall any more.
+        """
         width = self.door_width(number)
         places = []
         for wall in walls:

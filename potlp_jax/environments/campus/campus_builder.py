@@ -119,7 +119,19 @@ class CampusBuilder(BlockBuilder):
         self._furniture: list[tuple[Box, Furniture]] = []
 
     def build(self, outline: Outline, wings: tuple[Wing, ...], resolution: float) -> CampusFloor:
-        """The floor of these wings, mirrored at random."""
+        """Draw the floor of these wings, once: what is built stays in the builder.
+
+        Args:
+            outline: what the wings are an outline of; the floor says so, and nothing else depends on it.
+            wings: inside of the builder's array, in the order of ``draw_wings``: a hallway runs on to the hallways of
+                wings before its own.
+            resolution: side of a cell in metres.
+
+        Returns:
+            The floor, mirrored at random along both axes. Rooms that could get no door are solid, unlike those that
+            are meant to have none (``Floor.closed``). Where there is no office, laboratory or classroom, a room of a
+            kind of which there are several has become one.
+        """
         ground = np.zeros(self.rooms.shape, bool)
         for wing in wings:
             ground[wing.box.cells] = True

@@ -65,7 +65,21 @@ class FloorGenerator(Generator):
         return self.signed(world), floor, placement
 
     def posterior(self, key: PRNGKeyArray, noise: PRNGKeyArray, count: int) -> PeoplePosterior:
-        """Who may be where on the floor of a key, the floor being known; see ``Generator.posterior``."""
+        """Who may be where on the floor of a key, the floor being known; see ``Generator.posterior``.
+
+        Args:
+            key: of the world, as of ``generate``: its floor is known from the start; in which rooms there is light is
+                read as these come in sight.
+            noise: another key; decides which places of people are drawn.
+            count: how many floors are drawn at a time.
+
+        Returns:
+            The posterior before the first panorama: people are in any room of their kinds, all equally likely.
+
+        Raises:
+            WorldError: no world can be made (``generate_with_layout``), or the errand's people share rooms in another
+                way than ``people_posterior`` can draw.
+        """
         _, floor, placement = self.generate_with_layout(key)
         reach = self._furnishing.person_radius
         return people_posterior(floor, self.errand, reach, placement.rooms, self._shape, noise, count)

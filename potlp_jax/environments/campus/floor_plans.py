@@ -156,7 +156,18 @@ class FloorPlans(Generator):
         return self.signed(world), floor, placement
 
     def posterior(self, key: PRNGKeyArray, noise: PRNGKeyArray, count: int) -> PeoplePosterior:
-        """Who may be where on the plan of a key, the plan being known; see ``Generator.posterior``."""
+        """Who may be where on the plan of a key, the plan being known; see ``Generator.posterior``.
+
+        Args:
+            key: of the world, as of ``generate``: its building is known from the start; in which rooms there is light
+                is read as these come in sight.
+            noise: another key; decides which places of people are drawn.
+            count: how many floors are drawn at a time.
+
+        Returns:
+            The posterior before the first panorama, on arrays into which every plan fits: people are in any room of
+            their kinds, all equally likely. A person for whom the plan has no room is nowhere.
+        """
         _, plan, placement = self.generate_with_layout(key)
         reach = self.config.furnishing.person_radius
         return people_posterior(plan.floor, PEOPLE, reach, placement.rooms, self._shape, noise, count)

@@ -78,11 +78,28 @@ class Site:
         return self.draw_depth(most), False
 
     def row(self, top: int, bottom: int, left: int = 0, right: int | None = None, *, deep: bool = False) -> Wing:
-        """A wing along the rows."""
+        """A wing that runs from left to right, its hallway along the rows.
+
+        Args:
+            top, bottom: its first row and the one after its last, outer walls included.
+            left, right: its first column and the one after its last; by default it is as wide as the site.
+            deep: whether it has two hallways around a core, which takes ``LEAST_DEEP`` rows or more.
+
+        Returns:
+            The wing; nothing is drawn from ``rng``.
+        """
         return Wing(Box(top, bottom, left, self.width if right is None else right), deep=deep)
 
     def column(self, left: int, right: int, top: int, bottom: int | None = None) -> Wing:
-        """A wing from top to bottom."""
+        """A wing that runs from top to bottom, with one hallway along the columns.
+
+        Args:
+            left, right: its first column and the one after its last, outer walls included.
+            top, bottom: its first row and the one after its last; by default it ends where the site does.
+
+        Returns:
+            The wing; nothing is drawn from ``rng``.
+        """
         return Wing(Box(top, self.height if bottom is None else bottom, left, right), turned=True)
 
 
