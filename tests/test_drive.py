@@ -4,6 +4,7 @@ import base64
 import dataclasses
 import json
 import math
+import time
 
 import cv2
 import jax
@@ -432,3 +433,18 @@ def test_a_drive_over_a_real_socket(server, mode):
     assert trial.outcome == "satisfied"
     assert server.advertised["/potlp/path"] == "nav_msgs/Path"
     assert bool(server.link.goals) == (mode is Mode.NAVIGATE)
+
+
+def test_a_goal_is_not_kept_for_later_while_the_connection_is_lost(server):
+    pytest.importorskip("roslibpy")
+    link, told = RosbridgeLink(f"127.0.0.1:{server.port}"), []
+    link.close()
+    # It is closed by another thread.
+    until = time.monotonic() + 10
+    while link.is_connected and time.monotonic() < until:
+        time.sleep(0.01)
+    goal = link.send_goal(
+        "/follow_path", "nav2_msgs/action/FollowPath", {}, lambda succeeded, words: told.append((succeeded, words))
+    )
+    assert told == [(False, "/follow_path was not asked: the connection is lost")]
+    link.cancel("/follow_path", goal)

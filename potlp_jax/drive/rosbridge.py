@@ -73,7 +73,7 @@ class RosbridgeLink:
             self._topic(topic, kind).publish(self._library.Message(message))
 
     def send_goal(self, action: str, kind: str, goal: dict[str, Any], done: Callable[[bool, str], None]) -> str:
-        """Send an action's goal; while the connection is lost roslibpy keeps it, and sends it when it is back.
+        """Send an action's goal; while the connection is lost it is not sent, and has failed at once.
 
         Args:
             action, kind: name and type. An action of this name keeps the type that it was first used with.
@@ -82,8 +82,12 @@ class RosbridgeLink:
                 and never where the connection is lost before the result has come.
 
         Returns:
-            The id that rosbridge knows the goal by, for ``cancel``.
+            The id that rosbridge knows the goal by, for ``cancel``; empty for a goal that was not sent.
         """
+        # roslibpy would keep the goal, and start the robot with it later, whatever has been decided since.
+        if not self.is_connected:
+            done(False, f"{action} was not asked: the connection is lost")
+            return ""
         client = self._actions.setdefault(action, self._library.ActionClient(self._ros, action, kind))
 
         def ended(result: Message) -> None:
