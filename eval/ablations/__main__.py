@@ -1,8 +1,8 @@
 """What each part of the fire-fighting estimator is good for, in answers and in trials.
 
     python -m eval.ablations --out out/ablations --views own=out/own explored=out/explored --processes 2
-    python -m eval.ablations --out out/ablations --views ... --report docs/results/ablations
-    python -m eval.ablations --out out/ablations --views ... --report docs/results/ablations --as-it-is
+    python -m eval.ablations --out out/ablations --views own=out/own --report docs/results/ablations
+    python -m eval.ablations --out out/ablations --views own=out/own --report docs/results/ablations --as-it-is
 
 Networks are fitted to the same views of generated buildings, alike but for the one thing that each lacks
 (``eval.ablations.variants``), evaluated on data sets of other buildings (``--views NAME=FOLDER``), and drive in one set
