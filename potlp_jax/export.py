@@ -31,7 +31,7 @@ import jax.export
 from jaxtyping import Array, UInt32
 
 from potlp_jax.errors import ExportError
-from potlp_jax.files import MIB, MOST_TEXT, one_line, read_bytes, read_json, reading
+from potlp_jax.files import MIB, MOST_TEXT, one_line, read_bytes, read_json, reading, short
 from potlp_jax.native import twin_only
 from potlp_jax.planning.decision import decide_from_estimates, frontier_subgoals, subgoals_at
 from potlp_jax.planning.estimates import Estimates
@@ -45,7 +45,7 @@ from potlp_jax.task.task import Task
 from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL, Status
 from potlp_jax.world.grid import BeliefMap
 
-FORMAT: int = 1
+FORMAT: int = 2
 """Version of the folder's layout."""
 
 MANIFEST: str = "manifest.json"
@@ -179,7 +179,7 @@ def batch_shape(batch: int | str | None) -> tuple[Any, ...]:
     return tuple(jax.export.symbolic_shape(_BATCH_DIMENSION)) if batch == ANY_BATCH else (batch,)
 
 
-def load_program(folder: Path, name: str, propositions: Sequence[str]) -> Callable[..., dict[str, Array]]:
+def load_program(folder: Path | str, name: str, propositions: Sequence[str]) -> Callable[..., dict[str, Array]]:
     """A program of an exported folder as a function from named inputs to named outputs.
 
     For use where this package is installed; elsewhere the module's docstring shows the lines that it takes.
@@ -194,10 +194,16 @@ def load_program(folder: Path, name: str, propositions: Sequence[str]) -> Callab
 
     Raises:
       PropositionsError: the program was exported for a task over other propositions.
-      ExportError: the folder holds no such program, a file of it is missing or damaged, or a call does not name exactly
-        the program's inputs.
+      ExportError: the folder is of another format or holds no such program, a file of it is missing or damaged, or a
+        call does not name exactly the program's inputs.
     """
+    folder = Path(folder)
     manifest = read_json(folder / MANIFEST, ExportError, "a manifest", MOST_TEXT)
+    found = manifest.get("format") if isinstance(manifest, dict) else None
+    if found != FORMAT:
+        raise ExportError(
+            f"{folder}: format {short(found)} of exported planners; this version reads {FORMAT}: export it again"
+        )
     with reading(folder / MANIFEST, ExportError, "a manifest"):
         require_same_propositions(
             check_propositions(manifest["task"]["propositions"]),

@@ -208,6 +208,10 @@ def test_another_schema_version_is_refused(tmp_path):
     _write(tmp_path, [0], dataclasses.replace(METADATA, schema_version=SCHEMA_VERSION + 1))
     with pytest.raises(DatasetError, match=f"schema version {SCHEMA_VERSION + 1}"):
         read_dataset(tmp_path)
+    # Also where it lacks files that this version has, as the first one lacks maps.
+    worlds_file(tmp_path, 0).unlink()
+    with pytest.raises(DatasetError, match=f"schema version {SCHEMA_VERSION + 1}"):
+        read_dataset(tmp_path)
 
 
 def test_other_columns_are_refused(tmp_path):

@@ -12,6 +12,7 @@ import pytest
 
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.environments.toy import Toy
+from potlp_jax.errors import ExportError
 from potlp_jax.export import ANY_BATCH, MANIFEST, ExportConfig, export_planner, load_program
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.decision import frontier_subgoals
@@ -248,6 +249,14 @@ def test_manifest_holds_the_task_and_what_numbers_mean(situation, exported):
 def test_what_cannot_be_exported_is_refused(options, message):
     with pytest.raises(ValueError, match=message):
         ExportConfig(**options)
+
+
+@pytest.mark.parametrize("found", [1, None])
+def test_a_folder_of_another_format_is_refused(exported, tmp_path, found):
+    manifest = json.loads((exported / MANIFEST).read_text()) | {"format": found}
+    (tmp_path / MANIFEST).write_text(json.dumps(manifest))
+    with pytest.raises(ExportError, match=r"format \S+ of exported planners; this version reads 2: export it again"):
+        load_program(str(tmp_path), "plan", Toy.propositions)
 
 
 def test_loaded_programs_name_what_is_missing(exported):

@@ -601,6 +601,12 @@ class Bandit:
     pulls: Int32[Array, "*B 2"]
 
 
+@pytest.mark.parametrize("optimism", [None, -0.1, 1.1, float("nan")])
+def test_an_optimism_that_is_none_is_refused(optimism):
+    with pytest.raises(ValueError, match=r"BestFirstConfig.optimism is .+, must lie in \[0, 1\]"):
+        BestFirstConfig(optimism=optimism)
+
+
 def test_a_search_is_its_verbs():
     """The loop and the routing of vmap know nothing of graphs: a bandit of known value runs through them too."""
     problems = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(shared_shape("F g", seed) for seed in range(3)))

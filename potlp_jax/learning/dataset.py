@@ -257,8 +257,9 @@ def read_metadata(folder: Path | str) -> DatasetMetadata:
     shards = sorted(finished_shards(folder))
     if not shards:
         raise DatasetError(f"there is no dataset in {folder}: no finished shard (samples-*.parquet)")
-    # Every file carries the metadata: shards of two collections in one folder are found out.
-    paths = [path(folder, shard) for shard in shards for path in (worlds_file, views_file, samples_file)]
+    # Every file carries the metadata: shards of two collections in one folder are found out. The file of samples comes
+    # first, because other versions of the schema have it, too: the version is what is wrong, not what they lack.
+    paths = [path(folder, shard) for shard in shards for path in (samples_file, worlds_file, views_file)]
     first = metadata_of(paths[0])
     for path in paths[1:]:
         found = first.differences(metadata_of(path))

@@ -315,5 +315,6 @@ def summary(samples: Samples) -> str:
     # A proposition that is hardly ever asked for, or never found, will not be learned.
     for index, name in enumerate(samples.metadata.propositions):
         asked = samples.phi_go[:, index] > 0
-        lines.append(f"{name}: asked for in {asked.mean():.1%} of samples, {holds[asked].mean():.1%} of them successes")
+        found = f", {holds[asked].mean():.1%} of them successes" if asked.any() else ""
+        lines.append(f"{name}: asked for in {asked.mean():.1%} of samples{found}")
     return "\n".join(lines)
