@@ -14,11 +14,12 @@ from jaxtyping import Array, Int32
 from potlp_jax.bench.problems import family_problem
 from potlp_jax.planning.exact.api import solve_exact
 from potlp_jax.planning.history import terms_of_all
-from potlp_jax.planning.search import best_first
+from potlp_jax.planning.search import best_first, descending
 from potlp_jax.planning.search.api import plan_actions, plan_within, search, search_tree
+from potlp_jax.planning.search.chains import NEGLIGIBLE
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
 from potlp_jax.planning.search.graph import NodeValues
-from potlp_jax.planning.search.guess import NEGLIGIBLE, NESTED, guess_outcomes
+from potlp_jax.planning.search.guess import NESTED, guess_outcomes
 from potlp_jax.planning.search.inspect import tree_top
 from potlp_jax.planning.search.lockstep import SearchMethod, run_search
 from potlp_jax.planning.search.plan import Plan
@@ -363,14 +364,14 @@ def test_every_action_of_the_root_is_tried():
         return np.asarray(plan.visits), np.where(np.asarray(plan.visits) == 0, bounds, np.inf)
 
     visits, bounds = searched(1)
-    first = best_first.SIMULATIONS_BEFORE_TRIES * (np.isfinite(bounds).sum() + visits.sum())
+    first = descending.SIMULATIONS_BEFORE_TRIES * (np.isfinite(bounds).sum() + visits.sum())
     visits, bounds = searched(int(first))
     untried = np.isfinite(bounds).sum()
     assert untried > 5
     # The next one in every four is of least bound, and left alone thereafter unless it is the best.
     for tries in range(1, untried + 1):
         best = int(np.argmin(bounds))
-        visits, bounds = searched(int(first) + best_first.TRY_EVERY * tries)
+        visits, bounds = searched(int(first) + descending.TRY_EVERY * tries)
         assert visits[best] >= 1
         assert np.isfinite(bounds).sum() == untried - tries
     assert np.all(np.isinf(bounds))

@@ -4,7 +4,9 @@ from eval.mutants.mutant import Mutant
 
 PART = "search"
 
-_BEST_FIRST = "potlp_jax/planning/search/best_first.py"
+_BACKING_UP = "potlp_jax/planning/search/backing_up.py"
+_CONTEXT = "potlp_jax/planning/search/context.py"
+_DESCENDING = "potlp_jax/planning/search/descending.py"
 _GRAPH = "potlp_jax/planning/search/graph.py"
 _UCT = "potlp_jax/planning/search/uct.py"
 _CONVERGED = ("tests/test_search.py",)
@@ -13,7 +15,7 @@ MUTANTS = (
     Mutant(
         PART,
         "no action of the root is tried for its own sake",
-        _BEST_FIRST,
+        _DESCENDING,
         "return tries[:, None] & (visits > 0)",
         "return (tries & False)[:, None] & (visits > 0)",
         _CONVERGED,
@@ -22,7 +24,7 @@ MUTANTS = (
     Mutant(
         PART,
         "searches that certify try actions, too",
-        _BEST_FIRST,
+        _DESCENDING,
         "tries = is_due & is_late & ~certifies & jnp.any",
         "tries = is_due & is_late & jnp.any",
         ("tests/test_native_search.py",),
@@ -30,7 +32,7 @@ MUTANTS = (
     Mutant(
         PART,
         "the backup passes values up as bounds",
-        _BEST_FIRST,
+        _BACKING_UP,
         "bounds=write(tree.bounds, action.bound, step.actions)",
         "bounds=write(tree.bounds, action.value, step.actions)",
         _CONVERGED,
@@ -39,7 +41,7 @@ MUTANTS = (
     Mutant(
         PART,
         "floors rest on guesses",
-        _BEST_FIRST,
+        _CONTEXT,
         "floor=jnp.zeros_like(guess)",
         "floor=optimistic",
         _CONVERGED,
@@ -48,7 +50,7 @@ MUTANTS = (
     Mutant(
         PART,
         "the backup ignores the other actions of a node",
-        _BEST_FIRST,
+        _BACKING_UP,
         "least = jax.tree.map(jnp.minimum, step.rival, action)",
         "least = action",
         _CONVERGED,
@@ -57,7 +59,7 @@ MUTANTS = (
     Mutant(
         PART,
         "selection ignores the pending cost",
-        _BEST_FIRST,
+        _DESCENDING,
         "score = costs.low(certifies[:, None]) + jnp.where(inside, 0.0, descent.pending_cost[:, None])",
         "score = costs.low(certifies[:, None])",
         _CONVERGED,
@@ -66,7 +68,7 @@ MUTANTS = (
     Mutant(
         PART,
         "actions that stay inside are counted among those that leave",
-        _BEST_FIRST,
+        _BACKING_UP,
         "        leave=of_kind(~step.inside, before.leave),\n        stay=of_kind(step.inside, before.stay),",
         "        leave=of_kind(step.inside, before.leave),\n        stay=of_kind(~step.inside, before.stay),",
         _CONVERGED,
@@ -75,7 +77,7 @@ MUTANTS = (
     Mutant(
         PART,
         "a guess takes the satisfied task for a dead end",
-        "potlp_jax/planning/search/guess.py",
+        "potlp_jax/planning/search/rule.py",
         "jnp.where(tables.actions.accepts, jnp.float32(0.0), jnp.float32(1.0))",
         "jnp.ones(tables.actions.accepts.shape, jnp.float32)",
         _CONVERGED,
@@ -93,7 +95,7 @@ MUTANTS = (
     Mutant(
         PART,
         "bounds lie above the guesses",
-        _BEST_FIRST,
+        _CONTEXT,
         "jnp.minimum(rounded_product(1.0 - optimism, guess) + rounded_product(optimism, dead_ends_in(child)), guess)",
         "rounded_product(1.0 + optimism, guess)",
         _CONVERGED,
@@ -102,7 +104,7 @@ MUTANTS = (
     Mutant(
         PART,
         "what dead ends cost in a guess is discounted",
-        _BEST_FIRST,
+        _CONTEXT,
         "rounded_product(1.0 - optimism, guess) + rounded_product(optimism, dead_ends_in(child))",
         "rounded_product(1.0 - optimism, guess)",
         _CONVERGED,
@@ -120,7 +122,7 @@ MUTANTS = (
     Mutant(
         PART,
         "a success keeps no chance of a dead end",
-        "potlp_jax/planning/search/guess.py",
+        "potlp_jax/planning/search/chains.py",
         "dead_end=rounded_product(chance, walk.dead_end[level])",
         "dead_end=jnp.zeros_like(chance)",
         _CONVERGED,
@@ -129,7 +131,7 @@ MUTANTS = (
     Mutant(
         PART,
         "Eq. 3 weighs R_F by P_S",
-        _BEST_FIRST,
+        _DESCENDING,
         "    known += rounded_product(1.0 - chance, attempt.failure_cost)\n",
         "    known += rounded_product(chance, attempt.failure_cost)\n",
         _CONVERGED,

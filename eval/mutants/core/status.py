@@ -4,7 +4,7 @@ from eval.mutants.mutant import Mutant
 
 PART = "status bits"
 
-_BEST_FIRST = "potlp_jax/planning/search/best_first.py"
+_EXPANDING = "potlp_jax/planning/search/expanding.py"
 _UCT = "potlp_jax/planning/search/uct.py"
 _RULES = "potlp_jax/trials/rules.py"
 
@@ -12,7 +12,7 @@ MUTANTS = (
     Mutant(
         PART,
         "a full tree of best-first search is not flagged",
-        _BEST_FIRST,
+        _EXPANDING,
         "status_of_rows(is_new & ~added, Status.TREE_OVERFLOW)",
         "status_of_rows(is_new & ~is_new, Status.TREE_OVERFLOW)",
         ("tests/test_search.py",),

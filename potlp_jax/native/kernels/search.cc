@@ -27,11 +27,11 @@ using Set = uint32_t;
 
 constexpr float kInf = INFINITY;
 constexpr float kCostLimit = 1e30f;
-constexpr float kNegligible = 1e-3f;   // guess.NEGLIGIBLE
-constexpr int kPasses = 4;             // guess.PASSES
+constexpr float kNegligible = 1e-3f;   // chains.NEGLIGIBLE
+constexpr int kPasses = 4;             // successes.PASSES
 constexpr int kNested = 2;             // guess.NESTED
-constexpr float kLeastGuess = 1e-4f;   // best_first.LEAST_GUESS
-constexpr int kSimulationsBeforeTries = 4, kTryEvery = 4;  // best_first
+constexpr float kLeastGuess = 1e-4f;   // expanding.LEAST_GUESS
+constexpr int kSimulationsBeforeTries = 4, kTryEvery = 4;  // descending
 constexpr int32_t kShares = 2048;      // graph.SHARES
 constexpr int kProbes = 8;             // graph.PROBES
 constexpr int kNone = -1;              // NO_STATE, NO_SUBGOAL, NO_ACTION, NO_CLASS, NOWHERE, UNVISITED
@@ -157,7 +157,7 @@ inline Marks as_guesses(const Lanes& values, const Lanes& dead_ends) {
   return (bits & -kShares) | INT32_MIN | __builtin_convertvector(share, Marks);
 }
 
-// graph.guess_in and dead_ends_in, and best_first._discounted; of one entry or of a vector of them.
+// graph.guess_in and dead_ends_in, and context.discounted_guess_in; of one entry or of a vector of them.
 template <typename Value, typename Entry>
 inline Value guess_in(const Entry& child) {
   const Entry bits = child & (INT32_MAX & -kShares);
@@ -360,7 +360,7 @@ class Search {
 
   static bool is_path_cost(float value) { return (value >= 0 && value < kCostLimit) || value == kInf; }
 
-  // best_first._reachable_states; `reach_` holds the states that paths lead to.
+  // context.reachable_states; `reach_` holds the states that paths lead to.
   void relate_states(bool any_subgoal) {
     const int Z = shape_.Z;
     Set attempted = 0;
@@ -492,7 +492,7 @@ class Search {
     return failure;
   }
 
-  // guess._is_coupled, of the actions that a rollout can get to and of those that it cannot alike.
+  // rule._is_coupled, of the actions that a rollout can get to and of those that it cannot alike.
   bool is_coupled() const {
     for (int a = 0; a < shape_.E; ++a) {
       for (int b = 0; b < shape_.E; ++b) {
@@ -505,7 +505,7 @@ class Search {
     return false;
   }
 
-  // guess._order_of_successes: edges that end nearest to acceptance first, without those that need no value.
+  // successes._order_of_successes: edges that end nearest to acceptance first, without those that need no value.
   void order_edges() {
     edge_order_.clear();
     for (int depth = 0; depth <= shape_.Z; ++depth) {
@@ -682,7 +682,7 @@ class Search {
     }
   }
 
-  // guess._value_successes, with the chances and costs of all actions in `all_chance_` and `all_cost_`.
+  // successes.value_successes, with the chances and costs of all actions in `all_chance_` and `all_cost_`.
   void value_successes(std::vector<Guess>& after) {
     const int count = actions_.size(), S = shape_.S, E = shape_.E, Z = shape_.Z;
     after.resize(count);
@@ -707,7 +707,7 @@ class Search {
     }
   }
 
-  // guess._follow_chain: the action of least cost per chance, as long as all fail; `nested` of its successes in a row
+  // chains.follow_chain: the action of least cost per chance, as long as all fail; `nested` of its successes in a row
   // are valued by what has failed before.
   void follow(Chain& chain, const Candidates& list, int product_state, float pending_cost, int nested) {
     StateActions& own = *list.actions;
@@ -838,7 +838,7 @@ class Search {
     }
   }
 
-  // guess._costs_without and _cost_to_begin_elsewhere: the guess after each candidate's failure, into `without_`.
+  // guess._without_each and _cost_to_begin_elsewhere: the guess after each candidate's failure, into `without_`.
   void guess_failures(const Candidates& list) {
     StateActions& own = *list.actions;
     const int width = own.width;
@@ -871,7 +871,7 @@ class Search {
 
   // ---- Nodes --------------------------------------------------------------------------------------------------------
 
-  // best_first._new_node: the entries of `history_` behind all others; `parent` is where it comes from, or kNone.
+  // expanding.new_node: the entries of `history_` behind all others; `parent` is where it comes from, or kNone.
   Node new_node(int parent) {
     Node node{};
     node.left_by = kNone;
@@ -1036,7 +1036,7 @@ class Search {
     }
   }
 
-  // guess.value_successes_anew: by what `history_` knows.
+  // successes.value_successes_anew: by what `history_` knows.
   void value_anew() {
     const int S = shape_.S;
     for (size_t k = 0; k < actions_.size(); ++k) {
@@ -1114,7 +1114,7 @@ class Search {
     return root.value > root.floor;
   }
 
-  // Where a descent is (best_first.Descent).
+  // Where a descent is (descending.Descent).
   struct Descent {
     int node = 0, entry = 0;
     float pending_cost = 0;
@@ -1146,7 +1146,7 @@ class Search {
 
   int action_of(const Node& node, int entry) const { return state_actions_[node.state].action[entry]; }
 
-  // The entry that the next descent begins with because none has (best_first._passed_over), or kNone.
+  // The entry that the next descent begins with because none has (descending._passed_over), or kNone.
   int next_try() {
     if (all_tried_ || simulations_ % kTryEvery != kTryEvery - 1) return kNone;
     const Node& root = nodes_[0];
