@@ -602,8 +602,8 @@ class Bandit:
     pulls: Int32[Array, "*B 2"]
 
 
-@pytest.mark.parametrize("optimism", [None, -0.1, 1.1, float("nan")])
-def test_an_optimism_that_is_none_is_refused(optimism):
+@pytest.mark.parametrize("optimism", [-0.1, 1.1, float("nan")])
+def test_an_optimism_that_is_no_fraction_is_refused(optimism):
     with pytest.raises(ValueError, match=r"BestFirstConfig.optimism is .+, must lie in \[0, 1\]"):
         BestFirstConfig(optimism=optimism)
 

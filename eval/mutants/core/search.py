@@ -43,7 +43,7 @@ MUTANTS = (
         "floors rest on guesses",
         _CONTEXT,
         "floor=jnp.zeros_like(guess)",
-        "floor=optimistic",
+        "floor=discounted_guess_in(child, context.optimism)",
         _CONVERGED,
         "ended",
     ),

@@ -35,8 +35,7 @@ class BestFirstConfig:
     def __post_init__(self) -> None:
         _check_kind(self, "best-first")
         _check_at_least_one(self, "simulations", "max_depth", "tree_capacity", "guess_failures")
-        # Of 0.1: None chose by the size of the problem.
-        if self.optimism is None or not 0 <= self.optimism <= 1:
+        if not 0 <= self.optimism <= 1:
             raise ValueError(f"BestFirstConfig.optimism is {self.optimism}, must lie in [0, 1]")
 
     @property
