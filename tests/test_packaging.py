@@ -34,6 +34,13 @@ def test_the_pinned_versions_are_of_libraries_that_are_asked_for():
         assert name.lower() in pinned, f"{name} has no line in constraints.txt"
 
 
+def test_all_that_name_the_version_name_the_same():
+    version = PROJECT["project"]["version"]
+    assert re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text("utf-8"), re.M)[1] == version
+    assert re.search(r"^  version = \{(.+)\},$", (ROOT / "README.md").read_text("utf-8"), re.M)[1] == version
+    assert re.search(r"^## (.+)$", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.M)[1] == version
+
+
 def test_supported_versions_of_python_are_named():
     lowest = PROJECT["project"]["requires-python"].removeprefix(">=")
     named = [entry.rpartition(" ")[2] for entry in PROJECT["project"]["classifiers"] if " :: 3." in entry]
