@@ -70,6 +70,15 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="python -m eval.table1 --out {out} --processes {processes} --report docs/results/table1/test",
         hours=0.5,
     ),
+    # Its trials are compared with the rows of Table I, world by world.
+    "observer": Experiment(
+        page="table1", command="python -m eval.limit --out {out} --worlds 750 --arms ideal-observer"
+    ),
+    "beside": Experiment(
+        page="table1",
+        command="python -m eval.limit.beside docs/results/table1/rows.csv.gz {all}/observer "
+        "--report docs/results/table1/observer",
+    ),
     "limit": Experiment(
         page="limit", command="python -m eval.limit --out {out} --worlds 60 --report docs/results/limit"
     ),
@@ -116,7 +125,12 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="estimator",
         command="python -m eval.limit.excess firefighting --data {all}/means --report docs/results/estimator/excess",
     ),
-    "held-out": Experiment(page="panorama", command="potlp sweep firefighting-held-out --out {out}"),
+    "ablations": Experiment(
+        page="ablations",
+        command="python -m eval.ablations --out {out} --views own={all}/own explored={all}/explored "
+        "--processes {processes} --report docs/results/ablations",
+    ),
+    "held-out": Experiment(page="table1", command="potlp sweep firefighting-held-out --out {out}"),
     "panorama": Experiment(
         page="panorama",
         command="python -m eval.table1 --estimator firefighting-panorama --out {out} --processes {processes} "
