@@ -526,6 +526,16 @@ def test_info_says_how_closely_a_subgoal_is_looked_at(tmp_path, fovea, words):
     assert words in _potlp("info", tmp_path / "e.npz").stdout
 
 
+@pytest.mark.parametrize("command", ["info", "evaluate"])
+def test_a_shipped_estimator_is_known_by_its_name(dataset, command):
+    result = _potlp(*{"info": ("info", "firefighting"), "evaluate": ("evaluate", "firefighting", dataset[0])}[command])
+    if command == "info":
+        assert result.exit_code == 0, result.stderr
+        assert "fire, alarm, extinguisher, exit" in result.stdout
+    else:  # It was found: what is wrong is that these data are about other propositions.
+        assert "(fire, alarm, extinguisher, exit)" in result.stderr
+
+
 def test_bad_input_is_one_clear_message(estimator, dataset, tmp_path, monkeypatch):
     folder = dataset[0]
     other = tmp_path / "other.npz"
