@@ -87,7 +87,7 @@ def named_estimator(name: str | Path) -> TrainedEstimator | Estimator:
     if not plugins.is_known(str(name), plugins.ESTIMATORS):
         raise EstimatorError(
             f"there is no estimator {name}: give a file (potlp fit makes one), module:attribute, or the name of one "
-            f"that is shipped: {', '.join(shipped_files())}"
+            f"that is shipped or installed: {', '.join([*shipped_files(), *plugins.entry_points(plugins.ESTIMATORS)])}"
         )
     found = plugins.load(str(name), group=plugins.ESTIMATORS, kind="estimator")
     estimator = found() if isinstance(found, type) else found
