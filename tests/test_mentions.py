@@ -25,7 +25,8 @@ from tests.reference.mentions import ROOT, found, known_options, parse_module, p
 
 FOLDERS = "docs|eval|tests|examples|notebooks|train|potlp_jax"
 OTHERS = {
-    "pip": {"--no-deps"},
+    "pip": {"--no-deps", "--no-cache-dir", "--disable-pip-version-check"},
+    "venv, build and twine": {"--clear", "--outdir", "--strict"},
     "git": {"--porcelain"},
     "CSS": {"--faint"},
     "XLA": {"--xla"},
