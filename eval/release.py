@@ -194,6 +194,8 @@ def measured(out: Path, steps: Sequence[Sequence[str]], cached: bool) -> dict[st
 
 def release(out: Path, cached: bool) -> dict[str, Any]:
     """All of it; ends the program where a check fails."""
+    # Of the commit that is cloned now: another may be checked out before the end.
+    made_by = provenance()
     wheel, sdist = built(out)
     tracked = _run("git", "-C", ROOT, "ls-files", "potlp_jax").split()
     with zipfile.ZipFile(wheel) as archive:
@@ -214,7 +216,7 @@ def release(out: Path, cached: bool) -> dict[str, Any]:
         },
         "python": sys.version.split()[0],
         "cached": cached,
-        "provenance": provenance(),
+        "provenance": made_by,
     }
 
 
