@@ -1,6 +1,6 @@
 """A policy of your own: go where the largest frontier is.
 
-    potlp compare rooms --policies baseline,examples.own_policy:largest_frontier --worlds 5
+    potlp compare rooms --policies baseline,examples.own_policy:largest_frontier --trials 5
 
 A policy is a pure function (``planning.policies.PolicyFunction``): it is compiled with the rest of the decision, and
 runs in batches, so it branches with ``jnp.where``. A package that is installed may declare it as an entry point in the

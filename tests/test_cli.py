@@ -58,7 +58,7 @@ def recorded(tmp_path_factory) -> Path:
 def test_help_leads_a_newcomer_to_the_commands():
     result = _potlp("--help")
     assert result.exit_code == 0
-    for part in ("task", "run", "compare", "explain", "--version", "potlp run toy"):
+    for part in ("task", "run", "compare", "explain", "--version", "potlp run rooms"):
         assert part in result.stdout
     for command in ("task", "run", "compare", "explain"):
         shown = _potlp(command, "--help")
@@ -66,6 +66,19 @@ def test_help_leads_a_newcomer_to_the_commands():
         assert "Examples" in shown.stdout
         assert f"potlp {command}" in shown.stdout
         assert "--json" in shown.stdout
+
+
+def test_the_first_tour_shows_what_it_says(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shown = _potlp("--help").stdout
+    run, explain = (
+        next(line for line in shown.splitlines() if f"potlp {name}" in line) for name in ("run rooms", "explain demo")
+    )
+    for line in (run, explain):
+        done = _potlp(*line.partition(" - ")[0].split()[1:])
+        assert done.exit_code == 0, done.output
+    # Of a policy that does not search there would be nothing to explain.
+    assert "visits" in done.stdout
 
 
 def test_version():

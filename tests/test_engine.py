@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -14,7 +15,7 @@ import pytest
 
 from eval.faults.kills import workers_of
 from potlp_jax.engine.engine import MOST_KILLED, Broken, Engine, Here
-from potlp_jax.engine.opening import open_engine
+from potlp_jax.engine.opening import BATCH_SYSTEMS, SUBMITTING, open_engine
 from potlp_jax.engine.writer import only_writer
 from potlp_jax.errors import EngineError, StoreError, WorldError
 
@@ -202,11 +203,24 @@ def test_a_cluster_without_workers_is_waited_for_with_a_note(tmp_path, caplog, m
         ("ssh:", "name the machines"),
     ],
 )
-def test_clusters_that_cannot_be_are_named(cluster, message):
+def test_clusters_that_cannot_be_are_named(cluster, message, monkeypatch):
     pytest.importorskip("dask_jobqueue")
     pytest.importorskip("asyncssh")
+    monkeypatch.setattr(shutil, "which", lambda program: f"/usr/bin/{program}")
     with pytest.raises(EngineError, match=message), open_engine(cluster=cluster):
         pass
+
+
+def test_a_batch_system_that_is_not_here_is_named(monkeypatch):
+    pytest.importorskip("dask_jobqueue")
+    monkeypatch.setattr(shutil, "which", lambda program: None)
+    assert set(SUBMITTING) == set(BATCH_SYSTEMS)
+    for cluster, command in SUBMITTING.items():
+        with (
+            pytest.raises(EngineError, match=f"there is no {command} here"),
+            open_engine(cluster=f"{cluster}:workers=1"),
+        ):
+            pass
 
 
 def test_a_scheduler_that_does_not_answer_is_named(monkeypatch):

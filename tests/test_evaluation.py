@@ -5,6 +5,7 @@ import importlib.util
 import json
 import math
 from collections import Counter
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,7 @@ from potlp_jax.errors import EvaluationError, PropositionsError
 from potlp_jax.learning.ablations import INTACT, ablated
 from potlp_jax.learning.dataset import Samples, decode, encode, view_id, write_shard
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
+from potlp_jax.learning.estimator import estimator_file, shipped_files
 from potlp_jax.learning.map_images import without_painting
 from potlp_jax.learning.metrics import (
     BINS,
@@ -524,6 +526,24 @@ def test_info_says_how_closely_a_subgoal_is_looked_at(tmp_path, fovea, words):
     config = dataclasses.replace(CONFIG, fovea=fovea)
     save_estimator(tmp_path / "e.npz", EstimatorNetwork(config).init(jax.random.key(0)), config, METADATA.domain, {})
     assert words in _potlp("info", tmp_path / "e.npz").stdout
+
+
+def test_a_file_goes_before_a_shipped_estimator_of_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert estimator_file("parcels") == shipped_files()["parcels"]
+    assert estimator_file("mine.npz") == Path("mine.npz")
+    Path("parcels").touch()
+    assert estimator_file("parcels") == Path("parcels")
+
+
+@pytest.mark.parametrize("command", ["info", "evaluate"])
+def test_a_shipped_estimator_is_known_by_its_name(dataset, command):
+    result = _potlp(*{"info": ("info", "firefighting"), "evaluate": ("evaluate", "firefighting", dataset[0])}[command])
+    if command == "info":
+        assert result.exit_code == 0, result.stderr
+        assert "fire, alarm, extinguisher, exit" in result.stdout
+    else:  # It was found: what is wrong is that these data are about other propositions.
+        assert "(fire, alarm, extinguisher, exit)" in result.stderr
 
 
 def test_bad_input_is_one_clear_message(estimator, dataset, tmp_path, monkeypatch):

@@ -3,7 +3,9 @@
 import dataclasses
 import json
 import math
+import shlex
 import zlib
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -377,6 +379,19 @@ def test_a_trial_is_written_replayed_and_viewed(trial, tmp_path):
     refused = _potlp("log", "replay", tmp_path / "drive", "-l", labels, "-t", "F goal", "-p", "known-map", "-o", out)
     assert refused.exit_code == 2
     assert "choose baseline" in refused.stderr
+
+
+def test_the_page_shows_what_the_commands_print(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).parents[1] / "docs" / "logs.md").read_text("utf-8")
+    (transcript,) = (text for text in page.split("```") if "\n$ potlp run" in text)
+    for command, *shown in (part.splitlines() for part in transcript.split("\n$ potlp ")[1:]):
+        result = _potlp(*shlex.split(command))
+        assert result.exit_code == 0, result.output
+        printed = {line.rstrip() for line in result.output.splitlines()}
+        for line in filter(None, shown):
+            # How wide a table's line is goes by the terminal.
+            assert line.startswith(" ───") or line.rstrip() in printed, f"{command}: {line}"
 
 
 def test_bags_become_one_dataset(bags, tmp_path):

@@ -25,7 +25,8 @@ from tests.reference.mentions import ROOT, found, known_options, parse_module, p
 
 FOLDERS = "docs|eval|tests|examples|notebooks|train|potlp_jax"
 OTHERS = {
-    "pip": {"--no-deps"},
+    "pip": {"--no-deps", "--no-cache-dir", "--disable-pip-version-check"},
+    "venv, build and twine": {"--clear", "--outdir", "--strict"},
     "git": {"--porcelain"},
     "CSS": {"--faint"},
     "XLA": {"--xla"},
@@ -94,7 +95,11 @@ def test_sections_of_the_model_exist():
     assert not [f"{place}: {number}" for place, number in cited if number not in sections]
 
 
-POTLP = found(r"(?s)(?:(?<!`)`|\[cyan\]|``)(potlp [^`\[]+?)(?:`|\[/cyan\])")
+POTLP = [
+    *found(r"(?s)(?:(?<!`)`|\[cyan\]|``)(potlp [^`\[]+?)(?:`|\[/cyan\])"),
+    # Indented in a docstring: to the end of the line, which a backslash continues.
+    *((place, line.replace("\\ ", "")) for place, line in found(r"(?m)^ {4,}(potlp (?:[^\n\\]|\\\n)+)$")),
+]
 MODULES = found(r"python -m ([\w.]+(?:[ \t]+[^`\n#&|;()]+)?)")
 
 
@@ -113,6 +118,10 @@ def _is_a_mention(wrong: str) -> bool:
     return re.search(too_short, wrong) is not None
 
 
+def test_indented_commands_are_read():
+    assert ("examples/own_camera.py:1", "potlp run firefighting --camera examples.own_camera:thermal") in POTLP
+
+
 def test_what_is_no_command_is_refused():
     for line in ("run toy --no-such-option", "no-such-command", "run toy --world x", "sweep show --csv"):
         wrong = parse_potlp(line.split())
@@ -127,7 +136,7 @@ def test_what_is_no_command_is_refused():
 @pytest.mark.parametrize(("place", "line"), MODULES)
 def test_modules_commands_parse(place, line):
     module, *words = words_of(line)
-    if module.split(".")[-1].isupper() or "{" in line:
+    if module.split(".")[-1].isupper() or "{" in line or "..." in words:
         return  # a form, such as `python -m examples.NAME`, or one that the program fills in (tests/test_all.py)
     wrong = parse_module(module.rstrip("."), words)
     assert wrong is None or _is_a_mention(wrong), f"{place}: {line}: {wrong}"

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from eval.live import server
 from eval.live.building import REACH, Building
 from eval.live.perturbation import Network, Perturbation
 from eval.live.recorded import length_to_and_fro, on_true_map, problems_of_drive
@@ -17,12 +18,14 @@ from potlp_jax.drive.movers import Adviser
 from potlp_jax.drive.robot import RemoteRobot
 from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.places import Polygon
+from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import trial_config_for
 from potlp_jax.trials.robot import photograph
 from potlp_jax.world.camera import Disturbance
 from potlp_jax.world.grid import BeliefMap, make_world
 from potlp_jax.world.sensing import SensorConfig, observe
+from tests.reference.map_files import PLACES, TWO_ROOMS, p5, write_map
 
 TASK = Task.from_formula("!fire U exit", FLOOR.propositions)
 LETTERS = np.array([[{"f": 1, "e": 2}.get(cell, 0) for cell in row] for row in FLOOR.rows], np.int32)
@@ -56,6 +59,26 @@ def test_places_are_where_letters_were_seen(seed):
             corners = tuple((x, y) for x, y in region["polygon"])
             found |= Polygon(corners).covers(~ground.walls, ground.frame) << FLOOR.propositions.index(name)
     assert np.array_equal(found, np.where(seen, letters, 0))
+
+
+def test_a_labelled_map_is_a_building(tmp_path, monkeypatch):
+    # Its panorama is a large picture that nothing here looks at.
+    monkeypatch.setattr(Building, "picture_from", lambda building, cell: None)
+    file = write_map(tmp_path, p5(np.where(TWO_ROOMS, 254, 0)), resolution=1)
+    file.with_suffix(".places.yaml").write_text(PLACES)
+    ground = Building.from_spec(f"map:{file}", 0)
+    made = RosMap(RosMapConfig(file))
+    assert ground.propositions == made.propositions
+    assert ground.frame == made.clean.frame
+    assert np.array_equal(ground.walls, np.asarray(made.world(0).occupied))
+    assert set(ground.places(~ground.walls)) == set(made.propositions)
+
+
+def test_a_map_that_cannot_be_used_is_one_message_of_the_server(tmp_path, monkeypatch):
+    file = write_map(tmp_path, p5(np.where(TWO_ROOMS, 254, 0)), resolution=1)
+    monkeypatch.setattr("sys.argv", ["server", "--environment", f"parcels:{file}"])
+    with pytest.raises(SystemExit, match=r"(?s)map\.rooms\.yaml does not exist.*rooms:\n.*labelled is map:"):
+        server.main()
 
 
 def test_it_sees_what_a_robot_in_a_trial_sees():

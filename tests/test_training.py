@@ -32,7 +32,7 @@ from potlp_jax.learning.loss import DataScale, evaluation_of, loss_sums, total_l
 from potlp_jax.learning.network import Answers
 from potlp_jax.learning.panorama_learner import PanoramaLearner, PanoramaOptions
 from potlp_jax.learning.serialization import load_estimator, save_estimator
-from potlp_jax.learning.training import batches_of, train
+from potlp_jax.learning.training import batches_of, check_data, train
 from potlp_jax.learning.training_options import TrainingConfig
 from potlp_jax.learning.training_steps import initial_state, learning_rate_schedule, make_train_step, shared_sums
 from potlp_jax.world.camera import CameraConfig
@@ -325,6 +325,14 @@ def test_data_that_do_not_belong_together_are_refused():
     metadata = dataclasses.replace(METADATA, propositions=("red", "blue"))
     with pytest.raises(TrainingError, match=r"propositions.*blue"):
         train(_learner(samples, TINY), samples, dataclasses.replace(samples, metadata=metadata), _config(2))
+
+
+def test_logs_of_buildings_by_other_names_are_told_how_to_get_one():
+    samples = synthetic(2, 2, 9)
+    metadata = [dataclasses.replace(METADATA, environment=name, source="log") for name in ("monday", "friday")]
+    one, other = (dataclasses.replace(samples, metadata=each) for each in metadata)
+    with pytest.raises(TrainingError, match=r"monday for training, friday for validation; .* --environment NAME"):
+        check_data(one, other)
 
 
 def test_patience_ends_training_and_the_best_is_kept():

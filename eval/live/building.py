@@ -1,4 +1,4 @@
-"""A building from a map of others, for the simulated robot: walls, two things to find, and what a camera sees there."""
+"""A building from a map, for the simulated robot: walls, what is to be found, and what a camera sees there."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +10,7 @@ from jaxtyping import Bool, UInt8
 
 from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.mapped_rooms import MappedRooms
+from potlp_jax.environments.ros.ros_map import PREFIX, RosMap
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.trials.config import trial_config_for
 from potlp_jax.trials.robot import photograph
@@ -43,13 +44,14 @@ class Building:
         """A test world of a map.
 
         Args:
-            spec: ``parcels:FILE.yaml`` with options (``MappedRooms.from_spec``).
+            spec: ``map:FILE.yaml``, whose places are labelled, or ``parcels:FILE.yaml``, whose rooms are named, with
+                options (``RosMap.from_spec``, ``MappedRooms.from_spec``).
             number: of the world.
 
         Raises:
             MapError: the map cannot be used.
         """
-        generator = MappedRooms.from_spec(spec)
+        generator = (RosMap if spec.startswith(PREFIX) else MappedRooms).from_spec(spec)
         building = cls(generator.generate(world_key(Split.TEST, number, generator.name)), generator.clean.frame)
         # Compiled before the robot is there, which would be silent meanwhile.
         building.seen_from(building.start, REACH)

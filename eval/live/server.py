@@ -1,13 +1,14 @@
 """A rosbridge of one's own: the simulated robot behind a websocket that speaks the rosbridge protocol.
 
     python -m eval.live.server --port 9090     # then: potlp drive localhost --task '!fire U exit' ...
-    python -m eval.live.server --environment parcels:FILE.yaml --world 3     # in a building, with a camera
+    python -m eval.live.server --environment map:FILE.yaml     # in a building, with a camera; prints how to drive there
 
 Only what ``potlp drive`` uses is spoken: subscribe, advertise, publish, and the goals of actions.
 """
 
 import argparse
 import json
+import sys
 import threading
 import time
 from typing import Any
@@ -18,8 +19,9 @@ from websockets.sync.server import Server, ServerConnection, serve
 
 from eval.live.building import REACH, Building
 from eval.live.perturbation import Network, Perturbation
-from eval.live.simulator import FLOOR, STEP, Behaviour, Ground, SimulatedLink
+from eval.live.simulator import FLOOR, PICTURES, STEP, Behaviour, Ground, SimulatedLink
 from potlp_jax.cache import enable_compilation_cache
+from potlp_jax.errors import PotlpError
 
 _SUCCEEDED, _CANCELED, _ABORTED = 4, 5, 6
 """Of action_msgs/GoalStatus."""
@@ -99,19 +101,26 @@ def main() -> None:
     )
     parser.add_argument("--port", type=int, default=9090)
     parser.add_argument("--speed", type=float, default=1.0, help="seconds of the simulation in a second")
-    parser.add_argument("--environment", help="parcels:FILE.yaml, a real map; default: two rooms of text")
+    parser.add_argument(
+        "--environment", help="map:FILE.yaml or parcels:FILE.yaml, a map of yours; default: two rooms of text"
+    )
     parser.add_argument("--world", type=int, default=0, help="number of the building's test world")
     arguments = parser.parse_args()
     enable_compilation_cache()
     ground, behaviour = FLOOR, Behaviour()
     if arguments.environment is not None:
-        ground = Building.from_spec(arguments.environment, arguments.world)
+        try:
+            ground = Building.from_spec(arguments.environment, arguments.world)
+        except PotlpError as error:
+            sys.exit(f"{parser.prog}: {error}")
         behaviour = Behaviour(pixels=1, reach=REACH)
     server = RosbridgeServer(behaviour, arguments.port, arguments.speed, ground)
-    print(
-        f"rosbridge at localhost:{server.port}; propositions {','.join(ground.propositions)}; Ctrl-C ends it",
-        flush=True,
-    )
+    names = ",".join(ground.propositions)
+    print(f"rosbridge at localhost:{server.port}; propositions {names}; Ctrl-C ends it", flush=True)
+    if isinstance(ground, Building):
+        # Its walls have grown by the radius that the map was cleaned with.
+        options = f"--propositions {names} --resolution {ground.frame.resolution:g} --radius 0 --image-topic {PICTURES}"
+        print(f"next: potlp drive localhost:{server.port} {options} --follow --task FORMULA --out FOLDER", flush=True)
     threading.Event().wait()
 
 

@@ -48,11 +48,11 @@ def _print_version(wanted: bool) -> bool:
 
 [cyan]potlp task "!hazard U goal"[/cyan] - what the formula means, as an automaton
 
-[cyan]potlp run toy --task 2 --out demo[/cyan] - one small world: record, picture and animation in demo/
+[cyan]potlp run rooms --policy oracle --out demo[/cyan] - one building: record, picture and animation in demo/
 
 [cyan]potlp explain demo:0[/cyan] - why the robot decided as it did at first
 
-[cyan]potlp compare toy --task 2 --policies oracle --trials 20[/cyan] - does it save anything?
+[cyan]potlp compare rooms --policies oracle --trials 20[/cyan] - what it saves at most, with estimates that are true
 
 [dim]Exit codes: 0 done, 1 not satisfied or failed, 2 bad input, 130 interrupted.[/dim]
 """,

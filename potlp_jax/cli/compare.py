@@ -39,7 +39,7 @@ app = command_app()
     epilog="""
 [bold]Examples[/bold]
 
-[cyan]potlp compare toy --task 2 --trials 20[/cyan]
+[cyan]potlp compare rooms --policies oracle --trials 20[/cyan]
 
 [cyan]potlp compare firefighting -t 1 --policies baseline,optimistic,oracle --trials 100 --out out/table[/cyan]
 

@@ -31,7 +31,10 @@ SHOWN: int = 4
 
 app = command_app("estimator", "Describe or evaluate a trained estimator.")
 EstimatorArgument = Annotated[
-    Path, typer.Argument(metavar="ESTIMATOR", help="An estimator (.npz), as `potlp fit` writes it.")
+    Path,
+    typer.Argument(
+        metavar="ESTIMATOR", help="An estimator (.npz), as `potlp fit` writes it; or the name of one that is shipped."
+    ),
 ]
 
 
@@ -68,6 +71,7 @@ def evaluate_estimator(
     from potlp_jax.codec import finite_or_null
     from potlp_jax.learning.ablations import INTACT
     from potlp_jax.learning.dataset_reading import read_dataset
+    from potlp_jax.learning.estimator import estimator_file
     from potlp_jax.learning.learners import learner_of
     from potlp_jax.learning.metrics import evaluate, prior_of
     from potlp_jax.learning.predictions import answerable, check_fit
@@ -76,6 +80,7 @@ def evaluate_estimator(
 
     # Before the file is read and the network compiled, like every check of words.
     variants = _read_variants(ablate)
+    estimator = estimator_file(estimator)
     params, config, domain, metadata = load_estimator(estimator)
     samples = read_dataset(dataset)
     # An estimator asked about propositions that it does not know would answer without meaning.
@@ -211,6 +216,8 @@ def _write(
 
 [cyan]potlp estimator info out/fit/estimator.npz[/cyan]
 
+[cyan]potlp estimator info firefighting[/cyan] - the shipped one
+
 [cyan]potlp estimator info out/fit/estimator.npz --json[/cyan]
 """,
 )
@@ -218,9 +225,11 @@ def show_estimator(estimator: EstimatorArgument, json: Json = False) -> None:
     """Show what an estimator knows, how large it is and how it was trained."""
     from potlp_jax.codec import finite_or_null
     from potlp_jax.learning.architectures import architecture_of
+    from potlp_jax.learning.estimator import estimator_file
     from potlp_jax.learning.network import parameter_count
     from potlp_jax.learning.serialization import load_estimator
 
+    estimator = estimator_file(estimator)
     params, config, domain, metadata = load_estimator(estimator)
     architecture = architecture_of(config)
     # What a map costs goes by its size; 64 × 192 cells where the file does not say of what maps it learned.

@@ -45,7 +45,8 @@ def fit(
     datasets: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="DATASET...", help="Folders that `potlp collect` wrote; none: collect as the recipe says."
+            metavar="DATASET...",
+            help="Folders that `potlp collect` or `potlp log to-dataset` wrote; none: collect as the recipe says.",
         ),
     ] = None,
     validation: Annotated[
@@ -58,7 +59,10 @@ def fit(
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Of parameters, order and augmentation.")] = None,
     initial: Annotated[
-        Path | None, typer.Option("--initial", help="An estimator to go on from. Not with a recipe that collects.")
+        Path | None,
+        typer.Option(
+            "--initial", help="An estimator to go on from, or a shipped one's name. Not with a recipe that collects."
+        ),
     ] = None,
     processes: Processes = 1,
     cluster: ClusterName = None,
@@ -80,6 +84,7 @@ def fit(
     from potlp_jax.codec import settings_from_words, with_settings
     from potlp_jax.learning.dataset_reading import joined, read_dataset
     from potlp_jax.learning.devices import is_first, join_processes
+    from potlp_jax.learning.estimator import estimator_file
     from potlp_jax.recipes import fitting
     from potlp_jax.recipes.recipe import follow, read_recipe
 
@@ -110,8 +115,8 @@ def fit(
     with progress_bar() as progress:
         if datasets and validation is not None:
             training = joined([read_dataset(dataset) for dataset in datasets])
-            shown = _display(progress)
-            trained = fitting.fit(training, read_dataset(validation), folder, config, shown, initial=initial)
+            shown, begin = _display(progress), None if initial is None else estimator_file(initial)
+            trained = fitting.fit(training, read_dataset(validation), folder, config, shown, initial=begin)
         else:
             assert given is not None
             chosen = dataclasses.replace(given, fit=config)

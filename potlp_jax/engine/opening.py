@@ -4,6 +4,7 @@ import contextlib
 import importlib
 import logging
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 from typing import Any
@@ -15,6 +16,11 @@ BATCH_SYSTEMS: Mapping[str, str] = MappingProxyType(
     {"slurm": "SLURMCluster", "pbs": "PBSCluster", "sge": "SGECluster", "lsf": "LSFCluster", "oar": "OARCluster"}
 )
 """Batch systems by their name in ``--cluster``, and what dask-jobqueue calls them."""
+
+SUBMITTING: Mapping[str, str] = MappingProxyType(
+    {"slurm": "sbatch", "pbs": "qsub", "sge": "qsub", "lsf": "bsub", "oar": "oarsub"}
+)
+"""The command of each batch system that begins a job."""
 
 SCHEDULERS: tuple[str, ...] = ("tcp", "tls", "ucx", "ws", "wss")
 """How addresses of a Dask scheduler begin."""
@@ -103,6 +109,11 @@ def _of_batch_system(kind: str, options: dict[str, str]) -> Any:
     workers = _whole_number(options.pop("workers", "1"), f"--cluster {kind}: workers")
     given: dict[str, Any] = {_WORDS.get(name, name): value for name, value in options.items()}
     given = {"cores": 1, "processes": 1, "memory": "4GB", **given}
+    # dask-jobqueue would go on without workers: what it says about a command that is missing is said in the background.
+    if shutil.which(SUBMITTING[kind]) is None:
+        raise EngineError(
+            f"--cluster {kind}: there is no {SUBMITTING[kind]} here: give the command where jobs are begun"
+        )
     made = _begun(lambda: getattr(jobqueue, BATCH_SYSTEMS[kind])(**given), f"as jobs of {kind}")
     # Jobs that end before the work does, as at their time limit, are replaced.
     made.adapt(minimum_jobs=workers, maximum_jobs=workers)

@@ -82,14 +82,12 @@ def named_estimator(name: str | Path) -> TrainedEstimator | Estimator:
     """
     path = Path(name)
     # A file goes first: its name may well contain a colon.
-    if path.is_file():
-        return read_estimator(path)
-    if str(name) in shipped_files():
-        return read_estimator(shipped_files()[str(name)])
+    if path.is_file() or str(name) in shipped_files():
+        return read_estimator(estimator_file(name))
     if not plugins.is_known(str(name), plugins.ESTIMATORS):
         raise EstimatorError(
             f"there is no estimator {name}: give a file (potlp fit makes one), module:attribute, or the name of one "
-            f"that is shipped: {', '.join(shipped_files())}"
+            f"that is shipped or installed: {', '.join([*shipped_files(), *plugins.entry_points(plugins.ESTIMATORS)])}"
         )
     found = plugins.load(str(name), group=plugins.ESTIMATORS, kind="estimator")
     estimator = found() if isinstance(found, type) else found
@@ -116,6 +114,12 @@ def shipped_files() -> dict[str, Path]:
     """The files of the estimators that come with the package, by name."""
     folder = Path(str(resources.files("potlp_jax.learning"))) / "data"
     return {path.stem: path for path in sorted(folder.glob("*.npz"), key=lambda path: path.stem)}
+
+
+def estimator_file(name: str | Path) -> Path:
+    """The file that is meant by a path, or by the name of a shipped estimator; a file goes first."""
+    path = Path(name)
+    return path if path.is_file() else shipped_files().get(str(name), path)
 
 
 def shipped_estimators() -> tuple[TrainedEstimator, ...]:

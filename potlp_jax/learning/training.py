@@ -75,7 +75,13 @@ def check_data(training: Samples, validation: Samples) -> None:
     for name in ("propositions", "environment", "camera", "unit", "resolution"):
         one, other = getattr(training.metadata, name), getattr(validation.metadata, name)
         if one != other:
-            raise TrainingError(f"the data sets differ in {name}: {one} for training, {other} for validation")
+            # A log's environment is a name that is given; those of simulated worlds are not to be renamed.
+            logs = "log" in (training.metadata.source, validation.metadata.source)
+            hint = "; logs of one kind of building get one name: potlp log to-dataset ... --environment NAME"
+            raise TrainingError(
+                f"the data sets differ in {name}: {one} for training, {other} for validation"
+                + (hint if logs and name == "environment" else "")
+            )
 
 
 def batches_of(learner: Learner, samples: Samples, config: TrainingConfig) -> Batches:

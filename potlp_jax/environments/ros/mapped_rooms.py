@@ -52,6 +52,11 @@ LEAST_ROOM = 2.0
 
 _HALLWAY = 0
 
+_EXAMPLE = """rooms:
+  kitchen: [{polygon: [[12.0, 3.5], [15.2, 3.5], [15.2, 8.0], [12.0, 8.0]]}]
+  office: [{polygon: [[8.9, 3.5], [11.8, 3.5], [11.8, 8.0], [8.9, 8.0]]}]
+"""
+
 
 @dataclass(frozen=True)
 class MappedRoomsConfig:
@@ -99,6 +104,13 @@ class MappedRooms(Generator):
         """
         self.config = config
         file = Path(config.rooms) if config.rooms is not None else Path(config.file).with_suffix(".rooms.yaml")
+        if config.rooms is None and not file.exists():
+            raise MapError(
+                Path(config.file),
+                "rooms",
+                f"{file} does not exist. Write the outlines of the rooms into it, in map metres, for instance\n"
+                f"{_EXAMPLE}(a map whose places are labelled is map:{config.file})",
+            )
         regions = load_regions(file, ("rooms",))["rooms"]
         self.clean: CleanMap = clean_map(load_map(config.file), config.resolution, config.radius)
         self.name = f"{PARCELS_PREFIX}{Path(config.file).stem}"
