@@ -1,10 +1,11 @@
 """Where PO-TLP loses most in a sweep, and which of its answers it loses it by.
 
     python -m eval.limit.worst out/table1 --out out/worst --report docs/results/worst
+    python -m eval.limit.worst out/delivery/generated --out out/worst-delivery --buildings 8
 
-Takes the trials of a fire-fighting sweep that cost most beyond the known map, and runs each again with the truth in
-place of one part of the answers, and with an ideal observer's (``eval.limit``). What takes away at least half of a loss
-is its cause. The sweep needs known map, baseline and PO-TLP. Rows are appended to a file of JSON lines; the same
+Takes the trials of a sweep of one environment that cost most beyond the known map, and runs each again with the truth
+in place of one part of the answers, and with an ideal observer's (``eval.limit``). What takes away at least half of a
+loss is its cause. The sweep needs known map, baseline and PO-TLP. Rows are appended to a file of JSON lines; the same
 command goes on where it was stopped. ``--report`` writes NAME.json; the table is printed as Markdown.
 """
 
@@ -20,9 +21,9 @@ from eval.limit.arms import Arm, Experiment, key_of
 from eval.limit.rows import ROWS, append_row, read_rows
 from eval.savings import read_rows as rows_of_sweep
 from potlp_jax.cache import enable_compilation_cache
-from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
+from potlp_jax.learning.domain import unit_of
 from potlp_jax.learning.estimator import named_estimator
 from potlp_jax.sweep.results import pair_rows, reliable_pairs
 from potlp_jax.sweep.rows import provenance
@@ -101,8 +102,8 @@ def run(file: Path, experiment: Experiment, losses: Sequence[Loss]) -> list[dict
     return [known[experiment.key(loss.task, loss.world, arm)] for loss in losses for arm in CAUSES]
 
 
-def results_of(losses: Sequence[Loss], rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """JSON-able: every trial with its costs by arm and its cause, and what each cause costs over all of them."""
+def results_of(losses: Sequence[Loss], rows: Sequence[Mapping[str, Any]], unit: str) -> dict[str, Any]:
+    """JSON-able: every trial with its costs by arm and its cause, and what each cause costs over all, in ``unit``."""
     costs: dict[tuple[str, int], dict[Arm, float]] = defaultdict(dict)
     for row in rows:
         costs[row["task"], row["world"]][Arm(row["arm"])] = row["cost"]
@@ -116,6 +117,7 @@ def results_of(losses: Sequence[Loss], rows: Sequence[Mapping[str, Any]]) -> dic
             for loss, cause in zip(losses, causes, strict=True)
             for found in [costs[loss.task, loss.world]]
         ],
+        "unit": unit,
         "lost_by_cause": dict(sorted(total.items(), key=lambda item: -item[1])),
         "problems": [text for row in rows for text in row["problems"]],
         "commits": sorted({row["commit"] for row in rows}),
@@ -133,7 +135,7 @@ def markdown(results: Mapping[str, Any]) -> str:
         shown = " | ".join(f"{cost:.0f}" for cost in costs)
         lines.append(f"| {trial['task']} | {trial['world']} | {shown} | {trial['points']:.2f} | {trial['cause']} |")
     lines.append("")
-    lines += [f"- {cause}: {lost:.0f} cells lost" for cause, lost in results["lost_by_cause"].items()]
+    lines += [f"- {cause}: {lost:.0f} {results['unit']} lost" for cause, lost in results["lost_by_cause"].items()]
     return "\n".join(lines)
 
 
@@ -149,7 +151,8 @@ def main() -> None:
     store = Store(options.sweep / RESULTS, read_only=True)
     specification = store.facts()["specification"]
     store.close()
-    generator, given = make(Firefighting.name), specification["estimator"]
+    (environment,), given = specification["environments"], specification["estimator"]
+    generator = make(environment)
     experiment = Experiment(
         generator=generator,
         split=Split(specification["split"]),
@@ -158,7 +161,8 @@ def main() -> None:
         buildings=options.buildings,
     )
     losses = worst_of(rows_of_sweep(options.sweep), generator.tasks, options.trials)
-    results = results_of(losses, run(options.out / ROWS, experiment, losses))
+    unit = unit_of(experiment.world(0).resolution)
+    results = results_of(losses, run(options.out / ROWS, experiment, losses), unit)
     print(markdown(results))
     if options.report is not None:
         options.report.with_suffix(".json").write_text(json.dumps(results, indent=1) + "\n", "utf-8")
