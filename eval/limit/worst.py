@@ -161,7 +161,7 @@ def main() -> None:
         buildings=options.buildings,
     )
     losses = worst_of(rows_of_sweep(options.sweep), generator.tasks, options.trials)
-    unit = unit_of(experiment.world(0).resolution)
+    unit = unit_of(float(experiment.world(0).resolution))
     results = results_of(losses, run(options.out / ROWS, experiment, losses), unit)
     print(markdown(results))
     if options.report is not None:
