@@ -191,8 +191,8 @@ EXPERIMENTS: dict[str, Experiment] = {
     "collected": Experiment(
         page="scale",
         command="potlp collect firefighting --split training --worlds 10000 --out {out} --processes {processes} "
-        "--set first_world=60000 --set spacing=[0,8] --set posterior=16 --set look_every=1 --set staying_sets=3 "
-        "--set pursued=1 --set worlds_per_shard=50 --set views_per_world=4 --set driver=explorer",
+        "--set first_world=60000 --set spacing=[0,8] --set look_every=0 --set staying_sets=3 --set pursued=1 "
+        "--set worlds_per_shard=50 --set views_per_world=4",
     ),
     "scale-reading": Experiment(
         page="scale",
@@ -201,6 +201,9 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     "mutants": Experiment(page="mutants", command="python -m eval.mutants --report docs/results/mutants"),
     # Those that measure times come last: nothing else of this list runs beside them.
+    "release": Experiment(
+        page="release", command="python -m eval.release --out {out} --report docs/results/release", one_core=True
+    ),
     "decision": Experiment(
         page="speed",
         command="python -m eval.bench.decision --worlds 2 --out docs/results/speed/after.json",
