@@ -11,6 +11,7 @@ import threading
 import time
 from pathlib import Path
 
+import distributed
 import pytest
 
 from eval.faults.kills import workers_of
@@ -96,6 +97,15 @@ def test_in_processes_every_unit_is_done_and_units_are_asked_for_late(two):
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores can be chosen on Linux alone")
+def test_workers_are_counted_by_the_scheduler_and_not_by_what_dask_remembers(two, monkeypatch, caplog):
+    # What it refreshes in the background has no workers in it, and may come between a question and its answer.
+    monkeypatch.setattr(distributed.Client, "scheduler_info", lambda self, **options: {"workers": {}})
+    monkeypatch.setattr("potlp_jax.engine.cluster._LOOK", 0.0)
+    two.look_after_workers()
+    assert two.workers == 2
+    assert "ended" not in caplog.text
+
+
 def test_each_worker_keeps_to_a_core(two):
     found = {pid: allowed for _, ((pid, allowed),) in two.run(cores, None, range(8))}
     assert len(found) == 2

@@ -21,7 +21,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 import distributed
 from distributed.client import FutureCancelledError
@@ -180,7 +180,9 @@ class DaskEngine:
         if now - self._looked < _LOOK:
             return
         self._looked, before = now, self._known
-        self._known = frozenset(self.client.scheduler_info(n_workers=-1)["workers"])
+        # Not client.scheduler_info: what Dask refreshes in the background, without workers, may come between.
+        # Dask types it as a coroutine too, which a client that blocks never gives.
+        self._known = frozenset(cast(list[str], self.client.run_on_scheduler(_addresses)))
         if lost := len(before - self._known):
             logger.warning(f"{lost} of {len(before)} workers ended; what they had begun begins again elsewhere")
         # A batch system may let jobs wait for hours, so that this is no error.
@@ -305,6 +307,10 @@ def _done(work: Callable[[Any, Any], Iterable[Any]], name: str, unit: Any) -> li
 def _give_up_after(deaths: int, dask_scheduler: Any) -> None:
     # Dask counts those that are allowed.
     dask_scheduler.allowed_failures = deaths - 1
+
+
+def _addresses(dask_scheduler: Any) -> list[str]:
+    return list(dask_scheduler.workers)
 
 
 def _has_page(dask_scheduler: Any) -> bool:
