@@ -243,4 +243,5 @@ def draw_times(found: Mapping[str, Any], file: Path) -> None:
     axes.set_xlabel("minutes of fitting")
     axes.set_ylabel("share of the attainable savings, %")
     axes.legend(frameon=False)
+    figure.subplots_adjust(bottom=0.16, top=0.96)
     save_figure(figure, file)

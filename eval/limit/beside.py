@@ -4,8 +4,9 @@
     python -m eval.limit.beside docs/results/table1/rows.csv.gz out/limit --report docs/results/table1/observer
 
 The first command runs the observer, the baseline and the known map in the table's worlds; several folders of it, of
-different tasks, may be named. Compared are the worlds that both have. The costs of baseline and known map must be the
-same in both: otherwise they are not of the same worlds, or not of the same planner. ``--report`` writes NAME.json.
+different tasks, or files of its rows, may be named. Compared are the worlds that both have. The costs of baseline and
+known map must be the same in both: otherwise they are not of the same worlds, or not of the same planner. ``--report``
+writes NAME.json.
 """
 
 import argparse
@@ -116,10 +117,12 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", type=Path, metavar="ROWS.csv.gz", help="of eval.compact_rows")
-    parser.add_argument("observed", type=Path, nargs="+", metavar="FOLDER", help="of eval.limit")
+    parser.add_argument(
+        "observed", type=Path, nargs="+", metavar="PATH", help="folder or .jsonl.gz of eval.limit's rows"
+    )
     parser.add_argument("--report", type=Path, metavar="NAME", help="without suffix: where the results go")
     options = parser.parse_args()
-    rows = [row for folder in options.observed for row in read_rows(folder / ROWS)]
+    rows = [row for path in options.observed for row in read_rows(path / ROWS if path.is_dir() else path)]
     (environment,) = {row["environment"] for row in rows}
     formulas = {name: make(environment).task(name).text for name in make(environment).tasks}
     table, observed = costs_of(options.table), observed_costs(rows, formulas)

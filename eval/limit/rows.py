@@ -1,5 +1,6 @@
 """Trials of different answers, kept as JSON lines, so that a command goes on where it was killed."""
 
+import gzip
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,9 +10,12 @@ ROWS = "trials.jsonl"
 
 
 def read_rows(file: Path) -> list[dict[str, Any]]:
-    """Rows written so far; a line that was cut off by a kill is left out, and its trial runs again."""
+    """Rows written so far, packed or not; a line that was cut off by a kill is left out, and its trial runs again."""
+    if not file.exists():
+        return []
+    contents = gzip.decompress(file.read_bytes()) if file.suffix == ".gz" else file.read_bytes()
     rows = []
-    for line in file.read_text("utf-8").splitlines() if file.exists() else []:
+    for line in contents.decode("utf-8").splitlines():
         try:
             rows.append(json.loads(line))
         except json.JSONDecodeError:
