@@ -114,7 +114,8 @@ python -m eval.ablations --out out/ablations --views {views} --report docs/resul
 
 All but the last line are fitted to the same number of views: 1,200 buildings of the explorer, and 400 drives of PO-TLP
 with a first network. The [shipped estimator](estimator.md#how-it-was-made) had many more. Two epochs where nothing
-else is said; the network of one panorama has the settings of its own recipe.
+else is said; the network of one panorama has the settings of its own recipe but for the epochs, of which that has
+seven.
 
 ## In trials
 
