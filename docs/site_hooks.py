@@ -128,10 +128,10 @@ def _cells(notebook: Path) -> list[dict[str, Any]]:
 
 
 def notebook_page(notebook: Path) -> str:
-    """A notebook as a page: its text, and its code as blocks. Links to other notebooks lead to their pages."""
+    """A notebook as a page: its text, and its code as blocks. Links to notebooks and ``docs/`` lead to their pages."""
     parts = []
     for cell in _cells(notebook):
         source = "".join(cell["source"])
         parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
     where = f"*This page is the notebook `notebooks/{notebook.name}` of the repository.*"
-    return "\n\n".join([parts[0], where, *parts[1:]]).replace(".ipynb)", ".md)")
+    return "\n\n".join([parts[0], where, *parts[1:]]).replace(".ipynb)", ".md)").replace("](../docs/", "](../")
