@@ -149,8 +149,9 @@ def test_sight_equals_the_tables(range_cells):
         _same(jax.vmap(see), maps, cells)
 
 
+@pytest.mark.parametrize("glances", [False, True])
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.3])
-def test_looks_and_paintings_equal_those_of_their_tables(share):
+def test_looks_and_paintings_equal_those_of_their_tables(share, glances):
     _needs("camera")
     camera = CameraConfig(height=16, width=64, horizon=6.0, fold=3.0)
     rng = np.random.default_rng(round(100 * share))
@@ -168,13 +169,13 @@ def test_looks_and_paintings_equal_those_of_their_tables(share):
         paintings = jax.tree.map(lambda layer: jnp.repeat(layer[None], 8, axis=0), blank_painting(*shape))
         for at in (cells, cells[::-1]):
             pictures = jnp.asarray(rng.integers(0, 256, (8, 16, 64, 3)), jnp.uint8)
-            look = jax.vmap(functools.partial(paint, camera=camera))
+            look = jax.vmap(functools.partial(paint, camera=camera, glances=glances))
             paintings = _same(look, paintings, pictures, beliefs, at)
         assert np.isfinite(np.asarray(paintings.distance)).any()
 
         # Layers that begin as one constant stay apart.
         def first(picture, belief, at, shape=shape):
-            return paint(blank_painting(*shape), picture, belief, at, camera)
+            return paint(blank_painting(*shape), picture, belief, at, camera, glances=glances)
 
         alone = [_same(first, pictures[row], each[row], cells[row]) for row in range(8)]
         assert any((np.asarray(one.floor) != np.asarray(one.beyond)).any() for one in alone)

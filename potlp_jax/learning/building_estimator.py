@@ -43,7 +43,9 @@ class BuildingEstimator:
         self, seen: UInt8[Array, "rows columns 3"], belief: BeliefMap, cell: Int32[Array, "2"]
     ) -> "BuildingEstimator":
         """The estimator with one panorama more painted on its map (``learning.painting.paint``)."""
-        return dataclasses.replace(self, memory=paint(self.memory, seen, belief, cell, self.config.camera))
+        config = self.config
+        painted = paint(self.memory, seen, belief, cell, config.camera, glances=config.glances)
+        return dataclasses.replace(self, memory=painted)
 
     def moved(self, shape: tuple[int, int], rows: int, columns: int) -> "BuildingEstimator":
         """The estimator for another array of the same map (``learning.observing.MovesWithMap``)."""

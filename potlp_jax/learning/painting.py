@@ -21,9 +21,12 @@ from jaxtyping import Array, Bool, Float32, Int32, UInt8
 from potlp_jax.native import by_platform, target
 from potlp_jax.world.camera import CameraConfig, rows_at_slopes
 from potlp_jax.world.grid import BeliefMap, moved_layer
-from potlp_jax.world.renderer import obstacle_distances
+from potlp_jax.world.renderer import SightLines, obstacle_distances, sight_lines
 
 _HALF_DIAGONAL = math.sqrt(0.5)
+
+# More columns than a panorama has: no line meets the cell.
+_HIDDEN = 1 << 20
 
 # Entries of the table of looks (``_looks``).
 _COLUMNS, _ON_BORDER, _ROW_SHIFT = (1 << 15) - 1, 1 << 15, 16
@@ -68,6 +71,8 @@ def paint(
     belief: BeliefMap,
     cell: Int32[Array, "2"],
     camera: CameraConfig,
+    *,
+    glances: bool = False,
 ) -> Painting:
     """The painting after one more panorama.
 
@@ -77,6 +82,7 @@ def paint(
         belief: the map after the observation; only obstacles that it knows hide what is behind them.
         cell: where the panorama was taken.
         camera: its geometry; static.
+        glances: whether to paint cells of which a part alone is in sight, too, as doors are that one passes; static.
 
     Returns:
         The painting in which every cell in sight, nearer than ever before, has its colours of this panorama.
@@ -91,7 +97,9 @@ def paint(
         )
     looks = jnp.asarray(_looks(camera, *belief.cells.shape))
     free_until = obstacle_distances(belief.occupied, cell, camera)
-    known = (panorama, belief.occupied, cell, belief.extent, free_until, looks)
+    lines = sight_lines(camera, *belief.cells.shape) if glances else _no_lines(camera)
+    seen_through = jnp.asarray(lines.offset), jnp.asarray(lines.enter)
+    known = (panorama, belief.occupied, cell, belief.extent, free_until, looks, *seen_through)
     # A camera may look up or down so far that its picture has no horizon.
     horizon = min(max(math.floor(camera.horizon), 0), camera.height - 1)
     ways = (functools.partial(way, horizon=horizon) for way in (_painted_natively, _painted))
@@ -129,6 +137,8 @@ def _painted(
     extent: Int32[Array, "2"],
     free_until: Float32[Array, " columns"],
     looks: Int32[Array, "H W"],
+    offset: Int32[Array, "steps columns"],
+    enter: Float32[Array, "steps columns"],
     *,
     horizon: int,
 ) -> _Layers:
@@ -140,6 +150,10 @@ def _painted(
     column = _column_of(look, down[:, None], right[None, :], panorama.shape[1])
     # An obstacle is met at its side, and may be seen across up to half a diagonal of it.
     in_sight = away <= free_until[column] + jnp.where(occupied, jnp.float32(_HALF_DIAGONAL), 0.0)
+    if offset.shape[0]:
+        turn = _turn_to_glance(column, cell, SightLines(offset, enter), free_until)
+        column = jnp.where(in_sight, column, (column + turn) % panorama.shape[1])
+        in_sight = in_sight | (turn != _HIDDEN)
     # What pads the map to an array is no part of the building, although nothing that is known hides it.
     inside = (rows[:, None] < extent[0]) & (columns[None, :] < extent[1])
     nearer = in_sight & inside & (away < distance)
@@ -148,6 +162,29 @@ def _painted(
         jnp.where(nearer[:, :, None], panorama[horizon, column], beyond),
         jnp.where(nearer, away, distance),
     )
+
+
+def _turn_to_glance(
+    column: Int32[Array, "H W"],
+    cell: Int32[Array, "2"],
+    lines: SightLines,
+    free_until: Float32[Array, " columns"],
+) -> Int32[Array, "H W"]:
+    """By how many columns to turn from a cell's bearing to the nearest line that meets it before the sight ends."""
+    (height, width), count = column.shape, free_until.shape[0]
+    there = (cell[0] + 1) * jnp.int32(width + 2) + cell[1] + 1 + lines.offset
+    row, at = there // (width + 2) - 1, there % (width + 2) - 1
+    # The first obstacle is met, at its side, where the sight ends.
+    met = (lines.enter <= free_until[None]) & (row >= 0) & (row < height) & (at >= 0) & (at < width)
+    flat = jnp.where(met, row * width + at, height * width)
+    turn = jnp.arange(count, dtype=jnp.int32)[None] - jnp.take(column.ravel(), flat, mode="clip")
+    turn = (turn + count // 2) % count - count // 2
+    # By how far, and of two that are as far the later one first: 0, 1, -1, 2, -2, ...
+    rank = 2 * jnp.abs(turn) - jnp.where(turn > 0, 1, 0)
+    nearest = jnp.full(height * width, _HIDDEN, jnp.int32).at[flat.ravel()].min(rank.ravel(), mode="drop")
+    nearest = nearest.reshape(height, width)
+    found = jnp.where(nearest % 2 == 1, (nearest + 1) // 2, -(nearest // 2))
+    return jnp.where(nearest == _HIDDEN, _HIDDEN, found)
 
 
 def _column_of(
@@ -159,6 +196,11 @@ def _column_of(
     back = turn + jnp.where(look & _ON_BORDER, 0, 1)
     below = jnp.where(right >= 0, columns // 2 + turn, (columns - back) % columns)
     return jnp.where(down >= 0, below, jnp.where(right >= 0, columns // 2 - back, turn))
+
+
+def _no_lines(camera: CameraConfig) -> SightLines:
+    nothing = (0, camera.width)
+    return SightLines(offset=np.zeros(nothing, np.int32), enter=np.zeros(nothing, np.float32))
 
 
 @functools.lru_cache(maxsize=32)

@@ -61,6 +61,7 @@ class RecordingConfig:
         held_out: formulas whose languages are never drawn.
         camera: takes the images.
         look_every: how often it looks on the way, as in a trial (``TrialConfig``), to paint the map.
+        glances: whether cells of which a part alone is in sight are painted, too (``learning.painting.paint``).
     """
 
     views_per_world: int = 12
@@ -75,6 +76,7 @@ class RecordingConfig:
     held_out: tuple[str, ...] = ()
     camera: CameraConfig = CameraConfig()
     look_every: int = 1
+    glances: bool = True
 
 
 def recording_metadata(
@@ -134,16 +136,17 @@ class Seen:
     observer: IdealObserver | None
 
 
-@partial(jax.jit, static_argnames="camera")
+@partial(jax.jit, static_argnames=("camera", "glances"))
 def _after_picture(
     seen: Seen,
     image: UInt8[Array, "rows columns 3"],
     belief: BeliefMap,
     cell: Int32[Array, "2"],
     camera: CameraConfig,
+    glances: bool,
 ) -> Seen:
     observer = None if seen.observer is None else seen.observer.remember(None, belief, cell)
-    return Seen(painting=paint(seen.painting, image, belief, cell, camera), observer=observer)
+    return Seen(painting=paint(seen.painting, image, belief, cell, camera, glances=glances), observer=observer)
 
 
 class Recorder:
@@ -256,7 +259,9 @@ def record_views(
         image = photograph(pose.cell, pose.step)
         if image is None:
             continue
-        seen = _after_picture(seen, image, pose.belief, jnp.asarray(pose.cell, jnp.int32), config.camera)
+        seen = _after_picture(
+            seen, image, pose.belief, jnp.asarray(pose.cell, jnp.int32), config.camera, config.glances
+        )
         # Before the scene is made: finding subgoals is what takes time.
         if pose.travelled < due:
             continue
@@ -286,7 +291,7 @@ def _seen_on_the_way(
         cell = pose.way[step - before - 1]
         image = photograph(cell, step)
         if image is not None:
-            seen = _after_picture(seen, image, pose.belief, jnp.asarray(cell, jnp.int32), config.camera)
+            seen = _after_picture(seen, image, pose.belief, jnp.asarray(cell, jnp.int32), config.camera, config.glances)
     return seen
 
 

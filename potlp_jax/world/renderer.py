@@ -172,11 +172,32 @@ def obstacle_distances(
     Returns:
         Distances in cells.
     """
-    height, width = occupied.shape
-    # Beyond the array everything hides: rays end there, as the tables want it.
-    rays, _ = _tables(config, height + 2, width + 2)
-    tables = jnp.asarray(rays.offset), jnp.asarray(rays.enter)
+    lines = sight_lines(config, *occupied.shape)
+    tables = jnp.asarray(lines.offset), jnp.asarray(lines.enter)
     return by_platform("camera", _looked_natively, _looked, occupied, cell, *tables)
+
+
+class SightLines(NamedTuple):
+    """The cells that the columns of a panorama look through one after the other, whatever stands there.
+
+    Attributes:
+        offset: flat, from the robot's cell, in the array with a border of one cell.
+        enter: at what distance the cell is entered, in cells, growing from step to step.
+    """
+
+    offset: Int32[np.ndarray, "steps columns"]
+    enter: Float32[np.ndarray, "steps columns"]
+
+
+def sight_lines(config: CameraConfig, height: int, width: int) -> SightLines:
+    """The lines of sight of a panorama in an array of this shape.
+
+    Args:
+        config: the camera's geometry.
+        height, width: of the array. Beyond it everything hides: lines end in the border.
+    """
+    rays, _ = _tables(config, height + 2, width + 2)
+    return SightLines(offset=rays.offset, enter=rays.enter)
 
 
 def _looked_natively(

@@ -63,6 +63,41 @@ int64_t ColumnOf(int32_t look, int64_t down, int64_t right, int64_t columns) {
   return right >= 0 ? columns / 2 - back : turn;
 }
 
+// No line meets the cell.
+constexpr int32_t kHidden = INT32_MAX;
+
+// By how many columns one turns from a cell's bearing, as its rank in the order 0, 1, -1, 2, -2, ...
+int32_t RankOfTurn(int64_t turn) { return static_cast<int32_t>(turn > 0 ? 2 * turn - 1 : -2 * turn); }
+int64_t TurnOfRank(int32_t rank) { return rank % 2 ? (rank + 1) / 2 : -(rank / 2); }
+
+// Of every cell the rank of the line nearest to its bearing among those that meet it before the sight ends.
+std::vector<int32_t> Glances(const ffi::Buffer<ffi::S32>& offset, const ffi::Buffer<ffi::F32>& enter,
+                             const float* free_until, const int32_t* cell, const int32_t* looks, int64_t height,
+                             int64_t width) {
+  const int64_t steps = offset.dimensions()[0], columns = offset.dimensions()[1], stride = width + 2;
+  std::vector<int32_t> nearest(height * width, kHidden);
+  std::vector<int32_t> going(columns);
+  for (int64_t column = 0; column < columns; ++column) going[column] = static_cast<int32_t>(column);
+  for (int64_t step = 0; step < steps && !going.empty(); ++step) {
+    size_t kept = 0;
+    for (const int32_t line : going) {
+      // The first obstacle is met, at its side, where the sight ends.
+      if (!(enter.typed_data()[step * columns + line] <= free_until[line])) continue;
+      going[kept++] = line;
+      const int64_t there = (cell[0] + 1) * stride + cell[1] + 1 + offset.typed_data()[step * columns + line];
+      const int64_t row = there / stride - 1, column = there % stride - 1;
+      if (there < stride || row >= height || column < 0 || column >= width) continue;
+      const int64_t down = row - cell[0], right = column - cell[1];
+      const int32_t look = looks[std::abs(down) * width + std::abs(right)];
+      const int64_t away = line - ColumnOf(look, down, right, columns) + columns + columns / 2;
+      const int32_t rank = RankOfTurn(away % columns - columns / 2);
+      nearest[row * width + column] = std::min(nearest[row * width + column], rank);
+    }
+    going.resize(kept);
+  }
+  return nearest;
+}
+
 template <typename T, ffi::DataType type>
 T* Continued(const ffi::Buffer<type>& before, ffi::ResultBuffer<type>& after) {
   if (after->typed_data() != before.typed_data()) {
@@ -74,7 +109,8 @@ T* Continued(const ffi::Buffer<type>& before, ffi::ResultBuffer<type>& after) {
 ffi::Error Paint(ffi::Buffer<ffi::U8> floor_before, ffi::Buffer<ffi::U8> beyond_before,
                  ffi::Buffer<ffi::F32> distance_before, ffi::Buffer<ffi::U8> panorama, ffi::Buffer<ffi::PRED> occupied,
                  ffi::Buffer<ffi::S32> cell, ffi::Buffer<ffi::S32> extent, ffi::Buffer<ffi::F32> free_until,
-                 ffi::Buffer<ffi::S32> looks, int64_t horizon, ffi::ResultBuffer<ffi::U8> floor_after,
+                 ffi::Buffer<ffi::S32> looks, ffi::Buffer<ffi::S32> offset, ffi::Buffer<ffi::F32> enter,
+                 int64_t horizon, ffi::ResultBuffer<ffi::U8> floor_after,
                  ffi::ResultBuffer<ffi::U8> beyond_after, ffi::ResultBuffer<ffi::F32> distance_after) {
   const int64_t height = occupied.dimensions()[0], width = occupied.dimensions()[1];
   const int64_t columns = panorama.dimensions()[1];
@@ -83,6 +119,12 @@ ffi::Error Paint(ffi::Buffer<ffi::U8> floor_before, ffi::Buffer<ffi::U8> beyond_
   float* distance = Continued<float>(distance_before, distance_after);
   const uint8_t* pixels = panorama.typed_data();
   const float* free = free_until.typed_data();
+  // Without lines cells are seen in the column of their bearing, or not at all.
+  const bool glances = offset.dimensions()[0] > 0;
+  std::vector<int32_t> nearest;
+  if (glances) {
+    nearest = Glances(offset, enter, free, cell.typed_data(), looks.typed_data(), height, width);
+  }
   // No cell farther away than the longest look is in sight.
   const float farthest = *std::max_element(free, free + columns) + kHalfDiagonal;
   const int64_t rows_inside = std::min<int64_t>(height, extent.typed_data()[0]);
@@ -95,9 +137,12 @@ ffi::Error Paint(ffi::Buffer<ffi::U8> floor_before, ffi::Buffer<ffi::U8> beyond_
       const float away = std::sqrt(static_cast<float>(down * down + right * right));
       if (!(away < distance[at]) || away > farthest) continue;
       const int32_t look = looks.typed_data()[far_down * width + std::min(std::abs(right), width - 1)];
-      const int64_t seen_in = ColumnOf(look, down, right, columns);
+      int64_t seen_in = ColumnOf(look, down, right, columns);
       // An obstacle is met at its side, and may be seen across up to half a diagonal of it.
-      if (!(away <= free[seen_in] + (occupied.typed_data()[at] ? kHalfDiagonal : 0.0f))) continue;
+      if (!(away <= free[seen_in] + (occupied.typed_data()[at] ? kHalfDiagonal : 0.0f))) {
+        if (!glances || nearest[at] == kHidden) continue;
+        seen_in = (seen_in + TurnOfRank(nearest[at]) + columns) % columns;
+      }
       std::copy_n(pixels + ((look >> kRowShift) * columns + seen_in) * 3, 3, floor + at * 3);
       std::copy_n(pixels + (horizon * columns + seen_in) * 3, 3, beyond + at * 3);
       distance[at] = away;
@@ -128,6 +173,8 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(paint, potlp::Paint,
                                   .Arg<xla::ffi::Buffer<xla::ffi::S32>>()
                                   .Arg<xla::ffi::Buffer<xla::ffi::F32>>()
                                   .Arg<xla::ffi::Buffer<xla::ffi::S32>>()
+                                  .Arg<xla::ffi::Buffer<xla::ffi::S32>>()
+                                  .Arg<xla::ffi::Buffer<xla::ffi::F32>>()
                                   .Attr<int64_t>("horizon")
                                   .Ret<xla::ffi::Buffer<xla::ffi::U8>>()
                                   .Ret<xla::ffi::Buffer<xla::ffi::U8>>()
