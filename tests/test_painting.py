@@ -1,5 +1,6 @@
 """What is painted on the map, against a loop over cells, and against a rendered room whose colours are known."""
 
+import dataclasses
 import itertools
 import math
 
@@ -15,7 +16,7 @@ from potlp_jax.world.renderer import obstacle_distances, render
 from potlp_jax.world.sensing import SensorConfig, observe
 
 CAMERA = CameraConfig(height=64, width=128, horizon=24.0, fold=8.0, texture=0.0)
-paint_jit = jax.jit(paint, static_argnames="camera")
+paint_jit = jax.jit(paint, static_argnames=("camera", "glances"))
 
 
 def _room(rows: int = 14, columns: int = 20) -> np.ndarray:
@@ -44,11 +45,31 @@ def _walk(occupied: np.ndarray, cell: tuple[int, int], bearing: float) -> float:
     raise AssertionError
 
 
-def _slow_paint(painting: Painting, panorama: np.ndarray, belief: BeliefMap, cell: tuple[int, int]) -> Painting:
+def _met_by_lines(occupied: np.ndarray, cell: tuple[int, int], bearings: np.ndarray) -> dict[tuple[int, int], set]:
+    """By cell the columns whose lines meet it before, or where, they meet an obstacle."""
+    found: dict[tuple[int, int], set] = {}
+    for column, bearing in enumerate(bearings):
+        for step in itertools.count():
+            row, at = (
+                round(start + step * 1e-3 * turn)
+                for start, turn in zip(cell, (math.sin(bearing), math.cos(bearing)), strict=True)
+            )
+            if not (0 <= row < occupied.shape[0] and 0 <= at < occupied.shape[1]):
+                break
+            found.setdefault((row, at), set()).add(column)
+            if occupied[row, at] and (row, at) != cell:
+                break
+    return found
+
+
+def _slow_paint(
+    painting: Painting, panorama: np.ndarray, belief: BeliefMap, cell: tuple[int, int], *, glances: bool
+) -> Painting:
     """Cell by cell: the column whose bearing is nearest, the row of the floor at the cell's distance."""
     floor, beyond = np.array(painting.floor), np.array(painting.beyond)
     distance, occupied = np.array(painting.distance), np.asarray(belief.occupied)
     bearings = column_bearings(CAMERA)
+    met = _met_by_lines(occupied, cell, bearings) if glances else {}
     for row, column in np.ndindex(*distance.shape):
         away = math.hypot(row - cell[0], column - cell[1])
         if away >= distance[row, column]:
@@ -60,7 +81,11 @@ def _slow_paint(painting: Painting, panorama: np.ndarray, belief: BeliefMap, cel
         chosen = nearest[-1] if nearest[0] != 0 or len(nearest) == 1 else nearest[0]
         # Of an obstacle its side is seen, at most half a diagonal before its middle.
         if away > _walk(occupied, cell, bearings[chosen]) + (math.sqrt(0.5) if occupied[row, column] else 0.0):
-            continue
+            if (row, column) not in met:
+                continue
+            # Of two columns that are as far from the bearing the later one.
+            turns = [(one - chosen + 64) % 128 - 64 for one in met[row, column]]
+            chosen = (chosen + min(turns, key=lambda turn: (abs(turn), turn < 0))) % 128
         line = round(float(floor_rows(CAMERA, jnp.float32(away))))
         floor[row, column] = panorama[min(line, CAMERA.height - 1), chosen]
         beyond[row, column] = panorama[24, chosen]
@@ -68,15 +93,16 @@ def _slow_paint(painting: Painting, panorama: np.ndarray, belief: BeliefMap, cel
     return Painting(floor=jnp.asarray(floor), beyond=jnp.asarray(beyond), distance=jnp.asarray(distance))
 
 
+@pytest.mark.parametrize("glances", [False, True])
 @pytest.mark.parametrize("unknown_from", [20, 12])
-def test_painting_is_what_a_loop_over_cells_paints(unknown_from):
+def test_painting_is_what_a_loop_over_cells_paints(unknown_from, glances):
     random = np.random.default_rng(0)
     belief = _belief(_room(), unknown_from)
     fast, slow = blank_painting(14, 20), blank_painting(14, 20)
     for cell in ((3, 3), (10, 5), (2, 7)):
         panorama = random.integers(0, 256, (64, 128, 3)).astype(np.uint8)
-        fast = paint_jit(fast, jnp.asarray(panorama), belief, jnp.asarray(cell), CAMERA)
-        slow = _slow_paint(slow, panorama, belief, cell)
+        fast = paint_jit(fast, jnp.asarray(panorama), belief, jnp.asarray(cell), CAMERA, glances=glances)
+        slow = _slow_paint(slow, panorama, belief, cell, glances=glances)
         np.testing.assert_allclose(fast.distance, slow.distance, rtol=1e-6)
         np.testing.assert_array_equal(fast.beyond, slow.beyond)
         np.testing.assert_array_equal(fast.floor, slow.floor)
@@ -129,6 +155,32 @@ def test_cells_are_painted_from_the_column_that_looks_along_their_bearing():
         rows, columns = np.mgrid[:height, :width] - np.reshape(cell, (2, 1, 1))
         expected = np.floor((np.arctan2(rows, columns) + math.pi) * (512 / (2 * math.pi)) + 1e-9).astype(int) % 512
         np.testing.assert_array_equal(found[..., 0] + 256 * found[..., 1], expected)
+
+
+def test_a_glance_paints_a_door_that_the_robot_passes_and_its_middle_does_not_show():
+    """A dark room below a lit hallway, its door two cells deep and seen from aside."""
+    occupied = np.ones((16, 30), bool)
+    occupied[2:6, 1:-1] = occupied[8:14, 10:20] = occupied[6:8, 15] = False
+    light = np.ones(occupied.shape, np.float32)
+    light[6:] = 0.0
+    look = dataclasses.replace(Appearance.plain(16, 30), light=jnp.asarray(light))
+    world = make_world(occupied, np.zeros(occupied.shape, np.int32), (5, 4), appearance=look)
+    at = jnp.array([5, 11])
+    belief = observe(BeliefMap.unobserved(world), world, at, SensorConfig(range_cells=60.0))
+    picture = render(world, at, CAMERA)
+    plain, glanced = (
+        paint_jit(blank_painting(16, 30), picture, belief, at, CAMERA, glances=glances) for glances in (False, True)
+    )
+    door = (6, 15)
+    assert bool(belief.free[door])
+    assert not np.isfinite(plain.distance[door])
+    assert np.isfinite(glanced.distance[door])
+    # At eye height the far side of the door frame, which has the light of the door.
+    assert int(glanced.beyond[door].max()) < 60 < int(glanced.beyond[3, 11].max())
+    # What the middle shows stays as it is.
+    seen = np.isfinite(np.asarray(plain.distance))
+    np.testing.assert_array_equal(np.asarray(glanced.floor)[seen], np.asarray(plain.floor)[seen])
+    np.testing.assert_array_equal(np.asarray(glanced.beyond)[seen], np.asarray(plain.beyond)[seen])
 
 
 def _coloured_world():

@@ -259,9 +259,8 @@ def record_views(
         image = photograph(pose.cell, pose.step)
         if image is None:
             continue
-        seen = _after_picture(
-            seen, image, pose.belief, jnp.asarray(pose.cell, jnp.int32), config.camera, config.glances
-        )
+        at = jnp.asarray(pose.cell, jnp.int32)
+        seen = _after_picture(seen, image, pose.belief, at, config.camera, config.glances)
         # Before the scene is made: finding subgoals is what takes time.
         if pose.travelled < due:
             continue
