@@ -13,11 +13,13 @@ from potlp_jax.learning.building_estimator import BuildingEstimator
 from potlp_jax.learning.building_learner import BuildingInputs, BuildingLearner, BuildingOptions
 from potlp_jax.learning.dataset import Samples, encode
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
+from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.loss import DataScale
 from potlp_jax.learning.map_images import encode_view, encode_world
 from potlp_jax.learning.painting import blank_painting, paint
 from potlp_jax.learning.training_options import TrainingConfig
 from potlp_jax.learning.training_steps import initial_state, make_train_step
+from potlp_jax.recipes.fitting import learner_after
 from potlp_jax.task.task import Task
 from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
@@ -158,6 +160,25 @@ def test_answers_in_training_are_those_of_the_estimator_in_a_trial(learner, para
             compared += 1
     assert compared >= 8
     assert len(np.unique(np.asarray(answers.success_logit))) > 1
+
+
+@pytest.mark.parametrize("glances", [False, True])
+def test_maps_are_painted_in_trials_as_in_the_training_data(samples, params, glances):
+    metadata = dataclasses.replace(samples.metadata, collection={"glances": glances})
+    painted = dataclasses.replace(samples, metadata=metadata)
+    config = SIZES.learner(painted).config
+    assert config.glances == glances
+    other = dataclasses.replace(config, glances=not glances)
+    begin = TrainedEstimator(params, other, metadata.domain, {}, "before", "0")
+    assert learner_after(begin, painted).config == config
+    # And the estimator of a trial does as its configuration says: a door that it looks at from aside.
+    world = _world(True)
+    cell = jnp.array([5, 7], jnp.int32)
+    belief = observe(BeliefMap.unobserved(world), world, cell, SensorConfig(range_cells=9.0))
+    estimator = BuildingEstimator(params=params, memory=blank_painting(*SHAPE), config=config)
+    seen = estimator.remember(render(world, cell, CAMERA), belief, cell).memory
+    assert bool(belief.free[4, 10])
+    assert bool(jnp.isfinite(seen.distance[4, 10])) == glances
 
 
 def _worlds():

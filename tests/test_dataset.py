@@ -294,6 +294,10 @@ def test_data_sets_of_one_family_are_joined(tmp_path):
     other = dataclasses.replace(two, metadata=dataclasses.replace(two.metadata, resolution=0.5))
     with pytest.raises(DatasetError, match=r"differ in resolution cannot be joined: 1\.0 and 0\.5"):
         joined([one, other])
+    # A data set that does not say it was painted without.
+    painted = dataclasses.replace(two.metadata, collection={"glances": True})
+    with pytest.raises(DatasetError, match="differ in glances cannot be joined: False and True"):
+        joined([one, dataclasses.replace(two, metadata=painted)])
 
 
 def test_images_stay_on_disk(tmp_path):

@@ -20,6 +20,7 @@ from potlp_jax.cli import app
 from potlp_jax.codec import config_from_dict
 from potlp_jax.errors import EvaluationError, PropositionsError
 from potlp_jax.learning.ablations import INTACT, ablated
+from potlp_jax.learning.building_config import BuildingConfig
 from potlp_jax.learning.dataset import Samples, decode, encode, view_id, write_shard
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.estimator import estimator_file, shipped_files
@@ -367,6 +368,10 @@ def test_an_estimator_is_evaluated_on_data_of_its_own_kind_only():
         check_fit(CONFIG, low, samples, "net", "data")
     with pytest.raises(EvaluationError, match="counts in metres"):
         check_fit(CONFIG, dataclasses.replace(learned, unit="metres"), samples, "net", "data")
+    building = BuildingConfig(propositions=CONFIG.propositions, image_shape=CONFIG.image_shape, glances=False)
+    check_fit(building, learned, samples, "net", "data")
+    with pytest.raises(EvaluationError, match=r"data was painted without glances.*from with;.*--set glances=true"):
+        check_fit(dataclasses.replace(building, glances=True), learned, samples, "net", "data")
     with pytest.raises(EvaluationError, match="no panoramas"):
         check_fit(CONFIG, learned, dataclasses.replace(samples, images=[]), "net", "data")
 

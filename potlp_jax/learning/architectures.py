@@ -73,7 +73,7 @@ ARCHITECTURES: Mapping[str, Architecture] = MappingProxyType(
                 BuildingNetwork,
                 _building_operations,
                 _start_building,
-                before={"contrast": 0},
+                before={"contrast": 0, "glances": False},
             ),
         )
     }

@@ -29,7 +29,7 @@ class BuildingConfig:
         step: the least R_S, one step of the grid, in the unit of cost.
         exclusive_within: as in ``NetworkConfig``.
         glances: whether cells of which a part alone is in sight are painted, too, as in the training data
-            (``learning.painting.paint``); files of 0.1 were trained without.
+            (``learning.painting.paint``); networks of files that do not say it were trained without.
         without: of ``ABLATABLE``, what the network is not shown; for measuring what each is good for, and for
             buildings of all sizes, among which a position says nothing.
     """
@@ -49,7 +49,7 @@ class BuildingConfig:
     failure_cost_scale: float = 30.0
     step: float = 1.0
     exclusive_within: float = 0.0
-    glances: bool = False
+    glances: bool = True
     without: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

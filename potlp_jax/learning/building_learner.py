@@ -158,8 +158,7 @@ class BuildingOptions:
                 **chosen,
                 **cost_scales(samples),
                 **camera_geometry(samples, "painting the map"),
-                # Data sets of 0.1 do not say it: there was no other way.
-                glances=bool(samples.metadata.collection.get("glances", False)),
+                glances=samples.metadata.glances,
             )
         )
 

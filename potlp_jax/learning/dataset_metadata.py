@@ -91,6 +91,12 @@ class DatasetMetadata:
             raise DatasetError(f"not the metadata of a dataset: {error}") from error
         return Domain.of_cells(self.family, camera, self.resolution)
 
+    @property
+    def glances(self) -> bool:
+        """Whether cells of which a part alone was in sight are painted, too (``learning.painting.paint``)."""
+        # Data sets that do not say it were recorded when there was no other way.
+        return bool(self.collection.get("glances", False))
+
     def differences(self, other: "DatasetMetadata") -> list[str]:
         """What differs, with both values: of this dataset, and of the other."""
         return differences(json_copy(dataclasses.asdict(self)), json_copy(dataclasses.asdict(other)))

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from potlp_jax.errors import EvaluationError
 from potlp_jax.learning.architectures import EstimatorConfig
 from potlp_jax.learning.batches import Batch, Batches
+from potlp_jax.learning.building_config import BuildingConfig
 from potlp_jax.learning.dataset import Samples, decode
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.learner import Learner
@@ -55,7 +56,8 @@ def check_fit(config: EstimatorConfig, domain: Domain, samples: Samples, estimat
 
     Raises:
         PropositionsError: other propositions.
-        EvaluationError: another size of panorama, another camera or another unit of cost than those it learned from.
+        EvaluationError: another size of panorama, another camera, another unit of cost or maps painted in
+            another way than those it learned from.
     """
     require_propositions(config.propositions, tuple(samples.metadata.propositions), estimator, asker=dataset)
     if not samples.images:
@@ -71,6 +73,12 @@ def check_fit(config: EstimatorConfig, domain: Domain, samples: Samples, estimat
         raise EvaluationError(
             f"{dataset} is not what {estimator} learned from: {'; '.join(misfits)}. Collect a data set with the same, "
             "or train an estimator for this one"
+        )
+    if isinstance(config, BuildingConfig) and config.glances != samples.metadata.glances:
+        painted = {True: "with", False: "without"}
+        raise EvaluationError(
+            f"{dataset} was painted {painted[samples.metadata.glances]} glances, the maps that {estimator} learned "
+            f"from {painted[config.glances]}; collect it again with --set glances={str(config.glances).lower()}"
         )
 
 

@@ -25,6 +25,7 @@ from potlp_jax.checks import AT_LEAST_ONE, require_fields
 from potlp_jax.codec import differences
 from potlp_jax.errors import TrainingError
 from potlp_jax.files import MOST_TEXT, read_json, reading
+from potlp_jax.learning.building_config import BuildingConfig
 from potlp_jax.learning.building_learner import BuildingOptions
 from potlp_jax.learning.dataset import Samples
 from potlp_jax.learning.devices import agreed, is_first, mesh
@@ -86,7 +87,8 @@ def fit(
         out: the fit's folder.
         config: what is fitted, and how.
         display: shows how it goes; of the first process alone.
-        initial: an estimator to go on from, whose network is kept as it is; a new one by default.
+        initial: an estimator to go on from, whose network is kept as it is, but for how its maps are painted, which is
+            as in the training data; a new one by default.
 
     Returns:
         The best parameters, which ``out`` / ``ESTIMATOR`` holds as well.
@@ -96,7 +98,7 @@ def fit(
         CheckpointError: ``out`` holds a damaged checkpoint, or one of another training.
     """
     begin = None if initial is None else read_estimator(initial)
-    learner = config.network.learner(training) if begin is None else _learner_of(begin, training)
+    learner = config.network.learner(training) if begin is None else learner_after(begin, training)
     # Measuring counts: the time asked for is that of the whole command.
     began = time.perf_counter()
     plan = _plan(learner, training, out, config)
@@ -137,11 +139,14 @@ def _begin_journal(training: Samples, plan: TrainingConfig, out: Path, config: F
     return Journal(out, plan.steps, display)
 
 
-def _learner_of(begin: TrainedEstimator, training: Samples) -> Learner:
+def learner_after(begin: TrainedEstimator, training: Samples) -> Learner:
     """What is fitted where an estimator is gone on from."""
     known = begin.config
     require_propositions(known.propositions, training.metadata.propositions, begin.name, asker="the training data")
-    # The scales of costs are the estimator's own: with others its parameters would mean other costs.
+    # The scales of costs are the estimator's own: with others its parameters would mean other costs. Its maps are
+    # painted as those from which it learns now.
+    if isinstance(known, BuildingConfig):
+        known = dataclasses.replace(known, glances=training.metadata.glances)
     return learner_of(known)
 
 
