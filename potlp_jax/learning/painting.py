@@ -78,7 +78,7 @@ def paint(
     cell: Int32[Array, "2"],
     camera: CameraConfig,
     *,
-    glances: bool = False,
+    glances: bool = True,
 ) -> Painting:
     """The painting after one more panorama.
 
