@@ -298,7 +298,7 @@ def test_operations_are_about_those_that_xla_counts(params):
     assert first == pytest.approx(analysis["flops"], rel=0.2)
     assert pair == 2 * (PROSPECTS * 16 + 3 * 16 * 16 + 16 * 3)
     # 25 squares of 8 features, 9 of 8 of the one scale of the decoder, 12 of the whole, 2 coordinates.
-    assert place == 2 * ((25 * 8 + 9 * 8 + 12 + 2) * 16 + 16 * 16)
+    assert place == 2 * ((25 * 14 + 25 * 8 + 9 * 8 + 12 + 2) * 16 + 16 * 16)
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,7 @@ ARCHITECTURES: Mapping[str, Architecture] = MappingProxyType(
                 BuildingNetwork,
                 _building_operations,
                 _start_building,
-                before={"contrast": 0, "glances": False},
+                before={"contrast": 0, "raw": 0, "glances": False},
             ),
         )
     }

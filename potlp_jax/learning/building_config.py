@@ -24,6 +24,8 @@ class BuildingConfig:
         decoder: channels at least, on the way back to squares of ``SQUARE`` cells.
         head: units of each layer of the head; condition: of the layer that reads phi.
         contrast: channels in which squares are compared with others of their kind in the building; 0 for none.
+        raw: side, in cells, of the square around a subgoal of which the head reads the map's channels as they are, odd;
+            0 for none.
         success_cost_scale, failure_cost_scale: unit of the outputs R_S and R_F, and of their errors in the loss
             (standard deviations over the training data).
         step: the least R_S, one step of the grid, in the unit of cost.
@@ -45,6 +47,7 @@ class BuildingConfig:
     head: int = 128
     condition: int = 64
     contrast: int = 24
+    raw: int = 5
     success_cost_scale: float = 30.0
     failure_cost_scale: float = 30.0
     step: float = 1.0
@@ -65,6 +68,8 @@ class BuildingConfig:
                 raise NetworkError(f"{name} is {getattr(self, name)}; give a positive number")
         if self.contrast < 0:
             raise NetworkError(f"contrast is {self.contrast}; give a number of channels, 0 for none")
+        if self.raw < 0 or (self.raw and self.raw % 2 == 0):
+            raise NetworkError(f"raw is {self.raw}; give an odd number of cells, 0 for none")
         for name in ("success_cost_scale", "failure_cost_scale", "step", "far", "fold"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise NetworkError(f"{name} is {getattr(self, name)}; give a positive number")

@@ -141,6 +141,7 @@ class BuildingOptions:
     head: int = BuildingConfig.head
     condition: int = BuildingConfig.condition
     contrast: int = BuildingConfig.contrast
+    raw: int = BuildingConfig.raw
     exclusive_within: float = BuildingConfig.exclusive_within
     without: tuple[str, ...] = BuildingConfig.without
 

@@ -58,12 +58,14 @@ class EncodedMap:
     """What the first stage makes of a map; any leading dimensions.
 
     Attributes:
+        cells: the channels that it was made from, as far as the network is shown them.
         close: features of squares of 2 cells.
         scales: features of squares of ``SQUARE`` cells, then of twice the side, and so on.
         whole: of the building as a whole.
         squares: logits of what ``Squares`` holds.
     """
 
+    cells: Float32[Array, "*B H W K"]
     close: Float32[Array, "*B h w F"]
     scales: tuple[Array, ...]
     whole: Float32[Array, "*B G"]
@@ -158,7 +160,9 @@ class _Encoder(nn.Module):
         # Small, so that training starts near even odds.
         propositions = len(config.propositions)
         squares = split(_dense(numbers_per_square(propositions), 0.01)(x), propositions)
-        return EncodedMap(close=scales[0], scales=tuple(reversed(decoded)), whole=whole, squares=squares)
+        return EncodedMap(
+            cells=channels, close=scales[0], scales=tuple(reversed(decoded)), whole=whole, squares=squares
+        )
 
     def _down(self, x: Array) -> list[Array]:
         scales, painted = [], _painted_share(x)
@@ -248,11 +252,13 @@ class _Network(nn.Module):
 
 def _read_at(encoded: EncodedMap, cells: Int32[Array, "*B S 2"], config: BuildingConfig) -> Float32[Array, "*B S F"]:
     """What the first stage says around cells, at every scale, and of the whole building."""
+    # Which cell of a square of two by two is the subgoal, and what colour that one has, the square does not say.
+    own = [_around(encoded.cells, cells, config.raw // 2)] if config.raw else []
     close = _around(encoded.close, cells // 2, _CLOSE)
     near = [_around(scale, cells // (SQUARE * 2**level), _NEAR) for level, scale in enumerate(encoded.scales)]
     whole = jnp.broadcast_to(encoded.whole[..., None, :], (*cells.shape[:-1], encoded.whole.shape[-1]))
     position = jnp.float32("position" not in config.without) * cells.astype(jnp.float32) / _COORDINATE
-    return jnp.concatenate([close, *near, whole, position], axis=-1)
+    return jnp.concatenate([*own, close, *near, whole, position], axis=-1)
 
 
 def _around(features: Float32[Array, "*B h w F"], at: Int32[Array, "*B S 2"], reach: int) -> Float32[Array, "*B S N"]:
@@ -343,5 +349,6 @@ def building_operations(config: BuildingConfig, height: int, width: int) -> tupl
         first += 2 * areas[level] * (config.widths[level] * o + 9 * o * o) + 2 * areas[level + 1] * below * o
     first += 2 * areas[1] * decoded[0] * numbers_per_square(len(config.propositions)) + 2 * 3 * config.widths[-1] ** 2
     read = (2 * _CLOSE + 1) ** 2 * config.widths[0] + (2 * _NEAR + 1) ** 2 * sum(decoded) + config.widths[-1] + 2
+    read += config.raw**2 * channel_count(config)
     place = sum(2 * i * o for i, o in itertools.pairwise((read, config.head, config.head)))
     return first, place, 2 * config.head * (PROSPECTS + _MODULATED * config.head + _OUTPUTS)
