@@ -59,7 +59,10 @@ class Experiment:
 
 _OTHERS = {"POTLP_EXTERNAL_DATA": "{data}"}
 
-_COLLECTED = "potlp collect firefighting --split validation --out {out} --set staying_sets=3 --set worlds_per_shard=20"
+_COLLECTED = (
+    "potlp collect firefighting --split validation --out {out} --set staying_sets=3 --set worlds_per_shard=20 "
+    "--set glances=false"
+)
 _DRIVEN = "--set driver=potlp --set estimator=firefighting --set drives=1 --set first_world=5000"
 _SHIPPED = "potlp_jax/learning/data/"
 

@@ -14,7 +14,7 @@ from potlp_jax.learning.building_estimator import BuildingEstimator
 from potlp_jax.learning.building_network import BuildingNetwork, building_operations, compared
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.imagined_paths import PROSPECTS, outlook, prospects, scenery
-from potlp_jax.learning.map_channels import channel_count, map_channels
+from potlp_jax.learning.map_channels import channel_count, map_channels, of_painting
 from potlp_jax.learning.observing import ObservingEstimator, looks_on_the_way, observe_panorama
 from potlp_jax.learning.painting import blank_painting
 from potlp_jax.learning.serialization import load_estimator, save_estimator
@@ -249,13 +249,40 @@ def test_trials_with_the_network_are_the_same_alone_and_in_a_batch(params):
         np.testing.assert_array_equal(trial.path, np.asarray(alone.path))
 
 
+def test_subgoals_in_one_square_are_told_apart_by_the_cells_around_them(params):
+    """Nothing but the cells themselves, as they are, tells two corners of a square of two by two from each other."""
+    rng = np.random.default_rng(5)
+    channels = jnp.asarray(rng.normal(size=(12, 26, 14)).astype(np.float32))
+    cells = jnp.array([[4, 6], [5, 7]], jnp.int32)
+    blind = dataclasses.replace(CONFIG, raw=0, without=("position",))
+    for config in (blind, dataclasses.replace(blind, raw=3)):
+        network = BuildingNetwork(config)
+        found = network.init(jax.random.key(2))
+        one, other = np.asarray(network.places(found, network.encode(found, channels), cells))
+        assert np.array_equal(one, other) == (config.raw == 0)
+
+
+def test_what_is_painted_enters_nowhere_where_it_is_left_out(params):
+    config = dataclasses.replace(CONFIG, without=("painting",))
+    network = BuildingNetwork(config)
+    rng = np.random.default_rng(6)
+    channels = rng.normal(size=(12, 26, 14)).astype(np.float32)
+    other = channels.copy()
+    other[..., of_painting(14)] += 1
+    cells = jnp.array([[4, 6]], jnp.int32)
+    one, same = (
+        network.places(params, network.encode(params, jnp.asarray(shown)), cells) for shown in (channels, other)
+    )
+    np.testing.assert_array_equal(one, same)
+
+
 def test_a_file_from_before_colours_were_compared_is_read(tmp_path):
-    config = dataclasses.replace(CONFIG, contrast=0)
+    config = dataclasses.replace(CONFIG, contrast=0, raw=0, glances=False)
     params = BuildingNetwork(config).init(jax.random.key(0))
     save_estimator(tmp_path / "now.npz", params, config, Domain("toy", CAMERA, "cells"), {})
     arrays = dict(np.load(tmp_path / "now.npz"))
     header = json.loads(arrays.pop("header").tobytes())
-    assert header["network"].pop("contrast") == 0
+    assert [header["network"].pop(name) for name in ("contrast", "raw", "glances")] == [0, 0, False]
     np.savez(tmp_path / "before.npz", header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
     assert load_estimator(tmp_path / "before.npz")[1] == config
 
@@ -309,6 +336,8 @@ def test_operations_are_about_those_that_xla_counts(params):
         ("blocks", (1,), "blocks"),
         ("head", 0, "head"),
         ("contrast", -1, "contrast"),
+        ("raw", 4, "raw"),
+        ("raw", -1, "raw"),
         ("far", float("nan"), "far"),
         ("exclusive_within", -1.0, "exclusive_within"),
     ],

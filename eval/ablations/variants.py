@@ -4,7 +4,7 @@ import dataclasses
 
 FAMILY: str = "firefighting"
 
-_COMMON = ("views_per_world=5", "spacing=[10,120]", "staying_sets=3", "worlds_per_shard=20")
+_COMMON = ("views_per_world=5", "spacing=[10,120]", "staying_sets=3", "worlds_per_shard=20", "glances=false")
 _EXPLORER = (*_COMMON, "pursued=2", "look_every=0")
 
 
@@ -56,7 +56,7 @@ _BUILDING = (
     "training.augmentation.colour=0.08",
     "training.patience=0",
 )
-_WHOLE = (*_BUILDING, "network.contrast=24")
+_WHOLE = (*_BUILDING, "network.contrast=24", "network.raw=0")
 # As in the recipe of firefighting-panorama.
 _PANORAMA = ("network.kind=panorama", "network.exclusive_within=16", "training.patience=10")
 
@@ -91,7 +91,7 @@ VARIANTS: dict[str, Variant] = {
     "no-map": Variant(says="no map: one panorama (the paper's kind), at its own settings", network=_PANORAMA),
     "no-paths": Variant(says="no paths through the imagined building", network=(*_WHOLE, "network.without=[paths]")),
     "no-contrast": Variant(
-        says="no comparison of colours across the building", network=(*_BUILDING, "network.contrast=0")
+        says="no comparison of colours across the building", network=(*_BUILDING, "network.contrast=0", "network.raw=0")
     ),
     "one-epoch": Variant(says="half of the time", network=_WHOLE, epochs=1),
     "six-epochs": Variant(says="three times the time", network=_WHOLE, epochs=6),
