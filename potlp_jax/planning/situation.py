@@ -41,6 +41,8 @@ class DecisionConfig:
       commitment: hysteresis: fraction of its expected cost by which another action must be cheaper before the robot
         switches to it. 0: it switches at once, as published. The default was chosen on validation worlds, against
         0, 30 % and fixed numbers of cells (docs/results/panorama.md, "Commitment").
+      least_chance: share of the largest P_S of a class below which a subgoal is no way to it (``worthwhile``). 0: all
+        count, as published.
       irrevocable_last: an irrevocable move is made only on a known path to acceptance, or where no frontier can be
         reached without one (docs/model.md section 7). False: it is weighed like any other move.
       path_horizon: moves in the path of one decision, at most; None means ``4 (H + W)``.
@@ -50,12 +52,15 @@ class DecisionConfig:
     search: BestFirstConfig | UctConfig = BestFirstConfig()
     dead_end_factor: float = 4.0
     commitment: float = 0.15
+    least_chance: float = 0.0
     irrevocable_last: bool = True
     path_horizon: int | None = None
 
     def __post_init__(self) -> None:
         if self.commitment < 0.0:
             raise ValueError(f"commitment is {self.commitment}, must be at least 0")
+        if not 0.0 <= self.least_chance <= 1.0:
+            raise ValueError(f"least_chance is {self.least_chance}, must lie between 0 and 1")
 
     def horizon(self, height: int, width: int) -> int:
         """Moves in the path of one decision on a map of this size."""
@@ -255,12 +260,13 @@ def planning_problem(situation: Situation, estimates: Estimates, config: Decisio
     Args:
       situation: known space, from the robot's product state.
       estimates: P_S, R_S and R_F of the situation's subgoals.
-      config: ``dead_end_factor`` matters.
+      config: ``dead_end_factor`` and ``least_chance`` matter.
 
     Returns:
       The unbatched problem.
     """
     task, subgoals = situation.task, situation.subgoals
+    estimates = worthwhile(estimates, subgoals, config.least_chance)
     travel, finish = _subgoal_travel(situation, estimates)
     at_subgoals = situation.distances[subgoals.cells[:, 0], subgoals.cells[:, 1]]
     # The robot's node has its own state alone: no rollout is there in another.
@@ -282,6 +288,29 @@ def planning_problem(situation: Situation, estimates: Estimates, config: Decisio
         subgoal_mask=subgoals.mask,
         dead_end_cost=config.dead_end_factor * size * belief.resolution,
     )
+
+
+def worthwhile(estimates: Estimates, subgoals: Subgoals, least_chance: float) -> Estimates:
+    """The estimates without subgoals that are hardly a way to a class while there are far better ones.
+
+    The model takes attempts to be independent of each other, and adds up chances that are one: thirty dark rooms, each
+    of which may have a second door to the one hallway that was not seen, are thirty chances to get there. Behind doors
+    that the robot stands before, such chances cost little and are tried first; there is always a next one.
+
+    Args:
+      estimates: of every subgoal and class; masked entries may hold anything.
+      subgoals: those that are asked about.
+      least_chance: share of the largest P_S of a class; below it P_S counts as 0.
+
+    Returns:
+      The estimates; the largest P_S of each class is always left.
+    """
+    if least_chance == 0.0:
+        return estimates
+    chance = estimates.success_probability
+    best = jnp.max(jnp.where(subgoals.mask[:, None], chance, 0.0), axis=0, keepdims=True)
+    kept = jnp.where(chance < jnp.float32(least_chance) * best, 0.0, chance)
+    return dataclasses.replace(estimates, success_probability=kept)
 
 
 def _subgoal_travel(
