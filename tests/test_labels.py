@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from potlp_jax.learning.labels import true_labels
+from potlp_jax.learning.labels import TrueMapEstimator, nearest_ways, true_labels
+from potlp_jax.planning.decision import subgoals_at
 from potlp_jax.planning.distances.product import grid_distances
+from potlp_jax.planning.estimates import Estimates
 from potlp_jax.task.task import Task, TaskSizes
 from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy, make_world
@@ -135,3 +137,50 @@ def test_nothing_behind_a_frontier_costs_nothing_to_fail():
     assert cells == [[1, 2]]
     assert float(estimates.failure_cost[0, 0]) == 0.0
     assert float(estimates.success_cost[0, 0]) > 0.0
+
+
+def test_only_the_nearest_ways_to_a_class_are_left():
+    rng = np.random.default_rng(8)
+    cells, mask = jnp.asarray(rng.integers(0, 5, (6, 2)), jnp.int32), jnp.asarray([True] * 5 + [False])
+    subgoals = subgoals_at(cells, mask, 5, 5)
+    success = jnp.asarray(rng.random((6, 40)) < 0.5, jnp.float32)
+    costs = jnp.asarray(rng.uniform(0.5, 20.0, (6, 40)), jnp.float32)
+    labels = Estimates(success_probability=success, success_cost=costs, failure_cost=costs[::-1])
+    found = jax.jit(nearest_ways)(labels, subgoals, jnp.float32(0.5))
+    left_out = 0
+    for column in range(40):
+        ways = [row for row in range(5) if success[row, column] > 0]
+        least = min((float(costs[row, column]) for row in ways), default=0.0)
+        for row in range(6):
+            # A quarter, and four cells of half a metre.
+            kept = row in ways and float(costs[row, column]) <= 1.25 * least + 2.0
+            assert float(found.success_probability[row, column]) == float(kept)
+            assert float(found.success_cost[row, column]) == (float(costs[row, column]) if kept else 0.5)
+            left_out += row in ways and not kept
+    assert left_out > 10
+    np.testing.assert_array_equal(found.failure_cost, labels.failure_cost)
+
+
+def test_the_oracle_of_the_nearest_ways_leaves_out_the_detour_through_a_second_door():
+    """A hallway whose far part is not seen, and beside the robot a room with a second door to that part."""
+    occupied = np.ones((9, 30), bool)
+    occupied[1:3, 1:-1] = occupied[4:8, 3:20] = occupied[3, [4, 18]] = False
+    letters = np.zeros(occupied.shape, np.int32)
+    letters[1, 28] = 1
+    world = make_world(occupied, letters, (1, 4), propositions=("goal",))
+    cells = np.where(occupied, BeliefMap.OCCUPIED, BeliefMap.FREE)
+    cells[:, 16:] = cells[4:] = BeliefMap.UNKNOWN
+    belief = belief_from_numpy(cells, np.zeros(cells.shape, np.int32), propositions=("goal",))
+    task = Task.from_formula("F goal", ("goal",))
+    subgoals = find_subgoals(belief, belief.free, jnp.ones(cells.shape), FrontierConfig(max_subgoals=4, min_size=1))
+    found = {}
+    for nearest in (False, True):
+        by = TrueMapEstimator(world=world, nearest=nearest)
+        labels = jax.jit(lambda by, *asked: by(*asked))(by, belief, subgoals, task.arrays)
+        best = np.asarray(labels.success_probability).max(axis=1)
+        places = np.asarray(subgoals.cells)[np.asarray(subgoals.mask)]
+        found[nearest] = {tuple(cell): float(best[row]) for row, cell in enumerate(places.tolist())}
+    (door,) = [cell for cell in found[False] if cell[0] == 3]
+    (hallway,) = [cell for cell in found[False] if cell[0] < 3]
+    assert found[False] == {door: 1.0, hallway: 1.0}
+    assert found[True] == {door: 0.0, hallway: 1.0}

@@ -38,7 +38,7 @@ def test_chances_below_a_share_of_the_best_of_their_class_count_as_none():
     # What is masked may hold anything, and is no measure of others.
     estimates = _estimates([[0.5, 0.04], [0.049, 0.0], [0.05, 0.004], [np.nan, 1.0]])
     found = worthwhile(estimates, subgoals, 0.1)
-    expected = np.float32([[0.5, 0.04], [0.0, 0.0], [0.05, 0.004]])
+    expected = np.array([[0.5, 0.04], [0.0, 0.0], [0.05, 0.004]], np.float32)
     np.testing.assert_array_equal(found.success_probability[:3], expected)
     np.testing.assert_array_equal(found.success_cost, estimates.success_cost)
     np.testing.assert_array_equal(found.failure_cost, estimates.failure_cost)

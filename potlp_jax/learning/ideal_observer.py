@@ -14,7 +14,7 @@ from flax import struct
 from jaxtyping import Array, Int32, UInt8
 
 from potlp_jax.environments.posterior import Posterior
-from potlp_jax.learning.labels import true_labels
+from potlp_jax.learning.labels import labels_in
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import Status, status_if
@@ -32,11 +32,13 @@ class IdealObserver:
         memory: what the camera showed so far.
         prior: what the building can be to a robot that has seen nothing.
         blank: a world of the building's size, which is filled with what is drawn.
+        nearest: whether in each building only the nearest ways to a class count (``labels.nearest_ways``).
     """
 
     memory: Any
     prior: Posterior
     blank: World
+    nearest: bool = struct.field(pytree_node=False, default=False)
 
     @property
     def looks_on_the_way(self) -> bool:
@@ -61,26 +63,27 @@ class IdealObserver:
 
         def label(building: tuple[Array, Array]) -> Estimates:
             world = dataclasses.replace(self.blank, occupied=building[0], letters=building[1])
-            return true_labels(world, belief, subgoals, task)
+            return labels_in(world, belief, subgoals, task, nearest=self.nearest)
 
         # One after the other: labels of one building keep a core busy.
         means = mean_labels(jax.lax.map(label, (drawn.occupied, drawn.letters)))
         return dataclasses.replace(means, status=status_if(~drawn.agrees, Status.INVALID))
 
 
-def ideal_observer(posterior: Posterior, world: World) -> IdealObserver:
+def ideal_observer(posterior: Posterior, world: World, *, nearest: bool = False) -> IdealObserver:
     """An observer of a world.
 
     Args:
         posterior: what the world can be to a robot that has seen nothing (``Generator.posterior``).
         world: in which the robot is.
+        nearest: as ``IdealObserver.nearest``.
 
     Returns:
         The observer of one trial, or of one drive.
     """
     # What the robot does not know must not come in by the world that is filled with what is drawn.
     blank = dataclasses.replace(world, occupied=jnp.ones_like(world.occupied), letters=jnp.zeros_like(world.letters))
-    return IdealObserver(memory=posterior.evidence, prior=posterior, blank=blank)
+    return IdealObserver(memory=posterior.evidence, prior=posterior, blank=blank, nearest=nearest)
 
 
 def mean_labels(labels: Estimates) -> Estimates:

@@ -11,6 +11,8 @@ unobserved cell, carries a letter of the class's cube. Staying depends on the au
 distances are solved once per (subgoal, state), for all classes of the state together.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -30,15 +32,55 @@ from potlp_jax.world.moves import dilate
 # is. They are the states of the automaton with which distances are solved.
 PORCH, HIDDEN, SEEN = range(3)
 
+# How much longer than the shortest way to a class others may be that count beside it: times its length, and cells.
+_DETOUR, _DETOUR_CELLS = 1.25, 4.0
+
 
 @struct.dataclass(kw_only=True)
 class TrueMapEstimator:
-    """The oracle of docs/model.md section 8: estimates are the true labels of ``world``."""
+    """The oracle of docs/model.md section 8: estimates are the true labels of ``world``.
+
+    Attributes:
+        world: the true map.
+        nearest: whether only subgoals count that are nearly the shortest way to a class (``nearest_ways``).
+    """
 
     world: World
+    nearest: bool = struct.field(pytree_node=False, default=False)
 
     def __call__(self, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays) -> Estimates:
-        return true_labels(self.world, belief, subgoals, task)
+        return labels_in(self.world, belief, subgoals, task, nearest=self.nearest)
+
+
+def labels_in(world: World, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays, *, nearest: bool) -> Estimates:
+    """``true_labels``, as they are or of the nearest ways alone."""
+    labels = true_labels(world, belief, subgoals, task)
+    return nearest_ways(labels, subgoals, world.resolution) if nearest else labels
+
+
+def nearest_ways(labels: Estimates, subgoals: Subgoals, resolution: Float32[Array, ""]) -> Estimates:
+    """Labels by which a subgoal leads to a class only where hardly any other is a shorter way to it.
+
+    Through a dark room with a second door one gets to whatever lies beyond, and to a planner that takes attempts to be
+    independent of each other thirty such rooms are thirty chances of what is one. So each place is left to the
+    subgoals from which it is nearest: R_S at most a quarter and four cells above the least R_S of all for the class.
+
+    Args:
+        labels: of one building; R_S means something where P_S is above 0.
+        subgoals: that they are of.
+        resolution: side of a cell in the unit of cost.
+
+    Returns:
+        The labels with P_S = 0, and R_S the resolution, for all longer ways; R_F as it was.
+    """
+    leads = (labels.success_probability > 0) & subgoals.mask[:, None]
+    least = jnp.min(jnp.where(leads, labels.success_cost, jnp.inf), axis=0, keepdims=True)
+    kept = leads & (labels.success_cost <= _DETOUR * least + _DETOUR_CELLS * resolution)
+    return dataclasses.replace(
+        labels,
+        success_probability=jnp.where(kept, labels.success_probability, 0.0),
+        success_cost=jnp.where(kept, labels.success_cost, resolution),
+    )
 
 
 def true_labels(world: World, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays) -> Estimates:

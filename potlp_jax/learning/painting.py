@@ -157,7 +157,7 @@ def _painted(
     # An obstacle is met at its side, and may be seen across up to half a diagonal of it.
     in_sight = away <= free_until[column] + jnp.where(occupied, jnp.float32(_HALF_DIAGONAL), 0.0)
     if offset.shape[0]:
-        turn = _turn_to_glance(column, cell, SightLines(offset, enter), free_until)
+        turn = _turn_to_glance(column, cell, offset, enter, free_until)
         column = jnp.where(in_sight, column, (column + turn) % panorama.shape[1])
         in_sight = in_sight | (turn != _HIDDEN)
     # What pads the map to an array is no part of the building, although nothing that is known hides it.
@@ -173,15 +173,16 @@ def _painted(
 def _turn_to_glance(
     column: Int32[Array, "H W"],
     cell: Int32[Array, "2"],
-    lines: SightLines,
+    offset: Int32[Array, "steps columns"],
+    enter: Float32[Array, "steps columns"],
     free_until: Float32[Array, " columns"],
 ) -> Int32[Array, "H W"]:
     """By how many columns to turn from a cell's bearing to the nearest line that meets it before the sight ends."""
     (height, width), count = column.shape, free_until.shape[0]
-    there = (cell[0] + 1) * jnp.int32(width + 2) + cell[1] + 1 + lines.offset
+    there = (cell[0] + 1) * jnp.int32(width + 2) + cell[1] + 1 + offset
     row, at = there // (width + 2) - 1, there % (width + 2) - 1
     # The first obstacle is met, at its side, where the sight ends.
-    met = (lines.enter <= free_until[None]) & (row >= 0) & (row < height) & (at >= 0) & (at < width)
+    met = (enter <= free_until[None]) & (row >= 0) & (row < height) & (at >= 0) & (at < width)
     flat = jnp.where(met, row * width + at, height * width)
     turn = jnp.arange(count, dtype=jnp.int32)[None] - jnp.take(column.ravel(), flat, mode="clip")
     turn = (turn + count // 2) % count - count // 2

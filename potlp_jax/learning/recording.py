@@ -30,6 +30,7 @@ from potlp_jax.learning.dataset import (
 )
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.ideal_observer import IdealObserver
+from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.map_images import encode_view, encode_world
 from potlp_jax.learning.observing import look_step, looks_between
 from potlp_jax.learning.painting import Painting, blank_painting, paint
@@ -62,6 +63,8 @@ class RecordingConfig:
         camera: takes the images.
         look_every: how often it looks on the way, as in a trial (``TrialConfig``), to paint the map.
         glances: whether cells of which a part alone is in sight are painted, too (``learning.painting.paint``).
+        nearest: whether by the labels only subgoals lead to a class that are nearly the shortest way to it
+            (``learning.labels.nearest_ways``).
     """
 
     views_per_world: int = 12
@@ -77,6 +80,7 @@ class RecordingConfig:
     camera: CameraConfig = CameraConfig()
     look_every: int = 1
     glances: bool = True
+    nearest: bool = False
 
 
 def recording_metadata(
@@ -195,7 +199,8 @@ class Recorder:
         config = self.config
         # One sheet size for all views: the labels are compiled once.
         sheet = question_sheet(questions, config.classes, config.staying_sets)
-        labels, weights = label(world, pose.belief, scene, sheet, self._bounds, seen.observer)
+        by = TrueMapEstimator(world=world, nearest=config.nearest) if seen.observer is None else seen.observer
+        labels, weights = label(by, pose.belief, scene, sheet, self._bounds)
         if labels.status is not None and Status.INVALID in Status(int(labels.status)):
             raise DatasetError(
                 f"world {self.worlds['world'][-1]}, step {pose.step}: no building of its family agrees with what was "

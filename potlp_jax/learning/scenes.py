@@ -92,28 +92,25 @@ def survey(
 
 @partial(jax.jit, static_argnames="bounds")
 def label(
-    world: World,
+    by: TrueMapEstimator | IdealObserver,
     belief: BeliefMap,
     scene: Scene,
     sheet: TaskArrays,
     bounds: WeightBounds,
-    observer: IdealObserver | None = None,
 ) -> tuple[Estimates, Weights]:
     """Labels and weights of every (subgoal, question), also of subgoals out of view.
 
     Args:
-        world: the true map.
-        belief: what the robot knows of it.
+        by: what answers: the true map, or an observer, by all that can be where the robot has not been.
+        belief: what the robot knows of the map.
         scene: the subgoals.
         sheet: the questions (``question_sheet``).
         bounds: of the weights; static.
-        observer: answers in place of the true map, by all that can be where the robot has not been.
 
     Returns:
         Labels and weights, 0 where masked. The observer's have its status.
     """
     # Subgoals out of view are labelled too: missing one is cheap where another, seen or not, would do as well.
-    by = TrueMapEstimator(world=world) if observer is None else observer
     labels = by(belief, scene.subgoals, sheet)
     mask = scene.subgoals.mask[:, None] & sheet.class_mask[None, :]
     return labels, loss_weights(scene.distance, labels, mask, bounds)

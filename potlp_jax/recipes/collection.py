@@ -282,7 +282,8 @@ def _observer(world: World, index: int, job: _Job) -> IdealObserver | None:
         return None
     noise = jax.random.fold_in(jax.random.key(job.config.seed), index)
     key = world_key(job.split, index, job.generator.name)
-    return ideal_observer(job.generator.posterior(key, noise, job.config.posterior), world)
+    posterior = job.generator.posterior(key, noise, job.config.posterior)
+    return ideal_observer(posterior, world, nearest=job.config.nearest)
 
 
 def _drives(
