@@ -195,7 +195,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="scale",
         command="potlp collect firefighting --split training --worlds 10000 --out {out} --processes {processes} "
         "--set first_world=60000 --set spacing=[0,8] --set look_every=0 --set staying_sets=3 --set pursued=1 "
-        "--set worlds_per_shard=50 --set views_per_world=4",
+        "--set worlds_per_shard=50 --set views_per_world=4 --set glances=false",
     ),
     "scale-reading": Experiment(
         page="scale",

@@ -24,7 +24,7 @@ from potlp_jax.learning.dataset import Samples, finished_shards, views_file
 from potlp_jax.learning.dataset_reading import read_dataset
 from potlp_jax.learning.estimator import TrainedEstimator, named_estimator
 from potlp_jax.learning.learners import learner_of
-from potlp_jax.learning.predictions import predict
+from potlp_jax.learning.predictions import check_fit, predict
 from potlp_jax.sweep.rows import provenance
 
 STEPS = ((0, 10), (10, 40), (40, 100), (100, None))
@@ -49,10 +49,15 @@ def groups(samples: Samples, moves: Int64[np.ndarray, " N"]) -> Iterator[tuple[s
 
 
 def excess_of(name: str, samples: Samples) -> Float64[np.ndarray, " N"]:
-    """The squared distance of an estimator from each label. Raises EvaluationError where it was not trained here."""
+    """The squared distance of an estimator from each label.
+
+    Raises:
+        EvaluationError: it was not trained here, or from other pictures, maps or units than those of the samples.
+    """
     estimator = named_estimator(name)
     if not isinstance(estimator, TrainedEstimator):
         raise EvaluationError(f"{name}: only estimators that were trained with this library answer data sets")
+    check_fit(estimator.config, estimator.domain, samples, name, "the data set")
     answers = predict(learner_of(estimator.config), estimator.params, samples).success
     return (answers - np.asarray(samples.success, np.float64)) ** 2
 

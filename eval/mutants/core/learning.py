@@ -1,4 +1,4 @@
-"""Faults of the core: labels and loss."""
+"""Faults of the core: labels, what is painted, and loss."""
 
 from eval.mutants.mutant import Mutant
 
@@ -6,8 +6,36 @@ PART = "labels and loss"
 
 _LABELS = "potlp_jax/learning/labels.py"
 _LOSS = "potlp_jax/learning/loss.py"
+_PAINTING = "potlp_jax/learning/painting.py"
 
 MUTANTS = (
+    Mutant(
+        PART,
+        "nearest ways: long detours count",
+        _LABELS,
+        "_DETOUR * least + _DETOUR_CELLS",
+        "2 * _DETOUR * least + _DETOUR_CELLS",
+        ("tests/test_labels.py",),
+        "nearest",
+    ),
+    Mutant(
+        PART,
+        "glances: the obstacle at the end of a line is not met",
+        _PAINTING,
+        "met = (enter <= free_until[None])",
+        "met = (enter < free_until[None])",
+        ("tests/test_native_twins.py",),
+        "looks_and_paintings",
+    ),
+    Mutant(
+        PART,
+        "glances: a cell takes its own column, which does not meet it",
+        _PAINTING,
+        "column = jnp.where(in_sight, column, (column + turn) % panorama.shape[1])",
+        "column = column % panorama.shape[1]",
+        ("tests/test_native_twins.py",),
+        "looks_and_paintings",
+    ),
     Mutant(
         PART,
         "R_S: a path may come back through its own frontier",

@@ -7,6 +7,7 @@ PART = "what a rollout knows and costs"
 _HISTORY = "potlp_jax/planning/history.py"
 _PROBLEM = "potlp_jax/planning/problem.py"
 _COMMITMENT = "potlp_jax/planning/commitment.py"
+_SITUATION = "potlp_jax/planning/situation.py"
 _ROLLOUTS = ("tests/test_history.py",)
 _EXACT = ("tests/test_exact.py",)
 
@@ -163,5 +164,21 @@ MUTANTS = (
         "acts & (intention.state == state) & jnp.any(same)",
         "acts & jnp.any(same)",
         ("tests/test_commitment.py",),
+    ),
+    Mutant(
+        PART,
+        "small chances: what pads the subgoals is a measure of the others",
+        _SITUATION,
+        "jnp.where(subgoals.mask[:, None], chance, 0.0), axis=0",
+        "chance, axis=0",
+        ("tests/test_worthwhile.py",),
+    ),
+    Mutant(
+        PART,
+        "small chances: the best of all classes is the measure of each",
+        _SITUATION,
+        "chance, 0.0), axis=0, keepdims=True)",
+        "chance, 0.0), keepdims=True)",
+        ("tests/test_worthwhile.py",),
     ),
 )
