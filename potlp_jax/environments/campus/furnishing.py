@@ -79,8 +79,7 @@ PARCELS: Errand = Errand(
 
 MANY_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 64}, "least_chance": 0.1}, "panoramas": 64})
 """Settings of trials: from a hallway one sees 18 to 27 doors at a time, in the mean of a trial; and up to 28 panoramas
-still showed a frontier at a time (docs/estimator.md, "Panoramas"). Doors that are hardly a way to anything are left out
-(docs/results/delivery.md, "Chances that are one")."""
+still showed a frontier at a time (docs/estimator.md, "Panoramas")."""
 
 NARROW_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 96, "min_size": 1}}, "panoramas": 128})
 """Settings of trials where a door may be as narrow as one cell, as after resampling the map of a real building: a
