@@ -12,7 +12,7 @@ import pytest
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.toy import Toy
 from potlp_jax.errors import PropositionsError, TaskError
-from potlp_jax.export import MANIFEST, load_program
+from potlp_jax.export import FORMAT, MANIFEST, load_program
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
@@ -192,7 +192,7 @@ def test_an_environment_that_draws_other_names_is_refused():
 
 
 def test_an_exported_planner_is_loaded_for_its_own_names_alone(tmp_path):
-    (tmp_path / MANIFEST).write_text(json.dumps({"task": RIGHT.describe(), "functions": {}}))
+    (tmp_path / MANIFEST).write_text(json.dumps({"format": FORMAT, "task": RIGHT.describe(), "functions": {}}))
     with pytest.raises(PropositionsError, match=r"\(goal, hazard\), what is to call it \(hazard, goal\)"):
         load_program(tmp_path, "decide", NAMES["order"])
     with pytest.raises(ValueError, match="no program 'decide'"):
