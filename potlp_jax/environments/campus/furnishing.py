@@ -77,7 +77,7 @@ PARCELS: Errand = Errand(
 )
 """Bradley et al. 2021, section V-C: a document and a package for two people, in any order or the document first."""
 
-MANY_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 64}, "least_chance": 0.1}, "panoramas": 64})
+MANY_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 64}}, "panoramas": 64})
 """Settings of trials: from a hallway one sees 18 to 27 doors at a time, in the mean of a trial; and up to 28 panoramas
 still showed a frontier at a time (docs/estimator.md, "Panoramas")."""
 
