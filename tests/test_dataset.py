@@ -298,6 +298,9 @@ def test_data_sets_of_one_family_are_joined(tmp_path):
     painted = dataclasses.replace(two.metadata, collection={"glances": True})
     with pytest.raises(DatasetError, match="differ in glances cannot be joined: False and True"):
         joined([one, dataclasses.replace(two, metadata=painted)])
+    labelled = dataclasses.replace(two.metadata, collection={"nearest": True})
+    with pytest.raises(DatasetError, match="differ in nearest cannot be joined: False and True"):
+        joined([one, dataclasses.replace(two, metadata=labelled)])
 
 
 def test_images_stay_on_disk(tmp_path):

@@ -97,6 +97,11 @@ class DatasetMetadata:
         # Data sets that do not say it were recorded when there was no other way.
         return bool(self.collection.get("glances", False))
 
+    @property
+    def nearest(self) -> bool:
+        """Whether by the labels the nearest ways to a class alone count (``learning.labels.nearest_ways``)."""
+        return bool(self.collection.get("nearest", False))
+
     def differences(self, other: "DatasetMetadata") -> list[str]:
         """What differs, with both values: of this dataset, and of the other."""
         return differences(json_copy(dataclasses.asdict(self)), json_copy(dataclasses.asdict(other)))

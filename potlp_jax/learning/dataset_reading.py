@@ -46,12 +46,12 @@ def joined(parts: Sequence[Samples]) -> Samples:
     """Several data sets as one, in this order; the metadata are the first one's, with arrays as large as any has.
 
     Raises:
-        DatasetError: what decides the meaning of a row differs: propositions, family, camera, unit, resolution or
-            glances.
+        DatasetError: what decides the meaning of a row differs: propositions, family, camera, unit, resolution,
+            glances or nearest.
     """
     first = parts[0].metadata
     for part in parts[1:]:
-        for name in ("propositions", "family", "camera", "unit", "resolution", "glances"):
+        for name in ("propositions", "family", "camera", "unit", "resolution", "glances", "nearest"):
             mine, other = getattr(first, name), getattr(part.metadata, name)
             if mine != other:
                 raise DatasetError(f"data sets that differ in {name} cannot be joined: {mine} and {other}")

@@ -72,7 +72,7 @@ class Trained:
 def check_data(training: Samples, validation: Samples) -> None:
     """Raises TrainingError where the two data sets do not belong together."""
     # The split may differ, and should: everything that decides what a row means may not.
-    for name in ("propositions", "environment", "camera", "unit", "resolution", "glances"):
+    for name in ("propositions", "environment", "camera", "unit", "resolution", "glances", "nearest"):
         one, other = getattr(training.metadata, name), getattr(validation.metadata, name)
         if one != other:
             # A log's environment is a name that is given; those of simulated worlds are not to be renamed.
