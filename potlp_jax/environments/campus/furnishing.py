@@ -77,9 +77,16 @@ PARCELS: Errand = Errand(
 )
 """Bradley et al. 2021, section V-C: a document and a package for two people, in any order or the document first."""
 
-MANY_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 64}}, "panoramas": 64})
+MANY_DOORS: Settings = Settings(
+    {
+        "decision": {"frontiers": {"max_subgoals": 64}, "least_chance": 0.1, "dead_end_factor": 0.5},
+        "panoramas": 64,
+    }
+)
 """Settings of trials: from a hallway one sees 18 to 27 doors at a time, in the mean of a trial; and up to 28 panoramas
-still showed a frontier at a time (docs/estimator.md, "Panoramas")."""
+still showed a frontier at a time (docs/estimator.md, "Panoramas"). Thirty doors that may all lead to one unseen hallway
+are not thirty chances, and what it costs when all of them fail outweighs all else where it is large
+(docs/results/delivery.md, "Chances that are one")."""
 
 NARROW_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 96, "min_size": 1}}, "panoramas": 128})
 """Settings of trials where a door may be as narrow as one cell, as after resampling the map of a real building: a
