@@ -8,8 +8,8 @@ frontier, observing at every cell, until the next decision is due. An agent that
 planner's trial.
 
 Reward. Minus the cost travelled, in the unit of ``World.resolution``; the rewards of an episode that satisfies the task
-add up to minus the trial's cost. An episode that ends otherwise also pays ``dead_end_factor`` times the size of the
-map, as the planner's dead ends do: otherwise an agent would learn that the cheapest episode is to get stuck at once.
+add up to minus the trial's cost. An episode that ends otherwise also pays ``UNSATISFIED`` times the size of the map:
+otherwise an agent would learn that the cheapest episode is to get stuck at once.
 """
 
 import dataclasses
@@ -40,6 +40,10 @@ OUTCOME_NAMES: Mapping[int, str] = {RUNNING: "running"} | {
     number: outcome.value for number, outcome in enumerate(OUTCOMES)
 }
 """What ``TimeStep.extras["outcome"]`` says."""
+
+UNSATISFIED: float = 4.0
+"""Times ``(H + W)`` times the resolution: what an episode pays that ends without acceptance. More than most trials cost,
+whatever a planner is told to expect of its dead ends (``DecisionConfig.dead_end_factor``)."""
 
 _INFEASIBLE, _SATISFIED, _BUDGET = (
     OUTCOMES.index(outcome) for outcome in (Outcome.INFEASIBLE, Outcome.SATISFIED, Outcome.BUDGET)
@@ -218,7 +222,7 @@ class TaskEnv:
         reward = -(after.progress.tally.travelled - before.tally.travelled) * resolution
         tally = after.progress.tally
         failed = before.tally.running & ~tally.running & (tally.outcome != _SATISFIED)
-        reward = reward - jnp.where(failed, self._dead_end_cost(state.scene), 0.0)
+        reward = reward - jnp.where(failed, _cost_of_failure(state.scene.world), 0.0)
         kind = jnp.where(tally.running, StepType.MID, StepType.LAST).astype(jnp.int8)
         return after, self._time_step(after, kind, reward)
 
@@ -238,10 +242,6 @@ class TaskEnv:
         outcome = jnp.where(nowhere, jnp.int8(_INFEASIBLE), progress.tally.outcome)
         tally = dataclasses.replace(progress.tally, outcome=outcome)
         return EnvState(scene=scene, progress=dataclasses.replace(progress, tally=tally), situation=situation)
-
-    def _dead_end_cost(self, scene: Scene) -> Float32[Array, ""]:
-        size = jnp.sum(scene.world.extent).astype(jnp.float32)
-        return self.config.decision.dead_end_factor * size * scene.world.resolution
 
     def _distances(self, situation: Situation) -> Float32[Array, "S Z"]:
         """To each subgoal in each state, inf where there is no way; padded subgoals included."""
@@ -305,3 +305,7 @@ class TaskEnv:
             # After the end there is nothing to choose.
             action_mask=self._action_mask(situation) & progress.tally.running,
         )
+
+
+def _cost_of_failure(world: World) -> Float32[Array, ""]:
+    return UNSATISFIED * jnp.sum(world.extent).astype(jnp.float32) * world.resolution
