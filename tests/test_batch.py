@@ -145,6 +145,9 @@ def test_what_does_not_fit_is_named():
     large = dataclasses.replace(second, world=pad_world(second.world, height + 1, width), name="large")
     with pytest.raises(BatchError, match=r"'large': its world has arrays of shapes .*pad worlds"):
         list(run_batch([first, large], Policy.BASELINE, CONFIG, slots=3))
+    finer = dataclasses.replace(second.world, resolution=second.world.resolution / 2)
+    with pytest.raises(BatchError, match=r"'finer': its world has the resolution 0.5, the first of the batch 1.0"):
+        list(run_batch([first, dataclasses.replace(second, world=finer, name="finer")], Policy.BASELINE, CONFIG))
     with pytest.raises(BatchError, match="slots is 0"):
         list(run_batch([first], Policy.BASELINE, CONFIG, slots=0))
     with pytest.raises(EstimatorError, match="no estimator is shipped for the propositions goal"):

@@ -106,7 +106,7 @@ def test_answers_equal_the_network_asked_pair_by_pair(world, task, trained, reso
     world = dataclasses.replace(world, resolution=jnp.float32(resolution))
     belief = observe(BeliefMap.unobserved(world), world, world.start, NEAR.sensor)
     subgoals = find_subgoals(belief, belief.free, jnp.zeros(world.shape), FrontierConfig())
-    eyes = observe_panorama(trained.start(*world.shape, 4), render(world, world.start), belief, world.start)
+    eyes = observe_panorama(trained.start(*world.shape, 4, 1.0), render(world, world.start), belief, world.start)
     estimates = jax.jit(lambda eyes, *asked: eyes(*asked))(eyes, belief, subgoals, task.arrays)
     network = EstimatorNetwork(trained.config)
     # Operation by operation they would be hundreds of programs.

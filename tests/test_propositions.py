@@ -93,7 +93,7 @@ ENTRIES = {
     "stack_tasks": lambda task: stack_tasks([RIGHT, task]),
     "questions": lambda task: question_sheet((*questions_of(RIGHT), *questions_of(task)), 8, 4),
     "estimator of a task": lambda task: estimator_for(task.propositions, domain_of("toy"), _trained(TOY.propositions)),
-    "network under a decision": lambda task: _trained(TOY.propositions).start(*WORLD.shape, 2)(
+    "network under a decision": lambda task: _trained(TOY.propositions).start(*WORLD.shape, 2, 1.0)(
         dataclasses.replace(BELIEF, propositions=task.propositions), SUBGOALS, task.arrays
     ),
     "observe": lambda task: observe(BeliefMap.unobserved(WORLD), _renamed(task), WORLD.start, SensorConfig()),

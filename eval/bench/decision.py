@@ -255,7 +255,8 @@ def asked_by(policy: Policy, trial: Start, config: TrialConfig) -> Any:
         return None
     here = Domain.of_world(trial.world, config.camera)
     shipped = rules.estimator_of(policy, trial.world.propositions, here, None)
-    return rules.first_estimator(policy, shipped, trial.world.shape, config.panoramas, None)
+    resolution = float(trial.world.resolution)
+    return rules.first_estimator(policy, shipped, trial.world.shape, resolution, config.panoramas, None)
 
 
 def table_of(found: dict[str, Any]) -> str:

@@ -139,7 +139,7 @@ class Experiment:
             return self._observer(number)
         if not arm.asks_trained:
             return None
-        own = first_estimator(Policy.POTLP, self.trained, world.shape, config.panoramas, None)
+        own = first_estimator(Policy.POTLP, self.trained, world.shape, float(world.resolution), config.panoramas, None)
         assert own is not None
         truth = TrueMapEstimator(world=world)
         return {Arm.TRUE_CHANCES: mixed(truth, own), Arm.TRUE_COSTS: mixed(own, truth)}.get(arm, self.trained)

@@ -41,7 +41,7 @@ def measure_perception(
         "render", lambda world, cell: photograph(world, cell, key, camera, Disturbance()), world, scene.cell
     )
     # An estimator before its first observation: an empty memory of the right size.
-    blind = trained.start(*world.shape, TrialConfig().panoramas)
+    blind = trained.start(*world.shape, TrialConfig().panoramas, float(world.resolution))
     seen = phases.measure("encode", lambda estimator, image: estimator.encode(image), blind, panorama)
     memory = phases.measure(
         "remember",

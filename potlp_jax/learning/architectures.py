@@ -1,6 +1,7 @@
 """The architectures of estimators: what a file's configuration is, what its parameters are, and how a trial begins."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
@@ -28,8 +29,8 @@ class Architecture:
         network: the network of a configuration, with ``init``.
         operations: from a configuration, and rows and columns of a map: floating-point operations forward, by what
             they are done for.
-        start: from parameters, configuration, rows and columns of the map's array, and panoramas that are remembered:
-            the estimator for a new trial.
+        start: from parameters, configuration, rows and columns of the map's array, panoramas that are remembered, and
+            the side of a cell in the unit of cost: the estimator for a new trial.
         before: fields of the configuration that files lack which were written before the network had what they size,
             and what such files stand for.
     """
@@ -38,7 +39,7 @@ class Architecture:
     config: type[Any]
     network: Callable[[Any], Any]
     operations: Callable[[Any, tuple[int, int]], dict[str, int]]
-    start: Callable[[Params, Any, int, int, int], ObservingEstimator]
+    start: Callable[[Params, Any, int, int, int, float], ObservingEstimator]
     before: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
@@ -52,14 +53,26 @@ def _building_operations(config: BuildingConfig, shape: tuple[int, int]) -> dict
     return dict(zip(names, building_operations(config, height, width), strict=True))
 
 
-def _start_panorama(params: Params, config: NetworkConfig, height: int, width: int, panoramas: int) -> NetworkEstimator:
+def _start_panorama(
+    params: Params, config: NetworkConfig, height: int, width: int, panoramas: int, _: float
+) -> NetworkEstimator:
+    # What a panorama shows is measured in the unit of cost, whatever the cells are.
     memory = empty_memory(panoramas, config.feature_shape, height, width)
     return NetworkEstimator(params=params, memory=memory, config=config)
 
 
-def _start_building(params: Params, config: BuildingConfig, height: int, width: int, _: int) -> BuildingEstimator:
+def _start_building(
+    params: Params, config: BuildingConfig, height: int, width: int, _: int, resolution: float
+) -> BuildingEstimator:
     # A painting holds any number of panoramas.
-    return BuildingEstimator(params=params, memory=blank_painting(height, width), config=config)
+    scale = resolution / config.step
+    return BuildingEstimator(
+        params=params,
+        memory=blank_painting(height, width),
+        config=config,
+        # Sides of cells are float32 in worlds, and float64 in files.
+        scale=1.0 if math.isclose(scale, 1.0, rel_tol=1e-4) else round(scale, 6),
+    )
 
 
 ARCHITECTURES: Mapping[str, Architecture] = MappingProxyType(

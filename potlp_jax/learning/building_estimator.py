@@ -13,8 +13,9 @@ from potlp_jax.learning.exclusion import exclusive_chances
 from potlp_jax.learning.imagined_paths import Outlook, Scenery, outlook_of_first, prospects, scenery
 from potlp_jax.learning.map_channels import map_channels
 from potlp_jax.learning.network import require_propositions
-from potlp_jax.learning.overlays import Overlay, imagined_overlay, painting_overlays
+from potlp_jax.learning.overlays import Overlay, imagined_overlay, painting_overlays, spread_over
 from potlp_jax.learning.painting import Painting, moved_painting, paint
+from potlp_jax.learning.resampling import cells_in, resampled
 from potlp_jax.learning.squares import SQUARE
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.task.task import TaskArrays
@@ -24,11 +25,20 @@ from potlp_jax.world.grid import BeliefMap
 
 @struct.dataclass(kw_only=True)
 class BuildingEstimator:
-    """P_S, R_S and R_F from the belief and from what the panoramas seen so far painted on it. ``config`` is static."""
+    """P_S, R_S and R_F from the belief and from what the panoramas seen so far painted on it.
+
+    Attributes:
+        params: of the network.
+        memory: the painting, on the belief's own cells.
+        config: of the network; static.
+        scale: how many of the network's cells are as long as one of the belief's; static. Where it is not 1 the network
+            looks at another map (``learning.resampling``).
+    """
 
     params: Params
     memory: Painting
     config: BuildingConfig = struct.field(pytree_node=False)
+    scale: float = struct.field(pytree_node=False, default=1.0)
 
     @property
     def looks_on_the_way(self) -> bool:
@@ -43,8 +53,11 @@ class BuildingEstimator:
         self, seen: UInt8[Array, "rows columns 3"], belief: BeliefMap, cell: Int32[Array, "2"]
     ) -> "BuildingEstimator":
         """The estimator with one panorama more painted on its map (``learning.painting.paint``)."""
-        config = self.config
-        painted = paint(self.memory, seen, belief, cell, config.camera, glances=config.glances)
+        camera = self.config.camera
+        if self.scale != 1.0:
+            # The same metres are another number of cells.
+            camera = dataclasses.replace(camera, **camera.lengths(1 / self.scale))
+        painted = paint(self.memory, seen, belief, cell, camera, glances=self.config.glances)
         return dataclasses.replace(self, memory=painted)
 
     def moved(self, shape: tuple[int, int], rows: int, columns: int) -> "BuildingEstimator":
@@ -52,14 +65,27 @@ class BuildingEstimator:
         return dataclasses.replace(self, memory=moved_painting(self.memory, shape, rows, columns))
 
     def imagine(self, belief: BeliefMap) -> EncodedMap:
-        """The network's first stage: what it makes of the map, also of squares that were not observed."""
+        """The network's first stage: what it makes of the map, also of squares that were not observed.
+
+        Args:
+            belief: on the network's own cells, as the memory is.
+        """
         return BuildingNetwork(self.config).encode(self.params, map_channels(belief, self.memory))
 
     def overlays(self, belief: BeliefMap) -> tuple[Overlay, ...]:
         """The painting, and what the network makes of squares that were not observed."""
-        squares = jax.tree.map(jax.nn.sigmoid, self.imagine(belief).squares)
-        imagined = imagined_overlay(squares.free, squares.holds, belief, SQUARE)
-        return (*painting_overlays(self.memory), imagined)
+        painted = painting_overlays(self.memory)
+        asked, own = self._on_own_cells(belief, jnp.zeros(belief.cells.shape, bool))
+        squares = jax.tree.map(jax.nn.sigmoid, asked.imagine(own).squares)
+        imagined = imagined_overlay(squares.free, squares.holds, own, SQUARE)
+        return (*painted, imagined if self.scale == 1.0 else spread_over(imagined, belief, self.scale))
+
+    def _on_own_cells(self, belief: BeliefMap, entered: Bool[Array, "H W"]) -> "tuple[BuildingEstimator, BeliefMap]":
+        """The estimator and the map on cells as large as those that the network learned from (``resampled``)."""
+        if self.scale == 1.0:
+            return self, belief
+        own, painting = resampled(belief, self.memory, entered, self.scale)
+        return dataclasses.replace(self, memory=painting, scale=1.0), own
 
     def __call__(self, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays) -> Estimates:
         """Estimates of every real (subgoal, class); padded pairs have P_S = 0.
@@ -68,8 +94,14 @@ class BuildingEstimator:
             PropositionsError: the network was trained for other propositions than the task's.
         """
         require_propositions(self.config.propositions, task.propositions, "the estimator's network")
+        height, width = belief.cells.shape
+        # Masked subgoals point at cell (0, 0), whatever is there.
+        entered = jnp.zeros((height, width), bool).at[subgoals.cells[:, 0], subgoals.cells[:, 1]].max(subgoals.mask)
+        asked, belief = self._on_own_cells(belief, entered)
+        if self.scale != 1.0:
+            subgoals = dataclasses.replace(subgoals, cells=cells_in(subgoals.cells, (height, width), self.scale))
         network = BuildingNetwork(self.config)
-        encoded = self.imagine(belief)
+        encoded = asked.imagine(belief)
         stay, go = task.class_phi[:, 0], task.class_phi[:, 1]
         modulation = network.modulation(self.params, stay, go)
         places = network.places(self.params, encoded, subgoals.cells)

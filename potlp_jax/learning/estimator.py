@@ -41,17 +41,18 @@ class TrainedEstimator:
         """Name and digest, as in records."""
         return f"{self.name} {self.digest}"
 
-    def start(self, height: int, width: int, panoramas: int) -> ObservingEstimator:
+    def start(self, height: int, width: int, panoramas: int, resolution: float) -> ObservingEstimator:
         """The estimator for a new trial: nothing observed yet.
 
         Args:
             height, width: of the map's array.
             panoramas: how many are remembered, by a panorama network.
+            resolution: side of a cell in the unit of cost; a building network looks at cells of its own size.
 
         Returns:
             What a decision calls inside jit.
         """
-        return architecture_of(self.config).start(self.params, self.config, height, width, panoramas)
+        return architecture_of(self.config).start(self.params, self.config, height, width, panoramas, resolution)
 
 
 @functools.lru_cache(maxsize=8)

@@ -13,6 +13,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float32, UInt8
 
 from potlp_jax.learning.painting import Painting
+from potlp_jax.learning.resampling import cells_in
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.world.grid import BeliefMap
 
@@ -101,3 +102,22 @@ def imagined_overlay(
     found = jax.lax.reduce(letters.reshape(rows, side, columns, side), np.int32(0), jax.lax.bitwise_or, (1, 3))
     known = jnp.stack([(found >> bit) & 1 for bit in range(holds.shape[-1])], axis=-1) == 1
     return Imagined(name="imagined", side=side, free=free, holds=jnp.where(known, 0.0, holds))
+
+
+def spread_over(imagined: Imagined, belief: BeliefMap, scale: float) -> Imagined:
+    """Chances about squares of other cells, for the cells of the belief.
+
+    Args:
+        imagined: of a map whose cells are not the belief's.
+        belief: what is known.
+        scale: how many of the cells of that map are as long as one of the belief's.
+
+    Returns:
+        The overlay with squares of one cell; each has the chances of the larger one in which it lies.
+    """
+    height, width = belief.cells.shape
+    shape = (height, width)
+    cells = jnp.stack(jnp.meshgrid(*(jnp.arange(length) for length in shape), indexing="ij"), axis=-1)
+    square = cells_in(cells, shape, scale) // imagined.side
+    free, holds = (layer[square[..., 0], square[..., 1]] for layer in (imagined.free, imagined.holds))
+    return Imagined(name=imagined.name, side=1, free=free, holds=holds)

@@ -42,8 +42,8 @@ OUTCOME_NAMES: Mapping[int, str] = {RUNNING: "running"} | {
 """What ``TimeStep.extras["outcome"]`` says."""
 
 UNSATISFIED: float = 4.0
-"""Times ``(H + W)`` times the resolution: what an episode pays that ends without acceptance. More than most trials cost,
-whatever a planner is told to expect of its dead ends (``DecisionConfig.dead_end_factor``)."""
+"""Times ``(H + W)`` times the resolution: what an episode pays that ends without acceptance. More than most trials
+cost, whatever a planner is told to expect of its dead ends (``DecisionConfig.dead_end_factor``)."""
 
 _INFEASIBLE, _SATISFIED, _BUDGET = (
     OUTCOMES.index(outcome) for outcome in (Outcome.INFEASIBLE, Outcome.SATISFIED, Outcome.BUDGET)

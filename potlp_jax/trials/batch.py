@@ -125,7 +125,7 @@ def run_batch(
     config = rules.config_of(policy, config_in(first.world, config))
     here = Domain.of_world(first.world, config.camera)
     asked = rules.estimator_of(policy, first.arrays.propositions, here, estimator)
-    shared = asked.start(*first.world.shape, config.panoramas) if isinstance(asked, TrainedEstimator) else asked
+    shared = _nothing_seen(asked, first.world, config)
 
     def checked(start: Start) -> Start:
         _check_start(start, first)
@@ -133,6 +133,13 @@ def run_batch(
 
     trials = map(checked, chain([first], starts))
     yield from _run(trials, first, Setup(policy=policy, config=config), slots, shared)
+
+
+def _nothing_seen(asked: TrainedEstimator | Asked, world: World, config: TrialConfig) -> Asked:
+    """What is asked in the first decision of every trial of a batch."""
+    if not isinstance(asked, TrainedEstimator):
+        return asked
+    return asked.start(*world.shape, config.panoramas, float(world.resolution))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -214,6 +221,10 @@ def _enter(
     return filled, trial, 0.0
 
 
+def _shown(value: Any) -> Any:
+    return float(value) if isinstance(value, jax.Array) else value
+
+
 def _check_start(start: Start, first: Start) -> None:
     asker = f"the task of trial {start.name!r}"
     require_same_propositions(start.arrays.propositions, start.world.propositions, asker=asker, knower="its world")
@@ -226,8 +237,9 @@ def _check_start(start: Start, first: Start) -> None:
         knower="that of the first trial of the batch",
         remedy="run trials over other ones in a batch of their own",
     )
-    for what in ("settings", "family"):
-        mine, other = getattr(start.world, what), getattr(first.world, what)
+    # An estimator that reads cells is started for cells of one size.
+    for what in ("settings", "family", "resolution"):
+        mine, other = (_shown(getattr(trial.world, what)) for trial in (start, first))
         if mine != other:
             raise BatchError(f"trial {start.name!r}: its world has the {what} {mine}, the first of the batch {other}")
     # Another shape would compile anew in the middle of the batch, without a word: refused instead.

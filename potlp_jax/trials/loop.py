@@ -158,7 +158,7 @@ def drive(
 
     def first_estimator(shape: tuple[int, int]) -> Estimator | None:
         # An estimator that remembers where it was needs to know how large the map is.
-        return rules.first_estimator(policy, asked, shape, config.panoramas, world)
+        return rules.first_estimator(policy, asked, shape, resolution, config.panoramas, world)
 
     loop = _Loop(
         robot,

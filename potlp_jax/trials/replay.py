@@ -146,7 +146,9 @@ def estimator_at(trial: Trial, index: int, estimator: TrainedEstimator | Estimat
 
 def _first(trial: Trial, estimator: TrainedEstimator | Estimator, config: TrialConfig) -> Estimator | None:
     """What a trial's first decision asked, nothing seen yet."""
-    return first_estimator(Policy.POTLP, estimator, trial.world.shape, config.panoramas, None)
+    return first_estimator(
+        Policy.POTLP, estimator, trial.world.shape, float(trial.world.resolution), config.panoramas, None
+    )
 
 
 def _after_looking(

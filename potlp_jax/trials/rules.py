@@ -124,6 +124,7 @@ def first_estimator(
     policy: Policy | PolicyFunction,
     asked: TrainedEstimator | Estimator | None,
     shape: tuple[int, int],
+    resolution: float,
     panoramas: int,
     world: World | None,
 ) -> Estimator | None:
@@ -133,6 +134,7 @@ def first_estimator(
         policy: of the trial.
         asked: from ``estimator_of``.
         shape: rows and columns of the map.
+        resolution: side of its cells in the unit of cost.
         panoramas: how many are remembered (``TrialConfig.panoramas``).
         world: the true map, which ``oracle`` asks; None where nobody knows it.
 
@@ -147,7 +149,7 @@ def first_estimator(
         if world is None:
             raise PotlpError("policy oracle asks the true map: give it as world, or choose another policy")
         return TrueMapEstimator(world=world)
-    return asked.start(*shape, panoramas) if isinstance(asked, TrainedEstimator) else asked
+    return asked.start(*shape, panoramas, resolution) if isinstance(asked, TrainedEstimator) else asked
 
 
 # When a robot that follows a path hands back control.

@@ -5,6 +5,7 @@ from eval.mutants.mutant import Mutant
 PART = "labels and loss"
 
 _LABELS = "potlp_jax/learning/labels.py"
+_RESAMPLING = "potlp_jax/learning/resampling.py"
 _LOSS = "potlp_jax/learning/loss.py"
 _PAINTING = "potlp_jax/learning/painting.py"
 
@@ -103,5 +104,32 @@ MUTANTS = (
         "cross_entropy=jnp.sum(missed + taken)",
         ("tests/test_training.py",),
         "written_out or nan_gradient",
+    ),
+    Mutant(
+        PART,
+        "resampling: what is in the way needs half of a larger cell",
+        _RESAMPLING,
+        "_THICK = 3",
+        "_THICK = 2",
+        ("tests/test_resampling.py",),
+        "walk_over or thin_wall",
+    ),
+    Mutant(
+        PART,
+        "resampling: colours of walls and floors are mixed",
+        _RESAMPLING,
+        "best = painted & (alike | ~jnp.any(painted & alike, axis=(1, 3), keepdims=True))",
+        "best = painted",
+        ("tests/test_resampling.py",),
+        "walk_over",
+    ),
+    Mutant(
+        PART,
+        "building estimator: the camera has its height in the network's cells on every map",
+        "potlp_jax/learning/building_estimator.py",
+        "camera.lengths(1 / self.scale)",
+        "camera.lengths(1.0)",
+        ("tests/test_resampling.py",),
+        "painted_where",
     ),
 )
