@@ -6,9 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from potlp_jax.codec import with_settings
 from potlp_jax.environments.campus.delivery import Delivery, DeliveryConfig
-from potlp_jax.environments.campus.furnishing import NARROW_DOORS, PARCELS, Floor, FurnishConfig, Kind, furnish
+from potlp_jax.environments.campus.furnishing import PARCELS, Floor, FurnishConfig, Kind, furnish
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.ros.mapped_rooms import (
     MappedRooms,
@@ -113,8 +112,9 @@ def test_parcels_of_a_map_take_every_pair_of_rooms_and_are_lit(building):
 
 def test_trials_on_a_map_see_as_in_the_worlds_that_were_learned_from(building):
     same = MappedRooms(MappedRoomsConfig(building, resolution=DeliveryConfig().resolution, radius=0.0))
-    learned_from = trial_config_for(make("parcels"))
-    expected = with_settings(learned_from, NARROW_DOORS)
+    learned_from, narrow = (trial_config_for(make(family)) for family in ("parcels", "campus-small-parcels"))
+    # Decisions are those of floors with doors as narrow, what is seen that of the floors that were learned from.
+    expected = dataclasses.replace(learned_from, decision=narrow.decision, panoramas=narrow.panoramas)
     assert trial_config_for(same) == expected
     fine = MappedRooms(MappedRoomsConfig(building, resolution=DeliveryConfig().resolution / 2, radius=0.0))
     config = trial_config_for(fine)
