@@ -72,7 +72,7 @@ def resampled(
     best = painted & (alike | ~jnp.any(painted & alike, axis=(1, 3), keepdims=True))
     count = jnp.sum(best, axis=(1, 3)).astype(jnp.float32)
 
-    def mean(layer: Float32[Array, "h k w l *rest"]) -> Float32[Array, "h w *rest"]:
+    def mean(layer: Float32[Array, "h k w _ *rest"]) -> Float32[Array, "h w *rest"]:
         weight = jnp.expand_dims(best, range(4, layer.ndim))
         total = jnp.sum(jnp.where(weight, layer, 0.0), axis=(1, 3))
         return total / jnp.maximum(jnp.expand_dims(count, range(2, total.ndim)), 1.0)
@@ -84,7 +84,7 @@ def resampled(
     return other, Painting(floor=colour(painting.floor), beyond=colour(painting.beyond), distance=distance)
 
 
-def _larger_cells(parts: Array, inside: Bool[np.ndarray, "h k w l"]) -> Array:
+def _larger_cells(parts: Array, inside: Bool[np.ndarray, "h k w _"]) -> Array:
     """What a larger cell is, from its parts."""
     occupied, unknown = (
         jnp.sum((parts == kind) & inside, axis=(1, 3)) for kind in (BeliefMap.OCCUPIED, BeliefMap.UNKNOWN)
@@ -118,7 +118,7 @@ def _parts(length: int, scale: float) -> Int32[np.ndarray, "h k"]:
     return np.stack([np.pad(part, (0, most - len(part)), constant_values=-1) for part in found]).astype(np.int32)
 
 
-def _gathering(shape: tuple[int, int], scale: float) -> tuple[Callable[[Array], Array], Bool[np.ndarray, "h k w l"]]:
+def _gathering(shape: tuple[int, int], scale: float) -> tuple[Callable[[Array], Array], Bool[np.ndarray, "h k w _"]]:
     """What takes a layer to its parts, ``[h, k, w, l, ...]``, and which of them there are."""
     rows, columns = (_parts(length, scale) for length in shape)
     inside = (rows >= 0)[:, :, None, None] & (columns >= 0)[None, None]
