@@ -372,6 +372,8 @@ def test_an_estimator_is_evaluated_on_data_of_its_own_kind_only():
     check_fit(building, learned, samples, "net", "data")
     with pytest.raises(EvaluationError, match=r"data was painted without glances.*from with;.*--set glances=true"):
         check_fit(dataclasses.replace(building, glances=True), learned, samples, "net", "data")
+    with pytest.raises(EvaluationError, match=r"data has maps with cells of 1, net learned from cells of 0\.5"):
+        check_fit(dataclasses.replace(building, step=0.5), learned, samples, "net", "data")
     with pytest.raises(EvaluationError, match="no panoramas"):
         check_fit(CONFIG, learned, dataclasses.replace(samples, images=[]), "net", "data")
 

@@ -5,10 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import potlp_jax
 from potlp_jax.planning.decision import decide_from_estimates_jit, subgoals_at
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.situation import DecisionConfig, worthwhile
 from potlp_jax.task.task import Task
+from potlp_jax.trials.config import trial_config_for
 from potlp_jax.types import NO_ACTION, Status
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy
@@ -88,3 +90,12 @@ def test_where_all_chances_are_small_none_is_left_out():
 def test_what_is_no_share_is_named(share):
     with pytest.raises(ValueError, match=r"least_chance is .*, must lie between 0 and 1"):
         DecisionConfig(least_chance=share)
+
+
+@pytest.mark.parametrize(
+    ("family", "share", "factor"),
+    [("delivery", 0.1, 0.5), ("parcels", 0.1, 0.5), ("campus-small", 0.0, 4.0), ("firefighting", 0.0, 4.0)],
+)
+def test_families_with_many_doors_leave_small_chances_out(family, share, factor):
+    decision = trial_config_for(potlp_jax.make(family)).decision
+    assert (decision.least_chance, decision.dead_end_factor) == (share, factor)

@@ -13,7 +13,7 @@ from potlp_jax.learning.exclusion import exclusive_chances
 from potlp_jax.learning.imagined_paths import Outlook, Scenery, outlook_of_first, prospects, scenery
 from potlp_jax.learning.map_channels import map_channels
 from potlp_jax.learning.network import require_propositions
-from potlp_jax.learning.overlays import Overlay, imagined_overlay, painting_overlays, spread_over
+from potlp_jax.learning.overlays import Imagined, Overlay, imagined_overlay, painting_overlays, spread_over
 from potlp_jax.learning.painting import Painting, moved_painting, paint
 from potlp_jax.learning.resampling import cells_in, resampled
 from potlp_jax.learning.squares import SQUARE
@@ -74,16 +74,18 @@ class BuildingEstimator:
 
     def overlays(self, belief: BeliefMap) -> tuple[Overlay, ...]:
         """The painting, and what the network makes of squares that were not observed."""
-        painted = painting_overlays(self.memory)
-        asked, own = self._on_own_cells(belief, jnp.zeros(belief.cells.shape, bool))
-        squares = jax.tree.map(jax.nn.sigmoid, asked.imagine(own).squares)
-        imagined = imagined_overlay(squares.free, squares.holds, own, SQUARE)
-        return (*painted, imagined if self.scale == 1.0 else spread_over(imagined, belief, self.scale))
+        if self.scale != 1.0:
+            asked, own = self._on_own_cells(belief, jnp.zeros(belief.cells.shape, bool))
+            return (*painting_overlays(self.memory), spread_over(asked._imagined(own), belief, self.scale))
+        return (*painting_overlays(self.memory), self._imagined(belief))
+
+    def _imagined(self, belief: BeliefMap) -> Imagined:
+        """What the network makes of squares of its own cells."""
+        squares = jax.tree.map(jax.nn.sigmoid, self.imagine(belief).squares)
+        return imagined_overlay(squares.free, squares.holds, belief, SQUARE)
 
     def _on_own_cells(self, belief: BeliefMap, entered: Bool[Array, "H W"]) -> "tuple[BuildingEstimator, BeliefMap]":
         """The estimator and the map on cells as large as those that the network learned from (``resampled``)."""
-        if self.scale == 1.0:
-            return self, belief
         own, painting = resampled(belief, self.memory, entered, self.scale)
         return dataclasses.replace(self, memory=painting, scale=1.0), own
 
@@ -94,14 +96,15 @@ class BuildingEstimator:
             PropositionsError: the network was trained for other propositions than the task's.
         """
         require_propositions(self.config.propositions, task.propositions, "the estimator's network")
-        height, width = belief.cells.shape
-        # Masked subgoals point at cell (0, 0), whatever is there.
-        entered = jnp.zeros((height, width), bool).at[subgoals.cells[:, 0], subgoals.cells[:, 1]].max(subgoals.mask)
-        asked, belief = self._on_own_cells(belief, entered)
         if self.scale != 1.0:
-            subgoals = dataclasses.replace(subgoals, cells=cells_in(subgoals.cells, (height, width), self.scale))
+            height, width = belief.cells.shape
+            # Masked subgoals point at cell (0, 0), whatever is there.
+            entered = jnp.zeros((height, width), bool).at[subgoals.cells[:, 0], subgoals.cells[:, 1]].max(subgoals.mask)
+            asked, own = self._on_own_cells(belief, entered)
+            there = cells_in(subgoals.cells, (height, width), self.scale)
+            return asked(own, dataclasses.replace(subgoals, cells=there), task)
         network = BuildingNetwork(self.config)
-        encoded = asked.imagine(belief)
+        encoded = self.imagine(belief)
         stay, go = task.class_phi[:, 0], task.class_phi[:, 1]
         modulation = network.modulation(self.params, stay, go)
         places = network.places(self.params, encoded, subgoals.cells)

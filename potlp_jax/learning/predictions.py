@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
@@ -56,8 +57,8 @@ def check_fit(config: EstimatorConfig, domain: Domain, samples: Samples, estimat
 
     Raises:
         PropositionsError: other propositions.
-        EvaluationError: another size of panorama, another camera, another unit of cost or maps painted in
-            another way than those it learned from.
+        EvaluationError: another size of panorama, another camera, another unit of cost, or maps with other cells or
+            painted in another way than those it learned from.
     """
     require_propositions(config.propositions, tuple(samples.metadata.propositions), estimator, asker=dataset)
     if not samples.images:
@@ -73,6 +74,12 @@ def check_fit(config: EstimatorConfig, domain: Domain, samples: Samples, estimat
         raise EvaluationError(
             f"{dataset} is not what {estimator} learned from: {'; '.join(misfits)}. Collect a data set with the same, "
             "or train an estimator for this one"
+        )
+    # In a trial it looks at cells of its own (``learning.resampling``); maps of data sets are read as they are.
+    if isinstance(config, BuildingConfig) and not math.isclose(config.step, samples.metadata.resolution, rel_tol=1e-4):
+        raise EvaluationError(
+            f"{dataset} has maps with cells of {samples.metadata.resolution:g}, {estimator} learned from cells of "
+            f"{config.step:g}; collect a data set on such maps, or train an estimator for this one"
         )
     if isinstance(config, BuildingConfig) and config.glances != samples.metadata.glances:
         painted = {True: "with", False: "without"}

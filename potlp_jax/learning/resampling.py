@@ -57,8 +57,10 @@ def resampled(
     gather, inside = _gathering(shape, scale)
     opened = jnp.any(gather(entered) & inside, axis=(1, 3))
     cells = jnp.where(opened, jnp.int8(BeliefMap.FREE), _larger_cells(gather(belief.cells), inside))
-    bits = [jnp.any(((gather(belief.letters) >> bit) & 1 == 1) & inside, axis=(1, 3)) for bit in _bits(belief)]
-    letters = sum((held.astype(jnp.int32) << bit for bit, held in enumerate(bits)), jnp.zeros(cells.shape, jnp.int32))
+    letters = jnp.zeros(cells.shape, jnp.int32)
+    for bit in range(len(belief.propositions)):
+        holds = jnp.any((gather(belief.letters) >> bit & 1 == 1) & inside, axis=(1, 3))
+        letters |= holds.astype(jnp.int32) << bit
     other = BeliefMap(
         cells=cells,
         letters=letters,
@@ -92,10 +94,6 @@ def _larger_cells(parts: Array, inside: Bool[np.ndarray, "h k w _"]) -> Array:
     of = np.sum(inside, axis=(1, 3))
     seen = jnp.where(2 * unknown > of, BeliefMap.UNKNOWN, BeliefMap.FREE)
     return jnp.where(_THICK * occupied >= of, BeliefMap.OCCUPIED, seen).astype(jnp.int8)
-
-
-def _bits(belief: BeliefMap) -> range:
-    return range(len(belief.propositions))
 
 
 @functools.lru_cache(maxsize=32)

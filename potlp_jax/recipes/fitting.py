@@ -144,9 +144,10 @@ def learner_after(begin: TrainedEstimator, training: Samples) -> Learner:
     known = begin.config
     require_propositions(known.propositions, training.metadata.propositions, begin.name, asker="the training data")
     # The scales of costs are the estimator's own: with others its parameters would mean other costs. Its maps are
-    # painted as those from which it learns now.
+    # painted as those from which it learns now, and have their cells.
     if isinstance(known, BuildingConfig):
-        known = dataclasses.replace(known, glances=training.metadata.glances)
+        meant = training.metadata
+        known = dataclasses.replace(known, glances=meant.glances, step=float(meant.resolution))
     return learner_of(known)
 
 
