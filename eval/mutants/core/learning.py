@@ -25,8 +25,8 @@ MUTANTS = (
         _PAINTING,
         "met = (enter <= free_until[None])",
         "met = (enter < free_until[None])",
-        ("tests/test_native_twins.py",),
-        "looks_and_paintings",
+        ("tests/test_painting.py",),
+        "loop_over_cells or glance",
     ),
     Mutant(
         PART,
@@ -34,8 +34,8 @@ MUTANTS = (
         _PAINTING,
         "column = jnp.where(in_sight, column, (column + turn) % panorama.shape[1])",
         "column = column % panorama.shape[1]",
-        ("tests/test_native_twins.py",),
-        "looks_and_paintings",
+        ("tests/test_painting.py",),
+        "loop_over_cells or glance",
     ),
     Mutant(
         PART,
