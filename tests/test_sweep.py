@@ -19,6 +19,7 @@ import pytest
 from typer.testing import CliRunner
 
 from eval.faults.kills import process_start, workers_of
+from eval.real_maps.__main__ import exchange
 from eval.savings import decisions_of
 from potlp_jax.cli import app
 from potlp_jax.cli.report import page_title
@@ -753,3 +754,11 @@ def test_an_experiment_counts_the_decisions_and_flagged_trials_of_a_policy():
     assert (found["trials"], found["number"], found["seconds"]) == (2, 8, 0.5)
     flagged = {name for name, count in found["flagged"].items() if count}
     assert flagged == {"SUBGOAL_OVERFLOW", "DEPTH_OVERFLOW"}
+
+
+def test_real_maps_compare_potlp_with_another_baseline_on_the_same_worlds():
+    rows = [_row(Item("toy", "F goal", policy, 0)) for policy in ("known-map", "baseline", "potlp")]
+    others = [dataclasses.replace(row, cost=row.cost + 5) for row in rows]
+    found = {row.item.policy: row.cost for row in exchange(rows, others)}
+    assert found == {"known-map": rows[0].cost, "baseline": others[1].cost, "potlp": rows[2].cost}
+    assert len(exchange(rows, others)) == 3
