@@ -16,7 +16,7 @@ import pytest
 
 from eval.faults.kills import workers_of
 from potlp_jax.engine.engine import MOST_KILLED, Broken, Engine, Here
-from potlp_jax.engine.opening import BATCH_SYSTEMS, SUBMITTING, open_engine
+from potlp_jax.engine.opening import BATCH_SYSTEMS, open_engine
 from potlp_jax.engine.writer import only_writer
 from potlp_jax.errors import EngineError, StoreError, WorldError
 
@@ -222,13 +222,13 @@ def test_clusters_that_cannot_be_are_named(cluster, message, monkeypatch):
 
 
 def test_a_batch_system_that_is_not_here_is_named(monkeypatch):
-    pytest.importorskip("dask_jobqueue")
+    jobqueue = pytest.importorskip("dask_jobqueue")
     monkeypatch.setattr(shutil, "which", lambda program: None)
-    assert set(SUBMITTING) == set(BATCH_SYSTEMS)
-    for cluster, command in SUBMITTING.items():
+    for name, system in BATCH_SYSTEMS.items():
+        assert hasattr(jobqueue, system.cluster)
         with (
-            pytest.raises(EngineError, match=f"there is no {command} here"),
-            open_engine(cluster=f"{cluster}:workers=1"),
+            pytest.raises(EngineError, match=f"there is no {system.submit} here"),
+            open_engine(cluster=f"{name}:workers=1"),
         ):
             pass
 

@@ -723,6 +723,13 @@ def test_export_has_a_line_per_trial(finished, tmp_path):
     assert pandas.read_parquet(tmp_path / "a.parquet")["cost"].tolist() == [row.cost for row in _rows(finished)]
 
 
+def test_parquet_without_its_library_fails_with_what_to_install(finished, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    told = _potlp("sweep", "export", finished, "--out", tmp_path / "a.parquet")
+    assert told.exit_code == 1
+    assert "pip install 'potlp-jax[train]', or write a .csv" in told.stderr
+
+
 def test_export_names_status_bits(tmp_path):
     store = Store(tmp_path / RESULTS)
     flagged = Status.SUBGOAL_OVERFLOW | Status.FALLBACK

@@ -14,7 +14,7 @@ from typer.core import TyperGroup
 
 from potlp_jax.cli.group import Command, command_app
 from potlp_jax.cli.options import ClusterName, Json, SweepFolder
-from potlp_jax.cli.output import console, fail, make_folder, print_json, progress_bar
+from potlp_jax.cli.output import FAILED, console, fail, make_folder, print_json, progress_bar
 
 if TYPE_CHECKING:
     from potlp_jax.engine.engine import Engine
@@ -284,5 +284,5 @@ def _write_parquet(rows: list[dict[str, Any]], file: Path) -> None:
         import pyarrow.parquet
     # CSV needs nothing; only the extra for training brings pyarrow.
     except ImportError:
-        fail("Parquet files need pyarrow: pip install 'potlp-jax[train]', or write a .csv")
+        fail("Parquet files need pyarrow: pip install 'potlp-jax[train]', or write a .csv", FAILED)
     pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows), file)

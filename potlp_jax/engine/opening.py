@@ -7,20 +7,34 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 from potlp_jax.engine.engine import Engine, Here
 from potlp_jax.errors import EngineError
 
-BATCH_SYSTEMS: Mapping[str, str] = MappingProxyType(
-    {"slurm": "SLURMCluster", "pbs": "PBSCluster", "sge": "SGECluster", "lsf": "LSFCluster", "oar": "OARCluster"}
-)
-"""Batch systems by their name in ``--cluster``, and what dask-jobqueue calls them."""
 
-SUBMITTING: Mapping[str, str] = MappingProxyType(
-    {"slurm": "sbatch", "pbs": "qsub", "sge": "qsub", "lsf": "bsub", "oar": "oarsub"}
+class BatchSystem(NamedTuple):
+    """A batch system.
+
+    Attributes:
+        cluster: the class of dask-jobqueue.
+        submit: the command that begins a job.
+    """
+
+    cluster: str
+    submit: str
+
+
+BATCH_SYSTEMS: Mapping[str, BatchSystem] = MappingProxyType(
+    {
+        "slurm": BatchSystem("SLURMCluster", "sbatch"),
+        "pbs": BatchSystem("PBSCluster", "qsub"),
+        "sge": BatchSystem("SGECluster", "qsub"),
+        "lsf": BatchSystem("LSFCluster", "bsub"),
+        "oar": BatchSystem("OARCluster", "oarsub"),
+    }
 )
-"""The command of each batch system that begins a job."""
+"""By their name in ``--cluster``."""
 
 SCHEDULERS: tuple[str, ...] = ("tcp", "tls", "ucx", "ws", "wss")
 """How addresses of a Dask scheduler begin."""
@@ -110,11 +124,10 @@ def _of_batch_system(kind: str, options: dict[str, str]) -> Any:
     given: dict[str, Any] = {_WORDS.get(name, name): value for name, value in options.items()}
     given = {"cores": 1, "processes": 1, "memory": "4GB", **given}
     # dask-jobqueue would go on without workers: what it says about a command that is missing is said in the background.
-    if shutil.which(SUBMITTING[kind]) is None:
-        raise EngineError(
-            f"--cluster {kind}: there is no {SUBMITTING[kind]} here: give the command where jobs are begun"
-        )
-    made = _begun(lambda: getattr(jobqueue, BATCH_SYSTEMS[kind])(**given), f"as jobs of {kind}")
+    system = BATCH_SYSTEMS[kind]
+    if shutil.which(system.submit) is None:
+        raise EngineError(f"--cluster {kind}: there is no {system.submit} here: give the command where jobs are begun")
+    made = _begun(lambda: getattr(jobqueue, system.cluster)(**given), f"as jobs of {kind}")
     # Jobs that end before the work does, as at their time limit, are replaced.
     made.adapt(minimum_jobs=workers, maximum_jobs=workers)
     return made
