@@ -19,6 +19,7 @@ import pytest
 from typer.testing import CliRunner
 
 from eval.faults.kills import process_start, workers_of
+from eval.limit.worst import experiment_of
 from eval.real_maps.__main__ import exchange
 from eval.savings import decisions_of
 from potlp_jax.cli import app
@@ -28,7 +29,7 @@ from potlp_jax.codec import shipped_settings
 from potlp_jax.engine.engine import Broken, Here
 from potlp_jax.engine.writer import only_writer
 from potlp_jax.environments.registry import make
-from potlp_jax.environments.splits import world_key
+from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import ConfigurationError, EngineError, StoreError, SweepError
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.rows import path_text, read_path
@@ -769,3 +770,16 @@ def test_real_maps_compare_potlp_with_another_baseline_on_the_same_worlds():
     found = {row.item.policy: row.cost for row in exchange(rows, others)}
     assert found == {"known-map": rows[0].cost, "baseline": others[1].cost, "potlp": rows[2].cost}
     assert len(exchange(rows, others)) == 3
+
+
+def test_the_worst_trials_of_a_sweep_are_run_again_as_it_ran_them(finished, tmp_path):
+    found = experiment_of(finished, 8)
+    assert (found.generator.name, found.split, found.given, found.buildings) == ("toy", Split.VALIDATION, None, 8)
+    given = Store(finished / RESULTS, read_only=True)
+    store = Store(tmp_path / RESULTS)
+    cells = [{"environment": name, "task": "F goal"} for name in ("toy", "rooms")]
+    store.agree({"specification": {**given.facts()["specification"], "cells": cells}})
+    given.close()
+    store.close()
+    with pytest.raises(ValueError, match="has trials in rooms, toy: give a sweep of one environment"):
+        experiment_of(tmp_path, 8)

@@ -22,12 +22,12 @@ from eval.limit.rows import ROWS, append_row, read_rows
 from eval.savings import read_rows as rows_of_sweep
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.registry import make
-from potlp_jax.environments.splits import Split
 from potlp_jax.learning.domain import unit_of
 from potlp_jax.learning.estimator import named_estimator
 from potlp_jax.sweep.results import pair_rows, reliable_pairs
 from potlp_jax.sweep.rows import provenance
 from potlp_jax.sweep.runner import RESULTS
+from potlp_jax.sweep.specification import specification_from_store
 from potlp_jax.sweep.store import Row, Store
 
 CAUSES = {Arm.TRUE_CHANCES: "P_S", Arm.TRUE_COSTS: "R_S and R_F", Arm.IDEAL_OBSERVER: "several answers at once"}
@@ -139,6 +139,28 @@ def markdown(results: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def experiment_of(sweep: Path, buildings: int) -> Experiment:
+    """The trials of a sweep of one environment, to be run with other answers.
+
+    Raises:
+        ValueError: the sweep has several environments.
+    """
+    store = Store(sweep / RESULTS, read_only=True)
+    specification = specification_from_store(store.facts()["specification"])
+    store.close()
+    environments = sorted({cell.environment for cell in specification.cells})
+    if len(environments) != 1:
+        raise ValueError(f"{sweep} has trials in {', '.join(environments)}: give a sweep of one environment")
+    generator, given = make(environments[0]), specification.estimator
+    return Experiment(
+        generator=generator,
+        split=specification.split,
+        tasks=tuple(generator.tasks),
+        given=None if given is None else named_estimator(given),
+        buildings=buildings,
+    )
+
+
 def main() -> None:
     enable_compilation_cache()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -148,19 +170,8 @@ def main() -> None:
     parser.add_argument("--buildings", type=int, default=16, help="that the ideal observer draws at a decision")
     parser.add_argument("--report", type=Path, help="without suffix: where the results go")
     options = parser.parse_args()
-    store = Store(options.sweep / RESULTS, read_only=True)
-    specification = store.facts()["specification"]
-    store.close()
-    (environment,), given = specification["environments"], specification["estimator"]
-    generator = make(environment)
-    experiment = Experiment(
-        generator=generator,
-        split=Split(specification["split"]),
-        tasks=tuple(generator.tasks),
-        given=None if given is None else named_estimator(given),
-        buildings=options.buildings,
-    )
-    losses = worst_of(rows_of_sweep(options.sweep), generator.tasks, options.trials)
+    experiment = experiment_of(options.sweep, options.buildings)
+    losses = worst_of(rows_of_sweep(options.sweep), experiment.generator.tasks, options.trials)
     unit = unit_of(float(experiment.world(0).resolution))
     results = results_of(losses, run(options.out / ROWS, experiment, losses), unit)
     print(markdown(results))
