@@ -133,7 +133,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="python -m eval.ablations --out {out} --views own={all}/own explored={all}/explored "
         "--processes {processes} --report docs/results/ablations",
     ),
-    "held-out": Experiment(page="table1", command="potlp sweep firefighting-held-out --out {out}"),
+    "held-out": Experiment(page="panorama", command="potlp sweep firefighting-held-out --out {out}"),
     "panorama": Experiment(
         page="panorama",
         command="python -m eval.table1 --estimator firefighting-panorama --out {out} --processes {processes} "

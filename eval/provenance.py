@@ -13,7 +13,7 @@ import gzip
 import json
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -85,11 +85,21 @@ def lines_of(page: str, folder: Path = RESULTS) -> str:
         # Several files of one table: what they agree in, and the commits of all.
         merged = {name: value for made_by in known for name, value in made_by.items()}
         merged["commits"] = sorted({commit for made_by in known for commit in _commits(made_by)})
+        merged["versions"] = _versions(known)
         if len({made_by.get("command") for made_by in known}) > 1:
             merged.pop("command", None)
         return f"{mark[1]}\n{made_line(merged)}\n"
 
     return _LINE.sub(renew, page)
+
+
+def _versions(known: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """By package, all versions that the files name."""
+    found: dict[str, set[str]] = {}
+    for made_by in known:
+        for package, version in made_by.get("versions", {}).items():
+            found.setdefault(package, set()).add(version)
+    return {package: " and ".join(sorted(versions)) for package, versions in found.items()}
 
 
 def _commits(made_by: Mapping[str, Any]) -> list[str]:

@@ -1,6 +1,6 @@
 """A camera of your own: a thermal one, in which only distance and smoke are seen.
 
-    potlp run firefighting --camera examples.own_camera:thermal
+    potlp run firefighting --camera examples.own_camera:thermal --estimator firefighting
 
 A camera is a function of the world, the robot's cell and its ``CameraConfig``, which runs inside jit. It is named, not
 passed: records, data sets and the workers of a sweep all mean the same one.

@@ -223,6 +223,10 @@ def test_shares_and_what_each_part_brings(tmp_path):
     data.write_text(json.dumps(results))
     text = page(results, data)
     assert "true P_S add 60.0 points and true R_S and R_F take 30.0 points" in text
+    assert "could be told from none" not in text
+    wide = {"gain": 0.6, "low": -0.1, "high": 0.9}
+    table = {**results["tables"]["1"], "gains": {"true-chances": wide, "true-costs": wide}}
+    assert "R_S and R_F could be told from none." in page({**results, "tables": {"1": table}}, data)
     assert lines_of(text, tmp_path) == text
     assert text.count("<!-- made: limit.json -->\n*Made by") == 2
     assert page(json.loads(data.read_text()), data) == text

@@ -40,6 +40,9 @@ OBSERVERS = {
         "buildings are drawn; what it does not know, nobody can."
     )
 }
+PARTS = (Arm.TRUE_CHANCES, Arm.TRUE_COSTS)
+"""The truth in place of one part of the answers."""
+
 OTHER_OBSERVER = (
     "who may be where, given the floor plan, every mapped cell and letter, and whether a room is lit, of every room of "
     "which a floor cell has been in line of sight at a decision. Having the plan, it bounds from above what can be "
@@ -160,15 +163,19 @@ def _answer(results: Mapping[str, Any]) -> str:
         shares = {entry["policy"]: entry["attainable_share"] for entry in table["satisfied"]["rows"]}
         ideal = shares.get(Arm.IDEAL_OBSERVER)
         limit = "" if ideal is None else f"the ideal observer reaches {100 * ideal:.0f} %, "
-        gains = {
-            arm: table["gains"][arm]["gain"] for arm in (Arm.TRUE_CHANCES, Arm.TRUE_COSTS) if arm in table["gains"]
-        }
+        gains = {arm: table["gains"][arm]["gain"] for arm in PARTS if arm in table["gains"]}
         told = " and ".join(
             f"true {'P_S' if arm is Arm.TRUE_CHANCES else 'R_S and R_F'} {'add' if gain >= 0 else 'take'} "
             f"{100 * abs(gain):.1f} points"
             for arm, gain in gains.items()
         )
         sentences.append(f"Task {name}: {limit}PO-TLP {100 * shares[Arm.POTLP]:.0f} %{'; ' + told if told else ''}.")
+    differences = [
+        table["gains"][arm] for table in results["tables"].values() for arm in PARTS if arm in table["gains"]
+    ]
+    known = [gain for gain in differences if gain["low"] is not None]
+    if known and all(gain["low"] <= 0 <= gain["high"] for gain in known):
+        sentences.append("None of these differences of true P_S or of true R_S and R_F could be told from none.")
     counts = [table["satisfied"]["pairs"] for table in results["tables"].values()]
     number = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
     return f"In {number} {results['split']} worlds a task: {' '.join(sentences)}"

@@ -36,7 +36,7 @@ class TrialConfig:
     sensor: SensorConfig = SensorConfig()
     camera: CameraConfig = CameraConfig()
     disturbance: Disturbance = Disturbance()
-    # Panoramas that still show a frontier: at most 9 in fire-fighting buildings (docs/estimator.md, "Panoramas").
+    # Panoramas that still show a frontier: at most 9 in fire-fighting buildings.
     panoramas: int = 32
     look_every: int = 1
     # Both are part of the model (docs/model.md section 7): another value gives other trials.

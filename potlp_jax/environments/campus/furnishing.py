@@ -84,14 +84,14 @@ MANY_DOORS: Settings = Settings(
     }
 )
 """Settings of trials: from a hallway one sees 18 to 27 doors at a time, in the mean of a trial; and up to 28 panoramas
-still showed a frontier at a time (docs/estimator.md, "Panoramas"). Thirty doors that may all lead to one unseen hallway
+still showed a frontier at a time. Thirty doors that may all lead to one unseen hallway
 are not thirty chances, and what it costs when all of them fail outweighs all else where it is large
 (docs/results/delivery.md, "Chances that are one")."""
 
 NARROW_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 96, "min_size": 1}}, "panoramas": 128})
 """Settings of trials where a door may be as narrow as one cell, as after resampling the map of a real building: a
 frontier is to be dropped only where it is smaller than any passage (docs/model.md section 6). Slivers that stay open
-are remembered: up to 59 panoramas still showed a frontier at a time (docs/estimator.md, "Panoramas")."""
+are remembered: up to 59 panoramas still showed a frontier at a time."""
 
 _WALL_COLOURS = {
     Kind.HALLWAY: (208, 204, 194),
