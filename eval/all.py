@@ -149,6 +149,11 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="python -m eval.delivery --out {out} --plans {data}/floorplans --worlds 1000 --plan-worlds 80 "
         "--formula-worlds 40 --processes {processes} --report docs/results/delivery/first1000",
     ),
+    "worst-delivery": Experiment(
+        page="delivery",
+        command="python -m eval.limit.worst {all}/delivery/generated --out {out} --trials 10 --buildings 8 "
+        "--report docs/results/delivery/worst",
+    ),
     "real-maps": Experiment(
         page="delivery",
         command="python -m eval.real_maps --out {out} --maps {data}/maps --worlds 50 --processes {processes}",

@@ -18,7 +18,7 @@ from potlp_jax.errors import SpotMissingError, TaskError
 from potlp_jax.task import spot_child
 
 _INSTALL_SPOT = (
-    "install it with 'pip install spottl' (Linux x86_64, Python up to 3.13; the PyPI package called 'spot' is something "
+    "install it with 'pip install spottl' (Linux x86_64, Python up to 3.13; the PyPI package 'spot' is something "
     "else) or elsewhere with 'conda install -c conda-forge spot'; formulas of shipped tasks, however they are written, "
     "and HOA files need no Spot"
 )
