@@ -94,7 +94,7 @@ def test_what_is_no_share_is_named(share):
 
 @pytest.mark.parametrize(
     ("family", "share", "factor"),
-    [("delivery", 0.1, 0.5), ("parcels", 0.1, 0.5), ("campus-small", 0.0, 4.0), ("firefighting", 0.0, 4.0)],
+    [("delivery", 0.1, 0.5), ("parcels", 0.1, 0.5), ("campus-small", 0.1, 0.5), ("firefighting", 0.0, 4.0)],
 )
 def test_families_with_many_doors_leave_small_chances_out(family, share, factor):
     decision = trial_config_for(potlp_jax.make(family)).decision

@@ -77,18 +77,17 @@ PARCELS: Errand = Errand(
 )
 """Bradley et al. 2021, section V-C: a document and a package for two people, in any order or the document first."""
 
-MANY_DOORS: Settings = Settings(
-    {
-        "decision": {"frontiers": {"max_subgoals": 64}, "least_chance": 0.1, "dead_end_factor": 0.5},
-        "panoramas": 64,
-    }
-)
-"""Settings of trials: from a hallway one sees 18 to 27 doors at a time, in the mean of a trial; and up to 28 panoramas
-still showed a frontier at a time. Thirty doors that may all lead to one unseen hallway
-are not thirty chances, and what it costs when all of them fail outweighs all else where it is large
-(docs/results/delivery.md, "Chances that are one")."""
+_SMALL_CHANCES = {"least_chance": 0.1, "dead_end_factor": 0.5}
+# Thirty doors that may all lead to one unseen hallway are not thirty chances, and what it costs when all of them fail
+# outweighs all else where it is large (docs/results/delivery.md, "Chances that are one").
 
-NARROW_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 96, "min_size": 1}}, "panoramas": 128})
+MANY_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 64}, **_SMALL_CHANCES}, "panoramas": 64})
+"""Settings of trials: from a hallway one sees 18 to 27 doors at a time, in the mean of a trial; and up to 28 panoramas
+still showed a frontier at a time."""
+
+NARROW_DOORS: Settings = Settings(
+    {"decision": {"frontiers": {"max_subgoals": 96, "min_size": 1}, **_SMALL_CHANCES}, "panoramas": 128}
+)
 """Settings of trials where a door may be as narrow as one cell, as after resampling the map of a real building: a
 frontier is to be dropped only where it is smaller than any passage (docs/model.md section 6). Slivers that stay open
 are remembered: up to 59 panoramas still showed a frontier at a time."""
