@@ -119,7 +119,8 @@ def _is_a_mention(wrong: str) -> bool:
 
 
 def test_indented_commands_are_read():
-    assert ("examples/own_camera.py:1", "potlp run firefighting --camera examples.own_camera:thermal") in POTLP
+    command = "potlp run firefighting --camera examples.own_camera:thermal --estimator firefighting"
+    assert ("examples/own_camera.py:1", command) in POTLP
 
 
 def test_what_is_no_command_is_refused():

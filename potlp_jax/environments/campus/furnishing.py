@@ -77,9 +77,9 @@ PARCELS: Errand = Errand(
 )
 """Bradley et al. 2021, section V-C: a document and a package for two people, in any order or the document first."""
 
-_SMALL_CHANCES = {"least_chance": 0.1, "dead_end_factor": 0.5}
 # Thirty doors that may all lead to one unseen hallway are not thirty chances, and what it costs when all of them fail
 # outweighs all else where it is large (docs/results/delivery.md, "Chances that are one").
+_SMALL_CHANCES = {"least_chance": 0.1, "dead_end_factor": 0.5}
 
 MANY_DOORS: Settings = Settings({"decision": {"frontiers": {"max_subgoals": 64}, **_SMALL_CHANCES}, "panoramas": 64})
 """Settings of trials: from a hallway one sees 18 to 27 doors at a time, in the mean of a trial; and up to 28 panoramas
