@@ -39,11 +39,15 @@ def test_a_line_that_the_data_contradict_is_renewed(tmp_path):
 
 
 def test_files_of_one_table_are_all_named(tmp_path):
-    for name, commit in (("a", "1" * 40), ("b", "2" * 40 + "+")):
-        made_by = {"command": f"python -m {name}", "commit": commit, "versions": {"jax": "0.10.1"}}
+    for name, commit, version in (("a", "1" * 40, "0.1.0"), ("b", "2" * 40 + "+", "0.2.0")):
+        versions = {"jax": "0.10.1", "potlp-jax": version}
+        made_by = {"command": f"python -m {name}", "commit": commit, "versions": versions}
         (tmp_path / f"{name}.json").write_text(json.dumps({"provenance": made_by}))
     (line,) = [line for line in lines_of("<!-- made: a.json, b.json -->\n", tmp_path).splitlines() if "Made" in line]
-    assert line == "*Made by command: not recorded; commit: `1111111`, `2222222` with changes; versions: jax 0.10.1.*"
+    assert line == (
+        "*Made by command: not recorded; commit: `1111111`, `2222222` with changes; "
+        "versions: jax 0.10.1, potlp-jax 0.1.0 and 0.2.0.*"
+    )
 
 
 def test_commits_of_rows_count_wherever_they_stand():
