@@ -772,14 +772,21 @@ def test_real_maps_compare_potlp_with_another_baseline_on_the_same_worlds():
     assert len(exchange(rows, others)) == 3
 
 
-def test_the_worst_trials_of_a_sweep_are_run_again_as_it_ran_them(finished, tmp_path):
-    found = experiment_of(finished, 8)
-    assert (found.generator.name, found.split, found.given, found.buildings) == ("toy", Split.VALIDATION, None, 8)
-    given = Store(finished / RESULTS, read_only=True)
-    store = Store(tmp_path / RESULTS)
-    cells = [{"environment": name, "task": "F goal"} for name in ("toy", "rooms")]
-    store.agree({"specification": {**given.facts()["specification"], "cells": cells}})
-    given.close()
-    store.close()
-    with pytest.raises(ValueError, match="has trials in rooms, toy: give a sweep of one environment"):
-        experiment_of(tmp_path, 8)
+def test_the_worst_trials_of_a_sweep_are_run_again_as_it_ran_them(tmp_path):
+    def swept(**changes):
+        file = tmp_path / f"{len(list(tmp_path.iterdir()))}"
+        file.mkdir()
+        store = Store(file / RESULTS)
+        given = {"environments": ["toy"], "tasks": ["F goal"], "policies": ["potlp"], "worlds": 1, **changes}
+        store.agree({"specification": specification_from_dict(given, "here").to_dict()})
+        store.close()
+        return file
+
+    found = experiment_of(swept(split="test"), 8)
+    assert (found.generator.name, found.split, found.given, found.buildings) == ("toy", Split.TEST, None, 8)
+    with pytest.raises(ValueError, match="has trials in campus-medium, campus-small: give a sweep of one environment"):
+        experiment_of(swept(environments=["campus-small", "campus-medium"], tasks=[1]), 8)
+    own = {"replan_distance": 3.0}
+    for changes in ({"seed": 1}, {"settings": own}, {"policy_settings": {"potlp": own}}):
+        with pytest.raises(ValueError, match="has settings or a seed of its own"):
+            experiment_of(swept(**changes), 8)

@@ -24,11 +24,13 @@ from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.registry import make
 from potlp_jax.learning.domain import unit_of
 from potlp_jax.learning.estimator import named_estimator
+from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.results import pair_rows, reliable_pairs
 from potlp_jax.sweep.rows import provenance
 from potlp_jax.sweep.runner import RESULTS
 from potlp_jax.sweep.specification import specification_from_store
 from potlp_jax.sweep.store import Row, Store
+from potlp_jax.trials.config import trial_config_for
 
 CAUSES = {Arm.TRUE_CHANCES: "P_S", Arm.TRUE_COSTS: "R_S and R_F", Arm.IDEAL_OBSERVER: "several answers at once"}
 """By the arm that takes a loss away, simplest first: the observer changes all answers."""
@@ -143,7 +145,7 @@ def experiment_of(sweep: Path, buildings: int) -> Experiment:
     """The trials of a sweep of one environment, to be run with other answers.
 
     Raises:
-        ValueError: the sweep has several environments.
+        ValueError: the sweep has several environments, or settings or a seed of its own, which an experiment has not.
     """
     store = Store(sweep / RESULTS, read_only=True)
     specification = specification_from_store(store.facts()["specification"])
@@ -152,6 +154,11 @@ def experiment_of(sweep: Path, buildings: int) -> Experiment:
     if len(environments) != 1:
         raise ValueError(f"{sweep} has trials in {', '.join(environments)}: give a sweep of one environment")
     generator, given = make(environments[0]), specification.estimator
+    configs = {specification.config, specification.config_of(Policy.POTLP)}
+    if specification.seed != 0 or configs != {trial_config_for(generator)}:
+        raise ValueError(
+            f"{sweep} has settings or a seed of its own: give a sweep with the family's settings and seed 0"
+        )
     return Experiment(
         generator=generator,
         split=specification.split,
