@@ -149,6 +149,15 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="python -m eval.delivery --out {out} --plans {data}/floorplans --worlds 1000 --plan-worlds 80 "
         "--formula-worlds 40 --processes {processes} --report docs/results/delivery/first1000",
     ),
+    "own-delivery": Experiment(
+        page="delivery",
+        command="potlp collect delivery --split validation --worlds 40 --out {out} --set first_world=1600 "
+        "--set look_every=1 --set staying_sets=3 --set views_per_world=12 --set spacing=[4,40] --set posterior=8 "
+        "--set nearest=true --set driver=potlp --set estimator=delivery --set drives=1",
+    ),
+    "d-own": Experiment(
+        page="delivery", command="potlp estimator evaluate delivery {all}/own-delivery --ablate all --out {out}"
+    ),
     "worst-delivery": Experiment(
         page="delivery",
         command="python -m eval.limit.worst {all}/delivery/generated --out {out} --trials 10 --buildings 8 "
@@ -157,6 +166,31 @@ EXPERIMENTS: dict[str, Experiment] = {
     "real-maps": Experiment(
         page="delivery",
         command="python -m eval.real_maps --out {out} --maps {data}/maps --worlds 50 --processes {processes}",
+    ),
+    # Each shipped recipe from nothing, and what its stages keep: how long one has to train.
+    "recipe-firefighting": Experiment(
+        page="estimator", command="potlp fit --recipe firefighting --out {out} --processes {processes}"
+    ),
+    "curve-firefighting": Experiment(
+        page="estimator",
+        command="python -m eval.training_curve {all}/recipe-firefighting --environment firefighting --worlds 60 "
+        "--out {out} --report docs/results/estimator/curve",
+    ),
+    "recipe-delivery": Experiment(
+        page="delivery", command="potlp fit --recipe delivery --out {out} --processes {processes}"
+    ),
+    "curve-delivery": Experiment(
+        page="delivery",
+        command="python -m eval.training_curve {all}/recipe-delivery --environment delivery --worlds 100 --out {out} "
+        "--report docs/results/delivery/curve",
+    ),
+    "recipe-parcels": Experiment(
+        page="delivery", command="potlp fit --recipe parcels --out {out} --processes {processes}"
+    ),
+    "curve-parcels": Experiment(
+        page="delivery",
+        command="python -m eval.training_curve {all}/recipe-parcels --environment campus-small-parcels --worlds 100 "
+        "--out {out} --report docs/results/delivery/curve_parcels",
     ),
     "floors": Experiment(page="floors", command="python -m eval.floor_statistics", variables=_OTHERS),
     "buildings": Experiment(

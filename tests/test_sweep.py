@@ -19,6 +19,7 @@ import pytest
 from typer.testing import CliRunner
 
 from eval.faults.kills import process_start, workers_of
+from eval.limit.arms import Arm
 from eval.limit.worst import experiment_of
 from eval.real_maps.__main__ import exchange
 from eval.savings import decisions_of
@@ -43,6 +44,7 @@ from potlp_jax.sweep.specification import (
 )
 from potlp_jax.sweep.store import Item, Row, Store
 from potlp_jax.task.task import Task
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.rules import trial_key
 from potlp_jax.types import Status
@@ -786,7 +788,12 @@ def test_the_worst_trials_of_a_sweep_are_run_again_as_it_ran_them(tmp_path):
     assert (found.generator.name, found.split, found.given, found.buildings) == ("toy", Split.TEST, None, 8)
     with pytest.raises(ValueError, match="has trials in campus-medium, campus-small: give a sweep of one environment"):
         experiment_of(swept(environments=["campus-small", "campus-medium"], tasks=[1]), 8)
-    own = {"replan_distance": 3.0}
-    for changes in ({"seed": 1}, {"settings": own}, {"policy_settings": {"potlp": own}}):
-        with pytest.raises(ValueError, match="has settings or a seed of its own"):
-            experiment_of(swept(**changes), 8)
+    with pytest.raises(ValueError, match="has the seed 1: give a sweep with seed 0"):
+        experiment_of(swept(seed=1), 8)
+    own, arm = {"replan_distance": 3.0}, Arm.BASELINE
+    for changes in ({"settings": own}, {"policy_settings": {"potlp": own}}):
+        other = experiment_of(swept(**changes), 8)
+        assert (other.config.replan_distance, found.config) == (3.0, TrialConfig())
+        # Trials with other settings are other trials: their rows are not taken for those of the family's.
+        assert other.key("F goal", 0, arm) != found.key("F goal", 0, arm)
+    assert other.run("1", 0, arm).config["replan_distance"] == 3.0

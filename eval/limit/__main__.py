@@ -21,7 +21,6 @@ from eval.limit.arms import REFERENCES, Arm, Experiment, key_of, missing_rows
 from eval.limit.report import markdown, page, results_of
 from eval.limit.rows import ROWS, append_row, read_rows
 from potlp_jax.cache import enable_compilation_cache
-from potlp_jax.environments.base import Generator
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
@@ -68,11 +67,8 @@ def main() -> None:
         given=None if options.estimator is None else named_estimator(options.estimator),
         buildings=options.buildings,
     )
-    # A family that does not say what its worlds can be has the method of the base class, which refuses.
-    says = type(generator).posterior is not Generator.posterior
-    known = [arm for arm in Arm if arm is not Arm.IDEAL_OBSERVER or says]
-    chosen = known if options.arms is None else options.arms
-    if not set(chosen) <= set(known):
+    chosen = experiment.arms if options.arms is None else options.arms
+    if not set(chosen) <= set(experiment.arms):
         parser.error(f"{generator.name}: an ideal observer needs a family that says what its worlds can be")
     if options.report is not None and Arm.POTLP not in chosen:
         parser.error("a report compares with potlp: name it among the arms, or use eval.limit.beside")

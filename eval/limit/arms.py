@@ -17,6 +17,7 @@ from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.rows import source_commit, trial_budget
+from potlp_jax.sweep.specification import configuration_hash
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 from potlp_jax.trials.loop import run_trial, versions
@@ -62,6 +63,7 @@ class Experiment:
         tasks: by the name that the family gives them.
         given: the trained estimator; None: the one that is shipped for the worlds.
         buildings: that the ideal observer draws at a decision.
+        settings: of the trials; None: those of the family.
     """
 
     generator: base.Generator
@@ -69,6 +71,19 @@ class Experiment:
     tasks: Sequence[str]
     given: TrainedEstimator | Estimator | None
     buildings: int
+    settings: TrialConfig | None = None
+
+    @functools.cached_property
+    def config(self) -> TrialConfig:
+        """The settings of all trials."""
+        return trial_config_for(self.generator) if self.settings is None else self.settings
+
+    @property
+    def arms(self) -> list[Arm]:
+        """Those that the family's worlds can have: an ideal observer needs one that says what they can be."""
+        # A family that does not has the method of the base class, which refuses.
+        says = type(self.generator).posterior is not base.Generator.posterior
+        return [arm for arm in Arm if arm is not Arm.IDEAL_OBSERVER or says]
 
     @functools.cached_property
     def padded(self) -> dict[str, tuple[Task, TaskArrays]]:
@@ -86,14 +101,14 @@ class Experiment:
         """The estimator that was given, or the one that is shipped."""
         if self.given is not None and not isinstance(self.given, TrainedEstimator):
             return self.given
-        here = Domain.of_world(self.world(0), trial_config_for(self.generator).camera)
+        here = Domain.of_world(self.world(0), self.config.camera)
         return estimator_for(self.generator.propositions, here, self.given)
 
     def identity(self, arm: Arm) -> str:
         """What an arm's answers come from, beside the true map; a row of another identity is another trial."""
-        if arm is Arm.IDEAL_OBSERVER:
-            return f"{self.buildings} buildings"
-        return identity_of(self.trained) if arm.asks_trained else ""
+        asked = f"{self.buildings} buildings" if arm is Arm.IDEAL_OBSERVER else ""
+        asked = identity_of(self.trained) if arm.asks_trained else asked
+        return asked if self.settings is None else f"{asked}, settings {configuration_hash(self.settings)}"
 
     def key(self, task: str, number: int, arm: Arm) -> tuple[Any, ...]:
         """What tells a row from others (``key_of``)."""
@@ -102,13 +117,13 @@ class Experiment:
     def row(self, task: str, number: int, arm: Arm) -> dict[str, Any]:
         """Run a trial, audit it, and say how it went."""
         began = time.perf_counter()
-        trial, config = self.run(task, number, arm), trial_config_for(self.generator)
+        trial = self.run(task, number, arm)
         seconds = time.perf_counter() - began
         names = ("environment", "split", "task", "world", "arm", "identity")
         return dict(zip(names, self.key(task, number, arm), strict=True)) | {
             "outcome": trial.outcome.value,
             "cost": trial.cost,
-            "budget": trial_budget(self.world(number), config.budget_factor),
+            "budget": trial_budget(self.world(number), self.config.budget_factor),
             "status": trial.status,
             "decisions": len(trial.decisions),
             "fallbacks": sum(decision.fallback for decision in trial.decisions),
@@ -120,26 +135,27 @@ class Experiment:
 
     def run(self, name: str, number: int, arm: Arm) -> Trial:
         """One trial of an arm."""
-        (task, arrays), world, config = self.padded[name], self.world(number), trial_config_for(self.generator)
+        (task, arrays), world = self.padded[name], self.world(number)
         return run_trial(
             world,
             task,
             arm.policy,
             trial_key(number),
-            config,
+            self.config,
             environment=f"{self.generator.name}/{self.split.value}",
             world_number=number,
             arrays=arrays,
-            estimator=self._asked(arm, world, number, config),
+            estimator=self._asked(arm, world, number),
         )
 
-    def _asked(self, arm: Arm, world: World, number: int, config: TrialConfig) -> TrainedEstimator | Estimator | None:
+    def _asked(self, arm: Arm, world: World, number: int) -> TrainedEstimator | Estimator | None:
         """What the arm asks in a trial."""
         if arm is Arm.IDEAL_OBSERVER:
             return self._observer(number)
         if not arm.asks_trained:
             return None
-        own = first_estimator(Policy.POTLP, self.trained, world.shape, float(world.resolution), config.panoramas, None)
+        shape, resolution = world.shape, float(world.resolution)
+        own = first_estimator(Policy.POTLP, self.trained, shape, resolution, self.config.panoramas, None)
         assert own is not None
         truth = TrueMapEstimator(world=world)
         return {Arm.TRUE_CHANCES: mixed(truth, own), Arm.TRUE_COSTS: mixed(own, truth)}.get(arm, self.trained)
