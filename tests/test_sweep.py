@@ -505,6 +505,12 @@ def read_only(request, finished, tmp_path):
     subprocess.run(["umount", "--lazy", mounted], check=True)
 
 
+def test_reading_makes_no_store_where_there_is_none(tmp_path):
+    with pytest.raises(StoreError, match="no such file; name the folder of a sweep that was begun"):
+        Store(tmp_path / RESULTS, read_only=True)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_finished_sweep_is_shown_from_a_medium_that_cannot_be_written(read_only, tmp_path):
     assert _rows(read_only, read_only=True) == _rows(read_only, read_only=True)
     told = _potlp("sweep", "show", read_only, "--json")

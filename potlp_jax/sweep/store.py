@@ -110,7 +110,7 @@ class Store:
         read_only: reads a store that is there, also from a medium that cannot be written, or that is full.
 
     Raises:
-        StoreError: the file is no store of this format, is damaged, or cannot be opened.
+        StoreError: the file is no store of this format, is damaged, or cannot be opened; or there is none to read.
     """
 
     def __init__(self, file: Path, read_only: bool = False) -> None:
@@ -131,13 +131,15 @@ class Store:
         self._check_format()
 
     def _open_to_read(self) -> sqlite3.Connection:
+        if not self.file.exists():
+            raise StoreError(f"{self.file}: there is no such file; name the folder of a sweep that was begun")
         log = self.file.with_name(f"{self.file.name}-wal")
         try:
             return self._connect_to_read(self.file, "mode=ro")
         except StoreError:
             # SQLite wants to make files beside it, to share it with others, and cannot. Nobody else can, either.
             if not _has_content(log):
-                return self._connect_to_read(self.file, "immutable=1")
+                return self._connect_to_read(self.file, "mode=ro&immutable=1")
         # The log is of a process that was killed. It cannot be worked in where it lies, so a copy is.
         with self._reporting(), tempfile.TemporaryDirectory() as folder:
             for path in (self.file, log):
