@@ -6,7 +6,8 @@
 Trials of the fire-fighting building (validation worlds, all of its tasks) run decision by decision. Every phase is a
 program of its own, which is given what the phases before it made; it runs until it has used ``--seconds`` of processor
 time, over the situations of all decisions in turn. Whole trials run in a batch, as a sweep runs them, compiled before:
-what they cost beyond the sum of their phases is copying between phases and the host. Operations and bytes are XLA's
+what they cost beyond the sum of their phases is copying between phases and the host. ``--estimators`` adds whole trials
+of PO-TLP that ask other estimators. Operations and bytes are XLA's
 own count of each program, without what runs in native kernels; loops are counted as if they ran once.
 
 Times are milliseconds of processor time, so that other work on the machine counts little; pin the process to a core.
@@ -28,6 +29,7 @@ from eval.bench.trials import ENVIRONMENT, FIRST_WORLD, starts
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.learning.building_estimator import outlook_of_classes
 from potlp_jax.learning.domain import Domain
+from potlp_jax.learning.estimator import named_estimator
 from potlp_jax.learning.imagined_paths import scenery
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.observing import with_memory
@@ -239,11 +241,12 @@ def _milliseconds(program: Any, inputs: Sequence[Made], seconds: float) -> float
     return 1e3 * used / count
 
 
-def whole_trials(trials: Sequence[Start], policy: Policy, slots: int) -> dict[str, float]:
+def whole_trials(trials: Sequence[Start], policy: Policy, slots: int, estimator: str | None = None) -> dict[str, float]:
     """Milliseconds of processor time a trial and a decision, in a batch as in a sweep; compiled before."""
-    list(run_batch(trials[:1], policy, slots=slots))
+    given = None if estimator is None else named_estimator(estimator)
+    list(run_batch(trials[:1], policy, slots=slots, estimator=given))
     began = time.process_time()
-    finished = list(run_batch(trials, policy, slots=slots))
+    finished = list(run_batch(trials, policy, slots=slots, estimator=given))
     used = 1e3 * (time.process_time() - began)
     decisions = sum(trial.decisions for trial in finished)
     return {"trial_ms": used / len(finished), "decision_ms": used / decisions, "decisions": decisions / len(finished)}
@@ -264,11 +267,13 @@ def table_of(found: dict[str, Any]) -> str:
     lines = ["| policy | phase | ms a decision | share | Mflop | MB |", "|---|---|---|---|---|---|"]
     for policy, result in found.items():
         whole = sum(row["ms"] for row in result["phases"] if not row["part_of"])
+        # Of another estimator whole trials alone were run.
         for row in result["phases"]:
             name = f"{row['phase']} (of {row['part_of']})" if row["part_of"] else row["phase"]
             counts = f"{row['operations'] / 1e6:.2f} | {row['bytes'] / 1e6:.2f}"
             lines.append(f"| {policy} | {name} | {row['ms']:.3f} | {row['ms'] / whole:.0%} | {counts} |")
-        lines.append(f"| {policy} | all phases | {whole:.3f} | | | |")
+        if result["phases"]:
+            lines.append(f"| {policy} | all phases | {whole:.3f} | | | |")
         trials = result["trials"]
         lines.append(f"| {policy} | in a batch | {trials['decision_ms']:.3f} | | | |")
         lines.append(f"| {policy} | a trial of {trials['decisions']:.1f} decisions | {trials['trial_ms']:.1f} | | | |")
@@ -279,6 +284,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--worlds", type=int, default=2)
     parser.add_argument("--policies", nargs="+", type=Policy, default=list(Policy))
+    parser.add_argument("--estimators", nargs="+", default=[], help="that PO-TLP asks in further trials")
     parser.add_argument("--seconds", type=float, default=2.0, help="processor time for each phase")
     parser.add_argument("--slots", type=int, default=SLOTS)
     parser.add_argument("--out", type=Path, help="JSON file")
@@ -292,6 +298,10 @@ def main() -> None:
         phases = measure(setup, asked, trials, arguments.seconds)
         found[policy.value] = {"phases": phases, "trials": whole_trials(trials, policy, arguments.slots)}
         print(table_of({policy.value: found[policy.value]}), flush=True)
+    for name in arguments.estimators:
+        asking = f"{Policy.POTLP.value}, {name}"
+        found[asking] = {"phases": [], "trials": whole_trials(trials, Policy.POTLP, arguments.slots, name)}
+        print(table_of({asking: found[asking]}), flush=True)
     if arguments.out is not None:
         made_by = provenance() | {"device": str(jax.devices()[0])}
         result = {"provenance": made_by, "environment": ENVIRONMENT, "first_world": FIRST_WORLD}
