@@ -143,10 +143,13 @@ def _told(share: Mapping[str, Any]) -> str:
 
 def draw(stages: Sequence[Mapping[str, Any]], file: Path) -> None:
     """Shares after each stage, and the skill after each epoch, over minutes from nothing."""
-    figure = new_figure(7.0, 3.4)
+    figure = new_figure(8.0, 3.6)
     left, right = figure.subplots(1, 2)
-    minutes = [stage["minutes"] for stage in stages]
-    for task in stages[0]["tasks"]:
+    figure.subplots_adjust(left=0.08, right=0.98, bottom=0.14, top=0.97, wspace=0.25)
+    last = stages[-1]["minutes"]
+    for place, task in enumerate(stages[0]["tasks"]):
+        # Side by side: intervals of tasks would hide each other.
+        minutes = [stage["minutes"] + 0.01 * last * place for stage in stages]
         shares = [stage["tasks"][task] for stage in stages]
         values = [100 * share["attainable_share"] for share in shares]
         below = [value - 100 * share["attainable_low"] for value, share in zip(values, shares, strict=True)]
@@ -155,11 +158,13 @@ def draw(stages: Sequence[Mapping[str, Any]], file: Path) -> None:
     for number, stage in enumerate(stages):
         right.plot(*zip(*stage["skills"], strict=True), marker="o", label=f"stage {number}")
     left.set_ylabel("share of the attainable savings, %")
-    right.set_ylabel("skill on the stage's validation data")
+    right.set_ylabel("skill, the stage's validation data")
+    left.set_ylim(0, 100)
+    right.set_ylim(0, 1)
     for axes in (left, right):
         axes.set_xlabel("minutes from nothing")
-        axes.set_xlim(left=0)
-        axes.legend()
+        axes.set_xlim(0, 1.1 * last)
+        axes.legend(loc="lower left")
     save_figure(figure, file)
 
 

@@ -223,6 +223,20 @@ def _panorama(origin, cell):
     return image
 
 
+def test_a_file_that_was_written_again_is_read_again(generator, tmp_path):
+    path = tmp_path / "mine.npz"
+    found = []
+    for made_by in ("the first fit", "the next fit"):
+        config = NetworkConfig(propositions=generator.propositions, exclusive_within=WITHIN, fovea=4, **TINY)
+        params = EstimatorNetwork(config).init(jax.random.key(3))
+        save_estimator(path, params, config, domain_of("toy"), {"says": made_by})
+        found.append(read_estimator(path))
+        # A file that stays as it is is read once.
+        assert read_estimator(path) is found[-1]
+    assert [estimator.metadata["says"] for estimator in found] == ["the first fit", "the next fit"]
+    assert found[0].identity != found[1].identity
+
+
 def test_each_subgoal_is_shown_in_the_centre_of_the_panorama_that_its_estimates_come_from(trial):
     first, last = trial.decisions[0], trial.decisions[-1]
     seen_from = {0: first.cell, last.index: last.cell}

@@ -136,8 +136,11 @@ def test_a_small_recipe_makes_an_estimator_and_continues(tmp_path):
     assert metadata["training"]["seed"] == 3
     assert domain == Domain.of_world(make("toy").world(0), recipe.collect.camera)
     assert read_metadata(tmp_path / "out" / "validation").split == "validation"
+    before = (tmp_path / "out" / ESTIMATOR).read_bytes()
     again = follow(recipe, tmp_path / "out", display=Display(say=lines.append))
     assert lines[-1].startswith("resumed at step")
+    # To the bit: what a round recorded with the file would else count as recorded with another one.
+    assert (tmp_path / "out" / ESTIMATOR).read_bytes() == before
     assert again.best_step == trained.best_step
 
 

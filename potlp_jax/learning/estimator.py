@@ -55,9 +55,15 @@ class TrainedEstimator:
         return architecture_of(self.config).start(self.params, self.config, height, width, panoramas, resolution)
 
 
-@functools.lru_cache(maxsize=8)
 def read_estimator(path: Path) -> TrainedEstimator:
     """Read an estimator. Raises EstimatorError where the file is none."""
+    # Which file it is now: a fit may have written another one under the name since it was read.
+    state = path.stat() if path.exists() else None
+    return _read(path, None if state is None else (state.st_mtime_ns, state.st_size, state.st_ino))
+
+
+@functools.lru_cache(maxsize=8)
+def _read(path: Path, state: tuple[int, int, int] | None) -> TrainedEstimator:
     # A digest and not the name: two files of one name are two estimators in records.
     params, config, domain, metadata = load_estimator(path)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]

@@ -246,7 +246,7 @@ class _Loop:
         self._schedule = learning_rate_schedule(config)
         self._state, before = self._begun(None if initial is None else initial.params)
         # Time counts over all starts, so that a budget is kept.
-        self._started = time.perf_counter() - before
+        self._started, self._spent = time.perf_counter() - before, before
         self.steps_done = int(self._state.step)
         self.out_of_time = self._is_out_of_time()
         """Whether the budget was spent when the last step ended."""
@@ -319,8 +319,10 @@ class _Loop:
 
     def save(self) -> None:
         """Write a checkpoint, if there is a folder for it."""
+        # In the precision in which who resumes learns it.
+        self._spent = float(np.float32(self.seconds))
         if self._folder is not None:
-            save_checkpoint(self._folder, self.steps_done, self._state, self._identity, {"seconds": self.seconds})
+            save_checkpoint(self._folder, self.steps_done, self._state, self._identity, {"seconds": self._spent})
 
     @property
     def reason(self) -> str | None:
@@ -334,11 +336,13 @@ class _Loop:
 
     def result(self) -> Trained:
         """The best parameters so far."""
+        # The time of the last checkpoint: a training that was over gives the same result when it is asked for again,
+        # and whoever drove with the estimator finds the same file.
         return Trained(
             params=self._state.best,
             best_step=int(self._state.best_step),
             best_loss=float(self._state.best_loss),
             steps=self.steps_done,
             reason=self.reason or "planned",
-            seconds=self.seconds,
+            seconds=self._spent,
         )

@@ -113,11 +113,16 @@ def _read_rows(path: Path) -> list[Row]:
         return []
     text = read_text(path, TrainingError, MOST_RECORD)
     with reading(path, TrainingError, "the table of a training"):
-        rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(io.StringIO(text))]
+        rows = [{name: _number(value) for name, value in row.items()} for row in csv.DictReader(io.StringIO(text))]
         # Which rows are kept goes by it (`Journal.start`).
         if not all("step" in row for row in rows):
             raise ValueError("it has no column step")
     return rows
+
+
+def _number(text: str) -> int | float:
+    # As it was written: the figures of a training that is over stay the same when it is started again.
+    return int(text) if text.isdigit() else float(text)
 
 
 def describe(progress: Progress) -> str:
