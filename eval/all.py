@@ -167,6 +167,11 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="delivery",
         command="python -m eval.real_maps --out {out} --maps {data}/maps --worlds 50 --processes {processes}",
     ),
+    "worst-floor2": Experiment(
+        page="delivery",
+        command="python -m eval.limit.worst {all}/real-maps/gdc_floor2 --out {out} --trials 10 "
+        "--report docs/results/real_maps/floor2_worst",
+    ),
     # Each shipped recipe from nothing, and what its stages keep: how long one has to train.
     "recipe-firefighting": Experiment(
         page="estimator", command="potlp fit --recipe firefighting --out {out} --processes {processes}"
@@ -174,7 +179,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "curve-firefighting": Experiment(
         page="estimator",
         command="python -m eval.training_curve {all}/recipe-firefighting --environment firefighting --worlds 60 "
-        "--out {out} --report docs/results/estimator/curve",
+        "--out {out} --report {out}/curve",
     ),
     "recipe-delivery": Experiment(
         page="delivery", command="potlp fit --recipe delivery --out {out} --processes {processes}"
