@@ -1,0 +1,55 @@
+"""Faults of what is found again when a command is given once more: estimators, tables of trainings, stores."""
+
+from eval.mutants.mutant import Mutant
+
+PART = "resumption"
+
+_RECIPES, _ESTIMATORS, _SWEEPS = (f"tests/test_{name}.py" for name in ("recipes", "estimator", "sweep"))
+
+MUTANTS = (
+    Mutant(
+        PART,
+        "a training that was over says another time than before",
+        "potlp_jax/learning/training.py",
+        "seconds=self._spent",
+        "seconds=self.seconds",
+        (_RECIPES,),
+        "small_recipe",
+    ),
+    Mutant(
+        PART,
+        "the time of a checkpoint is finer than what is read of it",
+        "potlp_jax/learning/training.py",
+        "self._spent = float(np.float32(self.seconds))",
+        "self._spent = self.seconds",
+        (_RECIPES,),
+        "small_recipe",
+    ),
+    Mutant(
+        PART,
+        "whole numbers of a training's table come back as others",
+        "potlp_jax/recipes/journal.py",
+        "return int(text) if text.isdigit() else float(text)",
+        "return float(text)",
+        (_RECIPES,),
+        "small_recipe",
+    ),
+    Mutant(
+        PART,
+        "an estimator's file that was written anew is not read anew",
+        "potlp_jax/learning/estimator.py",
+        "None if state is None else (state.st_mtime_ns, state.st_size, state.st_ino)",
+        "None",
+        (_ESTIMATORS,),
+        "written_again",
+    ),
+    Mutant(
+        PART,
+        "reading makes a store where there is none",
+        "potlp_jax/sweep/store.py",
+        "if not self.file.exists():",
+        "if False:",
+        (_SWEEPS,),
+        "reading_makes_no_store",
+    ),
+)
