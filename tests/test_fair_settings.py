@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from eval.fair_settings.choosing import chosen_settings, compare, interval, results
+from eval.fair_settings.confirming import confirm
 from eval.fair_settings.report import write_report
-from eval.fair_settings.running import ROWS, read_rows, run
+from eval.fair_settings.running import CONFIRMING, ROWS, read_rows, run
 from eval.fair_settings.settings import changes_of, grid, setting_of
 from potlp_jax.codec import with_settings
 from potlp_jax.environments.registry import make
@@ -46,13 +47,31 @@ def test_a_better_setting_is_chosen_and_one_that_may_be_luck_is_not():
     usual = [_row(default, world, 20.0 + world) for world in range(40)]
     better = [_row(other, world, 18.0 + world) for world in range(40)]
     found = compare([*usual, *better], possible)
-    assert found["best"] == found["chosen"] == list(other)
+    assert found["best"] == list(other)
     assert found["settings"][0]["difference"] == pytest.approx(-2.0)
     assert found["trials"] == found["worlds"] == 40
     lucky = [_row(other, world, (0.0 if world == 7 else 20.0) + world) for world in range(40)]
     found = compare([*usual, *lucky], possible)
     assert found["best"] == list(other)
     assert found["chosen"] == list(default)
+
+
+def test_the_best_is_chosen_where_other_worlds_confirm_it():
+    default, other = (2, 4.0, 0.15), (1, 4.0, 0.15)
+    others = range(CONFIRMING, CONFIRMING + 40)
+    possible = {("1", world) for world in (*range(40), *others)}
+    rows = [_row(default, world, 20.0) for world in (*range(40), *others)]
+    rows += [_row(other, world, 18.0) for world in range(40)]
+    # As long as it has not run there nobody knows.
+    found = compare(rows, possible)
+    assert (found["best"], found["confirmed"], found["chosen"]) == (list(other), None, list(default))
+    for cost, chosen in ((19.0, other), (21.0, default)):
+        found = compare([*rows, *(_row(other, world, cost) for world in others)], possible)
+        assert found["chosen"] == list(chosen)
+        assert found["confirmed"]["difference"] == pytest.approx(cost - 20.0)
+        # What chose it is what it was.
+        assert found["settings"][0]["difference"] == pytest.approx(-2.0)
+        assert found["trials"] == found["worlds"] == 40
 
 
 def test_only_pairs_count_and_a_trial_without_success_costs_its_budget():
@@ -101,6 +120,19 @@ def test_a_family_is_run_goes_on_where_it_was_killed_and_is_reported(tmp_path):
     again = read_rows(tmp_path)
     assert len(again) == 9
     assert sorted(map(json.dumps, again)) == sorted(map(json.dumps, rows))
+    # The default is the best: there is nothing to confirm.
+    confirm(toy, ["baseline"], 2, tmp_path, tasks=["2"])
+    assert len(read_rows(tmp_path)) == 9
+    # Were the other one cheaper, both would run where nothing was chosen.
+    other = tmp_path / "other"
+    other.mkdir()
+    cheaper = [row | {"cost": row["cost"] - (row["setting"][1] == 2.0)} for row in rows]
+    (other / ROWS).write_text("".join(json.dumps(row) + "\n" for row in cheaper))
+    confirm(toy, ["baseline"], 2, other, tasks=["2"])
+    added = [row for row in read_rows(other) if row["policy"] == "baseline"][6:]
+    assert {(row["setting"][1], row["world"]) for row in added} == {
+        (distance, CONFIRMING + number) for distance in (2.0, 4.0) for number in range(2)
+    }
     write_report(tmp_path, tmp_path / "fair")
     found = results(tmp_path)["families"]["toy"]
     assert found["policies"]["baseline"]["worlds"] == 3

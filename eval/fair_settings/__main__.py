@@ -11,8 +11,8 @@ Every policy runs in the same worlds with every combination of
 - the commitment of policies that search: by what fraction another action must be cheaper (``commitment``).
 
 A trial that is not satisfied is charged its budget, as in sweeps. The best setting has the least mean cost in the
-worlds of the default. It is chosen if the 95 % interval of its difference to the default, paired by world, lies below
-0; otherwise the default is.
+worlds of the default. It runs beside the default in as many other worlds once more, and is chosen if the 95 % interval
+of its difference to the default, paired by world, lies below 0 in both; otherwise the default is.
 Rows are appended to ``rows.jsonl`` as trials end, and the same command goes on. ``--report`` writes NAME.json and the
 page NAME.md; the former holds ``policy_settings`` of each family as a sweep's file takes them.
 """
@@ -20,6 +20,7 @@ page NAME.md; the former holds ``policy_settings`` of each family as a sweep's f
 import argparse
 from pathlib import Path
 
+from eval.fair_settings.confirming import confirm
 from eval.fair_settings.report import write_report
 from eval.fair_settings.running import run
 from eval.fair_settings.settings import COMMITMENTS, DISTANCES, SIZES
@@ -50,7 +51,9 @@ def main() -> None:
         sizes = [int(size) for size in arguments.min_sizes]
         values = (sizes, arguments.replan_distances, arguments.commitments)
         policies = arguments.policies.split(",")
-        run(make(arguments.environment), policies, arguments.worlds, arguments.out, values, arguments.estimator)
+        family, worlds, asked = make(arguments.environment), arguments.worlds, arguments.estimator
+        run(family, policies, worlds, arguments.out, values, asked)
+        confirm(family, policies, worlds, arguments.out, asked)
     if arguments.report is not None:
         write_report(arguments.out, arguments.report)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from eval.fair_settings.running import Row, read_rows
+from eval.fair_settings.running import CONFIRMING, Row, read_rows
 from eval.fair_settings.settings import Setting, changes_of
 from potlp_jax.environments.splits import Split
 from potlp_jax.planning.policies import Policy
@@ -32,26 +32,38 @@ def compare(rows: Sequence[Row], possible: set[tuple[str, int]]) -> dict[str, An
 
     Returns:
         JSON-able: ``settings``, by difference to the default; the ``default``; the ``best`` of those that have finished
-        what the default has; the one that is ``chosen``; the default's ``trials`` and ``worlds``.
+        what the default has; ``confirmed``: its figures in the worlds that did not choose it, None where it has not run
+        there; the one that is ``chosen``; the default's ``trials`` and ``worlds``.
     """
-    found: dict[Setting, dict[tuple[str, int], Row]] = {}
-    for row in rows:
-        if (row["task"], row["world"]) in possible:
-            found.setdefault(_setting(row), {})[row["task"], row["world"]] = row
+    found = _by_setting([row for row in rows if row["world"] < CONFIRMING], possible)
+    others = _by_setting([row for row in rows if row["world"] >= CONFIRMING], possible)
     default = next(_setting(row) for row in rows if row["is_default"])
     compared = [_against(setting, own, found[default]) for setting, own in found.items()]
     # Equal costs: the default, which nobody has to explain.
     compared.sort(key=lambda entry: (entry["difference"], entry["setting"] != list(default)))
     trials = len(found[default])
     best = next(entry for entry in compared if entry["trials"] == trials)
+    first = _as_setting(best["setting"])
+    again = others.get(first, {}).keys() & others.get(default, {}).keys()
+    confirmed = _against(first, others[first], others[default]) if again else None
+    better = best["high"] < 0 and confirmed is not None and confirmed["high"] < 0
     return {
         "default": list(default),
         "best": best["setting"],
-        "chosen": best["setting"] if best["high"] < 0 else list(default),
+        "confirmed": confirmed,
+        "chosen": best["setting"] if better else list(default),
         "trials": trials,
         "worlds": len({world for _, world in found[default]}),
         "settings": compared,
     }
+
+
+def _by_setting(rows: Sequence[Row], possible: set[tuple[str, int]]) -> dict[Setting, dict[tuple[str, int], Row]]:
+    found: dict[Setting, dict[tuple[str, int], Row]] = {}
+    for row in rows:
+        if (row["task"], row["world"]) in possible:
+            found.setdefault(_setting(row), {})[row["task"], row["world"]] = row
+    return found
 
 
 def _against(
@@ -75,7 +87,11 @@ def _against(
 
 
 def _setting(row: Row) -> Setting:
-    size, distance, commitment = row["setting"]
+    return _as_setting(row["setting"])
+
+
+def _as_setting(values: Sequence[Any]) -> Setting:
+    size, distance, commitment = values
     return size, distance, commitment
 
 
@@ -124,8 +140,7 @@ def results(folder: Path) -> dict[str, Any]:
 
 
 def _chosen_changes(compared: Mapping[str, Any]) -> dict[str, Any]:
-    size, distance, commitment = compared["chosen"]
-    return changes_of((size, distance, commitment))
+    return changes_of(_as_setting(compared["chosen"]))
 
 
 def chosen_settings(file: Path, family: str) -> dict[str, Any]:

@@ -26,6 +26,9 @@ ROWS: str = "rows.jsonl"
 PORTION: int = 20
 """Worlds that all settings visit before the next ones, so that what is finished early is paired."""
 
+CONFIRMING: int = 500
+"""From this number on worlds do not choose: the best setting is held against the default there once more."""
+
 Row = Mapping[str, Any]
 
 
