@@ -56,8 +56,8 @@ OPPONENTS: dict[str, Callable[[float], dict[str, Any]]] = {
     "with frontiers of two cells": lambda _: {"decision": {"frontiers": {"min_size": 2}}},
 }
 """Settings of further baselines, from the ``replan_distance`` of the map. The first is best for it in the
-validation worlds of buildings with doors as narrow (docs/results/fair_settings.md); the second is best for it on GDC 3NE, where
-slivers between clutter draw it away, and was chosen with these maps known."""
+validation worlds of buildings with doors as narrow (docs/results/fair_settings.md); the second is best for it on GDC
+3NE, where slivers between clutter draw it away, and was chosen with these maps known."""
 
 CAMERA = {"noise": 6.0, "exposure": 0.15, "colour": 0.05}
 """Disturbances of every picture (``world.camera.Disturbance``)."""

@@ -4,7 +4,9 @@ from eval.mutants.mutant import Mutant
 
 PART = "resumption"
 
-_RECIPES, _ESTIMATORS, _SWEEPS = (f"tests/test_{name}.py" for name in ("recipes", "estimator", "sweep"))
+_RECIPES = "tests/test_recipes.py"
+_ESTIMATORS = "tests/test_estimator.py"
+_SWEEPS = "tests/test_sweep.py"
 
 MUTANTS = (
     Mutant(
