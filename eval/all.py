@@ -262,6 +262,12 @@ EXPERIMENTS: dict[str, Experiment] = {
         one_core=True,
         variables={"POTLP_NATIVE": "0"},
     ),
+    "decision-estimators": Experiment(
+        page="speed",
+        command="python -m eval.bench.decision --worlds 2 --policies potlp --estimators firefighting-panorama "
+        "firefighting --out docs/results/speed/estimators.json",
+        one_core=True,
+    ),
     "distances": Experiment(
         page="planner",
         command="python -m eval.bench.distances --repeats 3 --out docs/results/planner/distances.json "
