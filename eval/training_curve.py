@@ -7,7 +7,8 @@
 Each stage of the recipe left an estimator. PO-TLP runs with each in the same test worlds, which choose nothing; the
 page says what share of the attainable savings it keeps, after how many minutes of collecting and fitting from nothing.
 In between the picture has the skill after each epoch, on the validation data of the stage: those differ between stages,
-so that only points of one stage can be compared. Rows are kept: the same command goes on where it was stopped.
+so that only points of one stage can be compared. Of a recipe that was killed the runs that ended no step are not
+counted: its ``times.csv`` does not hold them. Rows are kept: the same command goes on where it was stopped.
 """
 
 import argparse
@@ -19,10 +20,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from eval.limit.__main__ import own_rows, run
 from eval.limit.arms import REFERENCES, Arm, Experiment
 from eval.limit.report import results_of
 from eval.limit.rows import ROWS
+from eval.limit.running import own_rows, run
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split

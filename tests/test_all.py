@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from eval import all as everything
-from eval.all import EXPERIMENTS, Experiment, Run, left_out, perform
+from eval.all import Run, left_out, perform
+from eval.experiments import EXPERIMENTS, Experiment
 from potlp_jax.errors import ConfigurationError
 from tests.reference.mentions import parse_module, parse_potlp
 
@@ -83,7 +84,8 @@ DRIVER = """
 import sys
 from pathlib import Path
 from eval import all as everything
-from eval.all import Experiment, Run, perform
+from eval.all import Run, perform
+from eval.experiments import Experiment
 waits = "import os, pathlib, sys, time; pathlib.Path(sys.argv[1]).write_text(str(os.getpid())); time.sleep(600)"
 everything.EXPERIMENTS = {
     "first": Experiment(page="index", command='python -c "pass"'),

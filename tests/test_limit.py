@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from flax import struct
 
-from eval.limit.__main__ import run
 from eval.limit.arms import Arm, key_of, missing_rows
 from eval.limit.mixed import mixed
 from eval.limit.report import markdown, page, results_of
 from eval.limit.rows import read_rows
+from eval.limit.running import run
 from eval.limit.worst import Loss, cause_of, worst_of
 from eval.provenance import lines_of
 from potlp_jax.environments.firefighting import Firefighting

@@ -7,8 +7,8 @@ Trials of the fire-fighting building (validation worlds, all of its tasks) run d
 program of its own, which is given what the phases before it made; it runs until it has used ``--seconds`` of processor
 time, over the situations of all decisions in turn. Whole trials run in a batch, as a sweep runs them, compiled before:
 what they cost beyond the sum of their phases is copying between phases and the host. ``--estimators`` adds whole trials
-of PO-TLP that ask other estimators. Operations and bytes are XLA's
-own count of each program, without what runs in native kernels; loops are counted as if they ran once.
+of PO-TLP that ask other estimators. Operations and bytes are XLA's own count of each program, without what runs in
+native kernels; loops are counted as if they ran once.
 
 Times are milliseconds of processor time, so that other work on the machine counts little; pin the process to a core.
 """

@@ -13,36 +13,17 @@ on where it was stopped, also with another estimator or more worlds. ``--report`
 
 import argparse
 import json
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from eval.limit.arms import REFERENCES, Arm, Experiment, key_of, missing_rows
+from eval.limit.arms import REFERENCES, Arm, Experiment
 from eval.limit.report import markdown, page, results_of
-from eval.limit.rows import ROWS, append_row, read_rows
+from eval.limit.rows import ROWS
+from eval.limit.running import own_rows, run
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
 from potlp_jax.learning.estimator import named_estimator
-
-
-def run(file: Path, experiment: Experiment, arms: Sequence[Arm], worlds: int) -> None:
-    """Append what is missing."""
-    for row in missing_rows(experiment, arms, worlds, read_rows(file)):
-        append_row(file, row)
-        print(f"task {row['task']} world {row['world']} {row['arm']}: {row['outcome']}, {row['cost']:.1f}", flush=True)
-
-
-def own_rows(file: Path, experiment: Experiment, arms: Sequence[Arm]) -> list[dict[str, Any]]:
-    """The rows of these arms with this estimator."""
-    return [
-        row
-        for row in read_rows(file)
-        if Arm(row["arm"]) in arms
-        and row["task"] in experiment.tasks
-        and key_of(row) == experiment.key(row["task"], row["world"], Arm(row["arm"]))
-    ]
 
 
 def main() -> None:

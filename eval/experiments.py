@@ -1,0 +1,278 @@
+"""The experiments behind docs/results, which ``eval.all`` runs: a command each, and the page that shows its results."""
+
+import dataclasses
+from collections.abc import Mapping
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """One command.
+
+    Attributes:
+        page: of docs/results, that shows what the command gives.
+        command: as its page has it; ``{out}`` is a folder of its own, ``{all}`` that of all experiments, ``{data}`` the
+            folder of others' data, ``{processes}`` how many there may be.
+        hours: on two cores that do nothing else; None where it was never run alone and whole.
+        one_core: whether it measures times, so that it is kept on one core.
+        variables: of the environment.
+    """
+
+    page: str
+    command: str
+    hours: float | None = None
+    one_core: bool = False
+    variables: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def needs_data(self) -> bool:
+        """Whether it reads maps or plans of others."""
+        return "{data}" in self.command or "{data}" in self.variables.values()
+
+
+_OTHERS = {"POTLP_EXTERNAL_DATA": "{data}"}
+
+_COLLECTED = (
+    "potlp collect firefighting --split validation --out {out} --set staying_sets=3 --set worlds_per_shard=20 "
+    "--set glances=false"
+)
+_DRIVEN = "--set driver=potlp --set estimator=firefighting --set drives=1 --set first_world=5000"
+_SHIPPED = "potlp_jax/learning/data/"
+
+EXPERIMENTS: dict[str, Experiment] = {
+    # First what tells the most and is quoted first.
+    "table1": Experiment(
+        page="table1",
+        command="python -m eval.table1 --out {out} --processes {processes} --report docs/results/table1/test",
+        hours=0.5,
+    ),
+    # Its trials are compared with the rows of Table I, world by world.
+    "observer": Experiment(
+        page="table1", command="python -m eval.limit --out {out} --worlds 750 --arms ideal-observer"
+    ),
+    "beside": Experiment(
+        page="table1",
+        command="python -m eval.limit.beside docs/results/table1/rows.csv.gz {all}/observer "
+        "--report docs/results/table1/observer",
+    ),
+    "limit": Experiment(
+        page="limit", command="python -m eval.limit --out {out} --worlds 60 --report docs/results/limit"
+    ),
+    "limit-delivery": Experiment(
+        page="limit_delivery",
+        command="python -m eval.limit --out {out} --environment delivery --worlds 16 --buildings 8 "
+        "--report docs/results/limit_delivery",
+    ),
+    "worst": Experiment(
+        page="worst",
+        command="python -m eval.limit.worst {all}/table1 --out {out} --trials 40 --report docs/results/worst",
+    ),
+    # The estimator on what it meets itself and on what the explorer meets, in buildings that chose nothing.
+    "own": Experiment(
+        page="estimator",
+        command=f"{_COLLECTED} {_DRIVEN} --worlds 40 --set views_per_world=10 --set spacing=[10,120]",
+    ),
+    "explored": Experiment(
+        page="estimator",
+        command=f"{_COLLECTED} --worlds 60 --set first_world=3100 --set views_per_world=5 --set spacing=[10,120] "
+        "--set pursued=2",
+    ),
+    "means": Experiment(
+        page="estimator",
+        command=f"{_COLLECTED} {_DRIVEN} --worlds 40 --set views_per_world=20 --set spacing=[4,40] --set posterior=16",
+    ),
+    "f-own": Experiment(
+        page="estimator",
+        command=f"potlp estimator evaluate {_SHIPPED}firefighting.npz {{all}}/own --ablate all --out {{out}}",
+    ),
+    "f-explored": Experiment(
+        page="estimator",
+        command=f"potlp estimator evaluate {_SHIPPED}firefighting.npz {{all}}/explored --out {{out}}",
+    ),
+    "p-own": Experiment(
+        page="estimator",
+        command=f"potlp estimator evaluate {_SHIPPED}firefighting-panorama.npz {{all}}/own --out {{out}}",
+    ),
+    "p-explored": Experiment(
+        page="estimator",
+        command=f"potlp estimator evaluate {_SHIPPED}firefighting-panorama.npz {{all}}/explored --out {{out}}",
+    ),
+    "excess": Experiment(
+        page="estimator",
+        command="python -m eval.limit.excess firefighting --data {all}/means --report docs/results/estimator/excess",
+    ),
+    "ablations": Experiment(
+        page="ablations",
+        command="python -m eval.ablations --out {out} --views own={all}/own explored={all}/explored "
+        "--processes {processes} --report docs/results/ablations",
+    ),
+    "held-out": Experiment(page="panorama", command="potlp sweep firefighting-held-out --out {out}"),
+    "panorama": Experiment(
+        page="panorama",
+        command="python -m eval.table1 --estimator firefighting-panorama --out {out} --processes {processes} "
+        "--report docs/results/panorama/test",
+    ),
+    "fair-settings": Experiment(
+        page="fair_settings",
+        command="python -m eval.fair_settings firefighting --out {out} --report docs/results/fair_settings",
+    ),
+    "calibration": Experiment(page="calibration", command="python -m eval.calibrate_firefighting --worlds 100"),
+    "delivery": Experiment(
+        page="delivery",
+        command="python -m eval.delivery --out {out} --plans {data}/floorplans --worlds 1000 --plan-worlds 80 "
+        "--formula-worlds 40 --processes {processes} --report docs/results/delivery/first1000",
+    ),
+    "own-delivery": Experiment(
+        page="delivery",
+        command="potlp collect delivery --split validation --worlds 40 --out {out} --set first_world=1600 "
+        "--set look_every=1 --set staying_sets=3 --set views_per_world=12 --set spacing=[4,40] --set posterior=8 "
+        "--set nearest=true --set driver=potlp --set estimator=delivery --set drives=1",
+    ),
+    "d-own": Experiment(
+        page="delivery", command="potlp estimator evaluate delivery {all}/own-delivery --ablate all --out {out}"
+    ),
+    "worst-delivery": Experiment(
+        page="delivery",
+        command="python -m eval.limit.worst {all}/delivery/generated --out {out} --trials 10 --buildings 8 "
+        "--report docs/results/delivery/worst",
+    ),
+    "real-maps": Experiment(
+        page="delivery",
+        command="python -m eval.real_maps --out {out} --maps {data}/maps --worlds 50 --processes {processes}",
+    ),
+    "worst-floor2": Experiment(
+        page="delivery",
+        command="python -m eval.limit.worst {all}/real-maps/gdc_floor2 --out {out} --trials 10 "
+        "--report docs/results/real_maps/floor2_worst",
+    ),
+    # Each shipped recipe from nothing, and what its stages keep: how long one has to train.
+    "recipe-firefighting": Experiment(
+        page="estimator", command="potlp fit --recipe firefighting --out {out} --processes {processes}"
+    ),
+    "curve-firefighting": Experiment(
+        page="estimator",
+        command="python -m eval.training_curve {all}/recipe-firefighting --environment firefighting --worlds 60 "
+        "--out {out} --report {out}/curve",
+    ),
+    "recipe-delivery": Experiment(
+        page="delivery", command="potlp fit --recipe delivery --out {out} --processes {processes}"
+    ),
+    "curve-delivery": Experiment(
+        page="delivery",
+        command="python -m eval.training_curve {all}/recipe-delivery --environment delivery --worlds 100 --out {out} "
+        "--report docs/results/delivery/curve",
+    ),
+    "recipe-parcels": Experiment(
+        page="delivery", command="potlp fit --recipe parcels --out {out} --processes {processes}"
+    ),
+    "curve-parcels": Experiment(
+        page="delivery",
+        command="python -m eval.training_curve {all}/recipe-parcels --environment campus-small-parcels --worlds 100 "
+        "--out {out} --report docs/results/delivery/curve_parcels",
+    ),
+    "floors": Experiment(page="floors", command="python -m eval.floor_statistics", variables=_OTHERS),
+    "buildings": Experiment(
+        page="buildings",
+        command="python -m eval.buildings --data {data} --out {out}/rows.jsonl --most 6 "
+        "--report docs/results/buildings",
+    ),
+    "commits": Experiment(
+        page="commits",
+        command="python -m eval.commits --pairs 10000 --out {out}/rows.jsonl --report docs/results/commits.json",
+    ),
+    "trials": Experiment(
+        page="trials",
+        command="python -m eval.trials firefighting rooms maps revealed --processes {processes} --out {out}",
+        variables=_OTHERS,
+    ),
+    "live": Experiment(
+        page="live", command="python -m eval.live --streams 1000 --out docs/results/live.json", variables=_OTHERS
+    ),
+    "live-recorded": Experiment(
+        page="live",
+        command="python -m eval.live.recorded --out {out} --maps {data}/maps --report docs/results/live/recorded",
+    ),
+    "faults-files": Experiment(page="faults", command="python -m eval.faults files --cases 5000 --out {out}"),
+    "faults-texts": Experiment(page="faults", command="python -m eval.faults texts --cases 100000 --out {out}"),
+    "faults-formulas": Experiment(page="faults", command="python -m eval.faults formulas --cases 1000 --out {out}"),
+    "faults-kills": Experiment(page="faults", command="python -m eval.faults kills --cases 300 --out {out}"),
+    "scale-overhead": Experiment(
+        page="scale", command="python -m eval.scale overhead --out {out} --report docs/results/scale/overhead"
+    ),
+    "scale-store": Experiment(
+        page="scale", command="python -m eval.scale store --out {out} --report docs/results/scale/store"
+    ),
+    "scale-kills": Experiment(
+        page="scale", command="python -m eval.scale kills --out {out} --report docs/results/scale/kills"
+    ),
+    "scale-fits": Experiment(
+        page="scale", command="python -m eval.scale fits --out {out} --report docs/results/scale/fits"
+    ),
+    "collected": Experiment(
+        page="scale",
+        command="potlp collect firefighting --split training --worlds 10000 --out {out} --processes {processes} "
+        "--set first_world=60000 --set spacing=[0,8] --set look_every=0 --set staying_sets=3 --set pursued=1 "
+        "--set worlds_per_shard=50 --set views_per_world=4 --set glances=false",
+    ),
+    "scale-reading": Experiment(
+        page="scale",
+        command="python -m eval.scale reading --data {all}/collected --validation {all}/means --out {out} "
+        "--report docs/results/scale/reading",
+    ),
+    "mutants": Experiment(page="mutants", command="python -m eval.mutants --report docs/results/mutants"),
+    # Those that measure times come last: nothing else of this list runs beside them.
+    "release": Experiment(
+        page="release", command="python -m eval.release --out {out} --report docs/results/release", one_core=True
+    ),
+    "decision": Experiment(
+        page="speed",
+        command="python -m eval.bench.decision --worlds 2 --out docs/results/speed/after.json",
+        one_core=True,
+    ),
+    "decision-twins": Experiment(
+        page="speed",
+        command="python -m eval.bench.decision --worlds 2 --out docs/results/speed/before.json",
+        one_core=True,
+        variables={"POTLP_NATIVE": "0"},
+    ),
+    "decision-estimators": Experiment(
+        page="speed",
+        command="python -m eval.bench.decision --worlds 2 --policies potlp --estimators firefighting-panorama "
+        "firefighting --out docs/results/speed/estimators.json",
+        one_core=True,
+    ),
+    "distances": Experiment(
+        page="planner",
+        command="python -m eval.bench.distances --repeats 3 --out docs/results/planner/distances.json "
+        "--plot docs/results/planner/distances.png",
+        one_core=True,
+    ),
+    "native": Experiment(page="planner", command="python -m eval.bench.native", one_core=True),
+    "ended": Experiment(
+        page="planner", command="python -m eval.bench.ended --instances 60 --simulations 500 --seconds 2 --out {out}"
+    ),
+    "regret": Experiment(
+        page="planner",
+        command="python -m eval.bench.regret --planners best-first po-uct-numba po-uct-pomdp-py --subgoals 2 4 6 8 12 "
+        "--instances 8 --seconds 2 --budgets 30 300 1000 10000 100000 --out {out}",
+        one_core=True,
+    ),
+    "rates": Experiment(
+        page="planner",
+        command="python -m eval.bench.regret --planners best-first po-uct po-uct-numba po-uct-pomdp-py mctx --families "
+        "find firefighting two three-single --subgoals 8 --instances 8 --seconds 2 --budgets 30 300 1000 --out {out}",
+        one_core=True,
+    ),
+    "optimism": Experiment(
+        page="planner",
+        command="python -m eval.bench.regret --split tuning --planners best-first --optimism .3 .4 .6 .7 1 "
+        "--subgoals 4 8 --instances 8 --seconds 2 --budgets 30 300 1000 10000 --families find three-single "
+        "three-joint two firefighting reuse random cubes shared rare extreme cheap dear clustered four --out {out}",
+        one_core=True,
+    ),
+    "throughput": Experiment(
+        page="planner",
+        command="python -m eval.bench.throughput --batches 1 64 --simulations 300 --repeats 3 --out {out}",
+        one_core=True,
+    ),
+}
+"""By the name that ``--only`` takes, in the order in which they run."""
