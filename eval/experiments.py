@@ -105,7 +105,16 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="python -m eval.ablations --out {out} --views own={all}/own explored={all}/explored "
         "--processes {processes} --report docs/results/ablations",
     ),
-    "held-out": Experiment(page="panorama", command="potlp sweep firefighting-held-out --out {out}"),
+    "held-out": Experiment(
+        page="estimator",
+        command="python -m eval.held_out docs/results/table1/rows.csv.gz --out {out} --processes {processes} "
+        "--report docs/results/estimator/held_out",
+    ),
+    "held-out-panorama": Experiment(
+        page="panorama",
+        command="python -m eval.held_out docs/results/panorama/rows.csv.gz --estimator firefighting-panorama "
+        "--out {out} --processes {processes} --report docs/results/panorama/held_out",
+    ),
     "panorama": Experiment(
         page="panorama",
         command="python -m eval.table1 --estimator firefighting-panorama --out {out} --processes {processes} "
@@ -160,6 +169,11 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="delivery",
         command="python -m eval.training_curve {all}/recipe-delivery --environment delivery --worlds 100 --out {out} "
         "--report docs/results/delivery/curve",
+    ),
+    "small-generator": Experiment(
+        page="delivery",
+        command="python -m eval.small_generator {all}/recipe-delivery --plans {data}/floorplans --out {out} "
+        "--processes {processes} --report docs/results/delivery/small_generator",
     ),
     "recipe-parcels": Experiment(
         page="delivery", command="potlp fit --recipe parcels --out {out} --processes {processes}"

@@ -1,6 +1,7 @@
 """Formulas that no training task equals, beside those of Table I, in the same test worlds of fire-fighting.
 
     python -m eval.held_out docs/results/table1/rows.csv.gz --out out/held-out --report docs/results/estimator/held_out
+    python -m eval.held_out docs/results/panorama/rows.csv.gz --estimator firefighting-panorama --out out/panorama
 
 The formulas are ``HELD_OUT`` of the library, which no collection asks about. The costs of the trained tasks are read
 from a file of ``eval.compact_rows``; it has to be of the same estimator. The same command goes on where it was stopped.
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from eval.gains import Costs, costs_of
-from eval.savings import TABLE_HEAD, audit, compare_first, read_rows, sweep, table_lines
+from eval.savings import TABLE_HEAD, audit, compare_first, pairs_of, read_rows, sweep, table_lines
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
 from potlp_jax.learning.questions import HELD_OUT
@@ -25,21 +26,11 @@ from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.rows import provenance
 from potlp_jax.sweep.statistics import attainable_share
 from potlp_jax.sweep.store import Row
-from potlp_jax.trials.record import Outcome
 
 ENVIRONMENT = "firefighting"
 POLICIES = [Policy.KNOWN_MAP.value, Policy.BASELINE.value, Policy.POTLP.value]
 
 _DRAWS = 2000
-
-
-def costs_of_rows(rows: Sequence[Row]) -> Costs:
-    """Costs by formula and world, of trials that ended satisfied."""
-    found: Costs = {}
-    for row in rows:
-        if row.outcome == Outcome.SATISFIED:
-            found.setdefault((row.item.task, row.item.world), {})[row.item.policy] = row.cost
-    return found
 
 
 def mean_share(costs: Costs, formulas: Iterable[str], worlds: Sequence[int]) -> float:
@@ -86,7 +77,8 @@ def results_of(rows: Sequence[Row], trained: Costs) -> dict[str, Any]:
     generator = make(ENVIRONMENT)
     held_out, tasks = list(HELD_OUT[ENVIRONMENT]), sorted({formula for formula, _ in trained})
     worlds = len({row.item.world for row in rows})
-    costs = {**trained, **costs_of_rows(rows)}
+    own = {text: pairs_of([row for row in rows if row.item.task == text], POLICIES) for text in held_out}
+    costs = {**trained, **{(text, world): found for text, pairs in own.items() for world, found in pairs.items()}}
     shared = shared_worlds(costs, [*held_out, *tasks])
     return {
         "provenance": provenance(),
@@ -119,17 +111,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("trained", type=Path, metavar="ROWS.csv.gz", help="trials of Table I, of eval.compact_rows")
     parser.add_argument("--out", type=Path, required=True, help="folder of the sweep")
+    parser.add_argument("--estimator", help="what potlp asks; default: the shipped one")
     parser.add_argument("--worlds", type=int, default=200, help="test worlds of each formula")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--report", type=Path, metavar="NAME", help="without suffix: where the results go")
     options = parser.parse_args()
-    specification = {
+    specification: dict[str, Any] = {
         "environments": [ENVIRONMENT],
         "tasks": list(HELD_OUT[ENVIRONMENT]),
         "policies": POLICIES,
         "worlds": options.worlds,
         "split": Split.TEST.value,
     }
+    if options.estimator is not None:
+        specification["estimator"] = options.estimator
     sweep(options.out, specification, options.processes)
     found = results_of(read_rows(options.out), costs_of(options.trained))
     print(markdown(found))

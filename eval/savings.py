@@ -13,10 +13,11 @@ from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import Split
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.audit import audit_rows
-from potlp_jax.sweep.results import compare_pairs, pair_rows
+from potlp_jax.sweep.results import compare_pairs, pair_rows, reliable_pairs
 from potlp_jax.sweep.runner import RESULTS
 from potlp_jax.sweep.statistics import PolicyRow
 from potlp_jax.sweep.store import Row, Store
+from potlp_jax.trials.record import Outcome
 from potlp_jax.types import Status
 
 SWEEP_COMMAND = (sys.executable, "-c", "from potlp_jax.cli import main; main()", "sweep")
@@ -67,6 +68,15 @@ def compare_first(
     clusters = None if building is None else [building(pair[Policy.BASELINE].item.world) for pair in pairs]
     comparison = compare_pairs(pairs, policies, clusters)
     return {"task": task, "buildings": 1 if clusters is None else len(set(clusters)), **comparison.to_dict()}
+
+
+def pairs_of(rows: Sequence[Row], policies: Sequence[str]) -> dict[int, dict[str, float]]:
+    """Costs by world and policy, of one task, in the worlds in which every policy ended satisfied and reliably."""
+    found: dict[int, dict[str, float]] = {}
+    for pair in reliable_pairs(pair_rows(rows, policies)):
+        if all(row.outcome == Outcome.SATISFIED for row in pair.values()):
+            found[pair[policies[0]].item.world] = {policy: row.cost for policy, row in pair.items()}
+    return found
 
 
 def audit(rows: Sequence[Row], generator: Generator, split: Split) -> list[str]:

@@ -2,8 +2,7 @@
 
 import pytest
 
-from eval.held_out import costs_of_rows, difference, mean_share, shared_worlds
-from potlp_jax.sweep.store import Item, Row
+from eval.held_out import difference, mean_share, shared_worlds
 
 
 def trial(known, ours, baseline):
@@ -40,13 +39,3 @@ def test_the_difference_is_paired_by_world():
     found, low, high = difference(COSTS, ["F a"], ["F b"], [0, 1])
     assert (found, low, high) == pytest.approx((1 / 3, 0.3, 0.5))
     assert difference(COSTS, ["F a"], ["F a"], [0, 1]) == pytest.approx((0, 0, 0))
-
-
-def row(world, policy, cost, outcome="satisfied"):
-    item = Item(environment="firefighting", task="F a", world=world, policy=policy)
-    return Row(item, outcome, cost, 99.0, 1, 1, 0, 0, (0, 0), "", "", {}, "", 0.0, "")
-
-
-def test_trials_that_were_not_satisfied_have_no_cost():
-    rows = [row(0, "potlp", 5.0), row(0, "baseline", 7.0), row(1, "potlp", 3.0, outcome="stuck")]
-    assert costs_of_rows(rows) == {("F a", 0): {"potlp": 5.0, "baseline": 7.0}}
