@@ -130,11 +130,12 @@ def _run(run: Run, name: str, log: TextIO) -> int:
 
 def listing() -> str:
     """The table of ``--list``."""
-    lines = [f"{'experiment':16s}{'page':16s}{'hours':>6s}  command"]
+    rows = [("experiment", "page", "hours", "command")]
     for name, experiment in EXPERIMENTS.items():
         hours = "?" if experiment.hours is None else f"{experiment.hours:.1f}"
-        lines.append(f"{name:16s}{experiment.page:16s}{hours:>6s}  {experiment.command}")
-    return "\n".join(lines)
+        rows.append((name, experiment.page, hours, experiment.command))
+    names, pages = (max(len(row[column]) for row in rows) for column in (0, 1))
+    return "\n".join(f"{name:{names}}  {page:{pages}}  {hours:>5}  {command}" for name, page, hours, command in rows)
 
 
 def main() -> int:

@@ -45,10 +45,17 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="python -m eval.table1 --out {out} --processes {processes} --report docs/results/table1/test",
         hours=0.5,
     ),
-    # Its trials are compared with the rows of Table I, world by world.
-    "observer": Experiment(
-        page="table1", command="python -m eval.limit --out {out} --worlds 750 --arms ideal-observer"
+    # In little space, for what reads it beside other trials.
+    "table1-export": Experiment(
+        page="table1", command="potlp sweep export {all}/table1 --out {out}/rows.csv", hours=0.1
     ),
+    "table1-rows": Experiment(
+        page="table1",
+        command="python -m eval.compact_rows {all}/table1-export/rows.csv docs/results/table1/rows.csv.gz",
+        hours=0.1,
+    ),
+    # Its trials are compared with the rows of Table I, world by world.
+    "observer": Experiment(page="table1", command="python -m eval.limit --out {out} --worlds 80 --arms ideal-observer"),
     "beside": Experiment(
         page="table1",
         command="python -m eval.limit.beside docs/results/table1/rows.csv.gz {all}/observer "
@@ -110,15 +117,23 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="python -m eval.held_out docs/results/table1/rows.csv.gz --out {out} --processes {processes} "
         "--report docs/results/estimator/held_out",
     ),
-    "held-out-panorama": Experiment(
-        page="panorama",
-        command="python -m eval.held_out docs/results/panorama/rows.csv.gz --estimator firefighting-panorama "
-        "--out {out} --processes {processes} --report docs/results/panorama/held_out",
-    ),
     "panorama": Experiment(
         page="panorama",
         command="python -m eval.table1 --estimator firefighting-panorama --out {out} --processes {processes} "
         "--report docs/results/panorama/test",
+    ),
+    "panorama-export": Experiment(
+        page="panorama", command="potlp sweep export {all}/panorama --out {out}/rows.csv", hours=0.1
+    ),
+    "panorama-rows": Experiment(
+        page="panorama",
+        command="python -m eval.compact_rows {all}/panorama-export/rows.csv docs/results/panorama/rows.csv.gz",
+        hours=0.1,
+    ),
+    "held-out-panorama": Experiment(
+        page="panorama",
+        command="python -m eval.held_out docs/results/panorama/rows.csv.gz --estimator firefighting-panorama "
+        "--out {out} --processes {processes} --report docs/results/panorama/held_out",
     ),
     "fair-settings": Experiment(
         page="fair_settings",
@@ -146,7 +161,8 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     "real-maps": Experiment(
         page="delivery",
-        command="python -m eval.real_maps --out {out} --maps {data}/maps --worlds 50 --processes {processes}",
+        command="python -m eval.real_maps --out {out} --maps {data}/maps --worlds 50 --processes {processes} "
+        "--report {out}/maps",
     ),
     "worst-floor2": Experiment(
         page="delivery",

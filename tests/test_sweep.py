@@ -110,6 +110,8 @@ def test_a_policy_may_have_settings_of_its_own():
         "baseline": "decision.frontiers.min_size was 2, is 5, replan_distance was 7.0, is 9.0"
     }
     assert "policy_settings" not in _specification().to_dict()
+    same = _specification(settings={"replan_distance": 7}, policy_settings={"baseline": {"replan_distance": 7}})
+    assert own_settings(same.to_dict()) == {}
 
 
 def test_trials_of_a_policy_have_its_settings_and_a_sweep_with_others_is_another(tmp_path):

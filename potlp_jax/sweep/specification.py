@@ -109,7 +109,9 @@ def specification_from_store(data: Mapping[str, Any]) -> Specification:
 def own_settings(data: Mapping[str, Any]) -> dict[str, str]:
     """By policy, in which settings it differs from those of the sweep, in words; ``data``: of ``to_dict``."""
     own = data.get("policy_settings", {})
-    return {policy: ", ".join(differences(data["settings"], settings)) for policy, settings in own.items()}
+    told = {policy: ", ".join(differences(data["settings"], settings)) for policy, settings in own.items()}
+    # A value that is named and is also the sweep's is no difference.
+    return {policy: found for policy, found in told.items() if found}
 
 
 def configuration_hash(config: TrialConfig) -> str:
