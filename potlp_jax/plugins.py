@@ -53,6 +53,9 @@ def load(name: str, *, group: str, kind: str, known: Iterable[str] = ()) -> Any:
         kind: what is looked for, for messages: "environment", "policy".
         known: names that are no extensions, listed where ``name`` is unknown.
 
+    Returns:
+        Whatever it is; that it is of the right kind is for the caller to check.
+
     Raises:
         PluginError: nothing has this name, or what has it cannot be imported.
     """

@@ -27,6 +27,9 @@ def surroundings_of(generator: Generator, split: Split | None = None, first: int
         split: whose worlds; None: the environment's default.
         first: number of the first world.
 
+    Returns:
+        The letters of ``WORLDS_LOOKED_AT`` worlds and their starts.
+
     Raises:
         WorldError: one cannot be made.
     """

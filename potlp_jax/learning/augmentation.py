@@ -32,14 +32,32 @@ class Augmentation:
 
 
 def draw_mirrors(key: PRNGKeyArray, views: int, amount: Augmentation) -> tuple[Bool[Array, " G"], Bool[Array, " G"]]:
-    """Which views have their rows mirrored, and which their columns."""
+    """Which views have their rows mirrored, and which their columns.
+
+    Args:
+        key: decides it.
+        views: how many.
+        amount: the chance of each.
+
+    Returns:
+        True where a view's rows are mirrored, and where its columns are.
+    """
     of_rows, of_columns = jax.random.split(key)
     rows = jax.random.bernoulli(of_rows, amount.mirror_rows, (views,))
     return rows, jax.random.bernoulli(of_columns, amount.mirror_columns, (views,))
 
 
 def draw_gains(key: PRNGKeyArray, views: int, amount: Augmentation) -> Float32[Array, "G 3"]:
-    """Factors of the three channels of each view, around 1: as a lamp and a camera's white balance change a picture."""
+    """Factors of the three channels of each view, around 1: as a lamp and a camera's white balance change a picture.
+
+    Args:
+        key: decides them.
+        views: how many.
+        amount: standard deviations of the logarithm, of all channels together and of each.
+
+    Returns:
+        A factor for red, green and blue of each view.
+    """
     of_brightness, of_colour = jax.random.split(key)
     logarithm = amount.brightness * jax.random.normal(of_brightness, (views, 1))
     return jnp.exp(logarithm + amount.colour * jax.random.normal(of_colour, (views, 3)))

@@ -134,7 +134,17 @@ class BuildingEstimator:
 def outlook_of_classes(
     scene: Scenery, subgoals: Subgoals, stay: Int8[Array, "C P"], class_mask: Bool[Array, " C"]
 ) -> Outlook:
-    """The outlook of every real (subgoal, class), leading dimensions ``S C``; classes that avoid the same share one."""
+    """The outlook of every real (subgoal, class), leading dimensions ``S C``; classes that avoid the same share one.
+
+    Args:
+        scene: of the map, without leading dimensions.
+        subgoals: padding is masked out.
+        stay: of the task's classes, ``phi_stay``: -1 for what is avoided.
+        class_mask: True for real classes.
+
+    Returns:
+        Numbers of about the size of 1; of masked subgoals and classes they mean nothing.
+    """
     count, classes = subgoals.mask.shape[0], class_mask.shape[0]
     same = jnp.all(stay[:, None, :] == stay[None, :, :], axis=2) & class_mask[None, :]
     first = jnp.argmax(same, axis=1).astype(jnp.int32)

@@ -295,13 +295,29 @@ class BuildingNetwork:
         return self._apply(params, "encode", channels)
 
     def places(self, params: Params, encoded: EncodedMap, cells: Int32[Array, "*B S 2"]) -> Float32[Array, "*B S U"]:
-        """What the network knows of subgoals, whatever is asked of them."""
+        """What the network knows of subgoals, whatever is asked of them.
+
+        Args:
+            params: of the network.
+            encoded: the maps, of ``encode``.
+            cells: of the subgoals of each map.
+
+        Returns:
+            Units of the head, for ``answer``.
+        """
         return self._apply(params, "place_of", _read_at(encoded, cells, self.config))
 
     def modulation(
         self, params: Params, phi_stay: Int8[Array, "*B P"], phi_go: Int8[Array, "*B P"]
     ) -> Float32[Array, "*B layers 2 U"]:
         """What a class does to the head's units; the same for all subgoals.
+
+        Args:
+            params: of the network.
+            phi_stay, phi_go: of the classes: 1 for what has to hold, -1 for what must not, 0 for what does not matter.
+
+        Returns:
+            A factor and a summand for each unit of each layer.
 
         Raises:
             NetworkError: the vectors phi have another length than the network's propositions.
@@ -317,7 +333,17 @@ class BuildingNetwork:
         prospects: Float32[Array, "*Q N"],
         modulation: Float32[Array, "*M layers 2 U"],
     ) -> Answers:
-        """The second stage; equally many leading dimensions, which are broadcast against each other."""
+        """The second stage; equally many leading dimensions, which are broadcast against each other.
+
+        Args:
+            params: of the network.
+            places: of ``places``.
+            prospects: of ``imagined_paths.prospects``.
+            modulation: of ``modulation``.
+
+        Returns:
+            Logits of P_S, and R_S and R_F in the unit of the network's costs, above 0.
+        """
         logit, success, failure = jnp.moveaxis(self._apply(params, "answer", places, prospects, modulation), -1, 0)
         # Softplus keeps costs positive; a success costs at least one step of the grid.
         return Answers(
@@ -335,6 +361,13 @@ def building_operations(config: BuildingConfig, height: int, width: int) -> tupl
     """Floating-point operations forward: per map (first stage), per subgoal, and per (subgoal, class) pair.
 
     Two per multiplication of a matrix product, as in ``network.operation_counts``.
+
+    Args:
+        config: of the network.
+        height, width: of the map's array, in cells; it is padded to whole squares.
+
+    Returns:
+        The three counts.
     """
     rows, columns = (-(-size // config.side) * config.side for size in (height, width))
     areas = [rows * columns // 4 ** (level + 1) for level in range(len(config.widths))]

@@ -32,7 +32,16 @@ class Domain:
 
     @classmethod
     def of_cells(cls, family: str, camera: CameraConfig, resolution: float) -> "Domain":
-        """Of worlds of a family, with cells of this size, seen by a camera whose lengths are in cells."""
+        """Of worlds of a family, with cells of this size, seen by a camera whose lengths are in cells.
+
+        Args:
+            family: as ``World.family``.
+            camera: its lengths are in cells.
+            resolution: side of a cell.
+
+        Returns:
+            The domain, with the camera's lengths in the unit of ``resolution``.
+        """
         in_unit = dataclasses.replace(camera, **camera.lengths(resolution))
         return cls(family, in_unit, unit_of(resolution))
 

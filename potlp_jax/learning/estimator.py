@@ -172,6 +172,9 @@ def estimator_for(
         here: the worlds.
         given: is used wherever it is asked for.
 
+    Returns:
+        One over exactly these propositions.
+
     Raises:
         EstimatorError: none is shipped for these.
         PropositionsError: the one given knows other propositions.

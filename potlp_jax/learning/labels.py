@@ -53,7 +53,18 @@ class TrueMapEstimator:
 
 
 def labels_in(world: World, belief: BeliefMap, subgoals: Subgoals, task: TaskArrays, *, nearest: bool) -> Estimates:
-    """``true_labels``, as they are or of the nearest ways alone."""
+    """``true_labels``, as they are or of the nearest ways alone.
+
+    Args:
+        world: the true map.
+        belief: what the robot knows of it.
+        subgoals: that are asked about.
+        task: whose classes are asked about.
+        nearest: whether only subgoals count that are nearly the shortest way to a class (``nearest_ways``).
+
+    Returns:
+        Labels of every real (subgoal, class).
+    """
     labels = true_labels(world, belief, subgoals, task)
     return nearest_ways(labels, subgoals, world.resolution) if nearest else labels
 

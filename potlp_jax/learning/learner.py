@@ -35,7 +35,13 @@ class Learner(Protocol):
         ...
 
     def augmented(self, inputs: Inputs, key: PRNGKeyArray, amount: Augmentation) -> Inputs:
-        """The inputs as they might have been just as well; traced."""
+        """The inputs as they might have been just as well; traced.
+
+        Args:
+            inputs: of a batch.
+            key: decides what is changed.
+            amount: how much is.
+        """
         ...
 
     def answers(

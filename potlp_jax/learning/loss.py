@@ -146,7 +146,15 @@ def _squared_errors(predicted: Array, true: Array, known: Array, share: Array, s
 
 
 def total_loss(sums: Sums, cost_share: float, view_share: float) -> Float32[Array, ""]:
-    """The loss that is minimised: terms per sample, and that of the views."""
+    """The loss that is minimised: terms per sample, and that of the views.
+
+    Args:
+        sums: over a batch.
+        cost_share, view_share: factors of both cost terms, and of the views' term.
+
+    Returns:
+        A number to be made small; 0 of an empty batch.
+    """
     of_samples = sums.cross_entropy + cost_share * (sums.success_error + sums.failure_error)
     of_views = view_share * sums.view_loss / jnp.maximum(sums.views, jnp.float32(1))
     return of_samples / jnp.maximum(sums.count, jnp.float32(1)) + of_views

@@ -103,6 +103,9 @@ def decode_view(view: EncodedView, world: EncodedWorld, shape: tuple[int, int]) 
         world: its true map.
         shape: rows and columns of the arrays; what the map does not fill is occupied and never seen.
 
+    Returns:
+        What the robot knew in the view, and what is true.
+
     Raises:
         DatasetError: an image is damaged, or of another size than the world, or the world is larger than the arrays.
     """

@@ -406,7 +406,15 @@ def _flat_fovea(centred: CentredView) -> Float32[Array, "B pixels"] | None:
 
 
 def require_phi(phi_stay: Int8[Array, "*B P"], phi_go: Int8[Array, "*B P"], propositions: tuple[str, ...]) -> None:
-    """Check that the vectors phi have an entry for each proposition. Raises NetworkError."""
+    """Check that the vectors phi have an entry for each proposition.
+
+    Args:
+        phi_stay, phi_go: of classes, any leading dimensions.
+        propositions: of the network.
+
+    Raises:
+        NetworkError: they have more or fewer.
+    """
     expected = len(propositions)
     if phi_stay.shape[-1] != expected or phi_go.shape[-1] != expected:
         raise NetworkError(

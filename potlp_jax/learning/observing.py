@@ -76,6 +76,9 @@ class MovesWithMap(Protocol):
         Args:
             shape: rows and columns of that array.
             rows, columns: of it that lie above and to the left of the one before (``world.grid.moved_layer``).
+
+        Returns:
+            The estimator; it knows nothing of cells that the array before did not have.
         """
         ...
 
@@ -102,7 +105,16 @@ def looks_between(before: _Count, now: _Count, every: int) -> _Count:
 
 
 def look_step(before: _Count, number: _Count, every: int) -> _Count:
-    """After how many cells entered it looks for time ``number``, counted from 0, after ``before`` and a decision."""
+    """After how many cells entered it looks for time ``number``, counted from 0, after ``before`` and a decision.
+
+    Args:
+        before: cells entered until the decision.
+        number: of the look, below ``looks_between``.
+        every: number of cells, as ``TrialConfig.look_every``.
+
+    Returns:
+        Cells entered since the trial's beginning.
+    """
     return before + (number + 1) * every
 
 
@@ -113,7 +125,17 @@ _Observing = TypeVar("_Observing", bound=ObservingEstimator)
 def observe_panorama(
     estimator: _Observing, panorama: UInt8[Array, "rows columns 3"], belief: BeliefMap, cell: Int32[Array, "2"]
 ) -> _Observing:
-    """The estimator after a panorama from ``cell``; ``belief`` is the map after the observation."""
+    """The estimator after a panorama.
+
+    Args:
+        estimator: before it.
+        panorama: red, green and blue, 0 to 255.
+        belief: the map after the observation.
+        cell: from where it was taken.
+
+    Returns:
+        The estimator that remembers it, too.
+    """
     # A typing.Self would say that the class stays; checks at run time cannot read it in a protocol.
     return cast(_Observing, estimator.remember(estimator.encode(panorama), belief, cell))
 

@@ -33,7 +33,16 @@ def shape_in(shape: tuple[int, int], scale: float) -> tuple[int, int]:
 
 
 def cells_in(cells: Int32[Array, "*B 2"], shape: tuple[int, int], scale: float) -> Int32[Array, "*B 2"]:
-    """The cells of the other map in which the middles of these lie."""
+    """The cells of the other map in which the middles of these lie.
+
+    Args:
+        cells: of the one map.
+        shape: its rows and columns.
+        scale: as in ``shape_in``.
+
+    Returns:
+        Cells of the other map.
+    """
     rows, columns = (jnp.asarray(_places(length, scale), jnp.int32) for length in shape)
     return jnp.stack([rows[cells[..., 0]], columns[cells[..., 1]]], axis=-1)
 

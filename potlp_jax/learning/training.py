@@ -85,7 +85,16 @@ def check_data(training: Samples, validation: Samples) -> None:
 
 
 def batches_of(learner: Learner, samples: Samples, config: TrainingConfig) -> Batches:
-    """The batches of a data set as a learner is shown them: this process's rows of them."""
+    """The batches of a data set as a learner is shown them: this process's rows of them.
+
+    Args:
+        learner: chooses the samples that it can answer.
+        samples: of the data set.
+        config: of the training, with the sizes of a batch and the seed of the order.
+
+    Returns:
+        The batches, each a function of its number.
+    """
     return Batches(
         samples,
         learner.inputs,
@@ -126,7 +135,15 @@ def steps_per_epoch(learner: Learner, training: Samples, config: TrainingConfig)
 
 
 def provenance(training: Samples, validation: Samples, initial: TrainedEstimator | None) -> dict[str, Any]:
-    """What a training is made from: every data set, and the estimator that it goes on from; JSON-able."""
+    """What a training is made from; JSON-able.
+
+    Args:
+        training, validation: its data.
+        initial: the estimator that it goes on from.
+
+    Returns:
+        The sources of both data sets, by number, and the estimator's identity.
+    """
 
     # By number and not as a list, so that what differs is named by itself.
     def data(samples: Samples) -> dict[str, Any]:

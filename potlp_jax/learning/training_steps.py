@@ -69,6 +69,9 @@ def initial_state(learner: Learner, config: TrainingConfig, params: Any = None) 
         learner: what is trained.
         config: how.
         params: to begin with; new ones by default.
+
+    Returns:
+        Parameters, their average, and the optimiser's state, with nothing done yet.
     """
     # Two keys: changing the augmentation leaves the initial parameters as they were.
     of_params, of_augmentation = jax.random.split(jax.random.key(config.seed))

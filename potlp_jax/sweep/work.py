@@ -89,7 +89,16 @@ class Work:
             yield Examined(item, trial.outcome is Outcome.SATISFIED)
 
     def rows(self, items: Iterable[Item], environment: str, policy: str) -> Iterator[Row]:
-        """The rows of trials of one environment and policy, as they end."""
+        """The rows of trials of one environment and policy, as they end.
+
+        Args:
+            items: of that environment and policy.
+            environment: by its name.
+            policy: by its name.
+
+        Returns:
+            A row for each item, in the order in which they end.
+        """
         config = self.specification.config_of(policy)
         asked = self.asked(environment, policy)
         for item, trial in self._trials(items, environment, policy):

@@ -16,6 +16,9 @@ def read_task(text: str, propositions: Sequence[str] | None = None, max_positive
         propositions: all propositions, in the order of a letter's bits; None: those that the task names.
         max_positive_literals: drops cubes that need more propositions to hold at one cell.
 
+    Returns:
+        The task, over ``propositions`` where they are given.
+
     Raises:
         TaskError: the file cannot be read, or what is named is no task over these propositions.
     """

@@ -262,7 +262,16 @@ class Trial(RunRecord):
 
 
 def belief_seen_by(world: World, first_seen: Int32[np.ndarray, "H W"], step: int) -> BeliefMap:
-    """The belief of a robot that saw each cell first at step ``first_seen`` (or ``NEVER_SEEN``), after ``step``."""
+    """The belief of a robot that saw each cell first at step ``first_seen`` (or ``NEVER_SEEN``), after ``step``.
+
+    Args:
+        world: what is true.
+        first_seen: step at which each cell was seen first.
+        step: cells entered until the moment that is asked about.
+
+    Returns:
+        The map as it was known then.
+    """
     # One number per cell stands for all beliefs of a trial: known space only grows.
     seen = (first_seen != NEVER_SEEN) & (first_seen <= step)
     # What is observed is observed rightly: the sensor is exact (docs/model.md section 7).

@@ -311,6 +311,14 @@ class Tally:
 def first_tally(belief: BeliefMap, cell: Int32[Array, "2"], task: TaskArrays) -> Tally:
     """Of a trial that has not begun: the letter of the robot's first cell is read.
 
+    Args:
+        belief: the map after the first observation.
+        cell: the robot's.
+        task: over the map's propositions.
+
+    Returns:
+        The tally, with nothing spent.
+
     Raises:
         PropositionsError: belief and task are not over the same propositions.
     """

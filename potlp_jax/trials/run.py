@@ -69,7 +69,16 @@ def run(
 def default_policy(
     world: World, config: TrialConfig | None = None, given: TrainedEstimator | Estimator | None = None
 ) -> Policy:
-    """PO-TLP where an estimator is given, or shipped for such a world and camera; otherwise the baseline."""
+    """PO-TLP where an estimator is given, or shipped for such a world and camera; otherwise the baseline.
+
+    Args:
+        world: where the trial is run.
+        config: with its camera; None: as such worlds want it.
+        given: the estimator that the user named.
+
+    Returns:
+        One of the two policies.
+    """
     config = trial_config_for(world) if config is None else config
     here = Domain.of_world(world, config.camera)
     is_shipped = shipped_estimator(world.propositions, here) is not None

@@ -195,6 +195,9 @@ def sight_lines(config: CameraConfig, height: int, width: int) -> SightLines:
     Args:
         config: the camera's geometry.
         height, width: of the array. Beyond it everything hides: lines end in the border.
+
+    Returns:
+        A line for each column of the panorama.
     """
     rays, _ = _tables(config, height + 2, width + 2)
     return SightLines(offset=rays.offset, enter=rays.enter)

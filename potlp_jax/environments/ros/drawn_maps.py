@@ -208,6 +208,9 @@ def drawn_map(
         closed: obstacles that were added.
         places: that the plan names.
 
+    Returns:
+        The map, with what was closed and named kept beside it.
+
     Raises:
         MapError: nothing is free.
     """

@@ -13,7 +13,18 @@ FARTHEST_SNAP: float = 2.0
 
 
 def shortest(free: Bool[np.ndarray, "H W"], start: Cell, goal: Cell) -> list[Cell]:
-    """Cells of a shortest path, the start left out. Raises KeyError where the ends are not in one component."""
+    """Cells of a shortest path, the start left out.
+
+    Args:
+        free: True where the robot may be.
+        start, goal: free cells.
+
+    Returns:
+        The cells in order, the goal last.
+
+    Raises:
+        KeyError: the ends are not in one component.
+    """
     # A* with the straight distance, which never exceeds the length of a path.
     best, came_from = {start: 0.0}, {}
     queue = [(0.0, start)]

@@ -40,7 +40,16 @@ def unpack_rows(packed: UInt32[Array, "B n"], like: _PerAction) -> _PerAction:
 
 
 def uniform(seeds: UInt32[Array, "B 2"], simulation: Int32[Array, "B"], level: Int32[Array, ""]) -> Float32[Array, "B"]:
-    """Uniform numbers in [0, 1) from a counter: 24 bits of a twice mixed hash of (seed, simulation, level)."""
+    """Uniform numbers in [0, 1) from a counter: 24 bits of a twice mixed hash of (seed, simulation, level).
+
+    Args:
+        seeds: of each row of the batch.
+        simulation: its number, in each row.
+        level: of the tree, the same in all rows.
+
+    Returns:
+        A number for each row; the same arguments give the same.
+    """
     # Odd constants: at one level every simulation has a counter of its own.
     counter = simulation.astype(jnp.uint32) * jnp.uint32(0x9E3779B9) + level.astype(jnp.uint32) * jnp.uint32(0x85EBCA77)
     # Mixed twice, with the other half of the seed in between: nearby counters give unrelated bits.

@@ -169,7 +169,16 @@ class Tree:
         return NodeValues.unpack(self.values[rows, node])
 
     def history(self, rows: Int32[Array, "B"], node: Int32[Array, "B"], pending_cost: Float32[Array, "B"]) -> History:
-        """The history of one node of each row, arrived at with this pending cost."""
+        """The history of one node of each row, arrived at with this pending cost.
+
+        Args:
+            rows: of the batch.
+            node: by its number in its row's tree.
+            pending_cost: paid by an action that leaves the unknown region.
+
+        Returns:
+            The history, leading dimension ``B``.
+        """
         return History(
             location=self.location[rows, node],
             state=self.state[rows, node],

@@ -75,7 +75,16 @@ class Model:
         return unpack_rows(self.packed[self.rows, action], self.tables.actions)
 
     def step(self, history: History, action: Int32[Array, "B"], success: Bool[Array, "B"]) -> History:
-        """The history of each row after an available action with the given outcome."""
+        """The history of each row after an available action with the given outcome.
+
+        Args:
+            history: before it.
+            action: by its number in the tables.
+            success: True where it succeeds.
+
+        Returns:
+            The history after it.
+        """
         return jax.vmap(step_row)(self.tables, self.action_rows(action), history, success)
 
 
