@@ -7,8 +7,7 @@
 Each stage of the recipe left an estimator. PO-TLP runs with each in the same test worlds, which choose nothing; the
 page says what share of the attainable savings it keeps, after how many minutes of collecting and fitting from nothing.
 In between the picture has the skill after each epoch, on the validation data of the stage: those differ between stages,
-so that only points of one stage can be compared. Of a recipe that was killed the runs that ended no step are not
-counted: its ``times.csv`` does not hold them. Rows are kept: the same command goes on where it was stopped.
+so that only points of one stage can be compared. Rows are kept: the same command goes on where it was stopped.
 """
 
 import argparse
@@ -31,7 +30,7 @@ from potlp_jax.errors import EvaluationError
 from potlp_jax.learning.estimator import named_estimator
 from potlp_jax.recipes.fitting import ESTIMATOR
 from potlp_jax.recipes.journal import TABLE
-from potlp_jax.recipes.recipe import TIMES
+from potlp_jax.recipes.times import TIMES, read_times
 from potlp_jax.sweep.rows import provenance
 from potlp_jax.view.style import new_figure, save_figure
 
@@ -68,7 +67,7 @@ def stages_of(recipe: Path) -> list[Stage]:
     file = recipe / TIMES
     if not file.is_file():
         raise EvaluationError(f"{recipe} has no {TIMES}: name the folder that `potlp fit --recipe NAME --out` wrote")
-    seconds = _seconds_of(file)
+    seconds = read_times(file)
     rounds = sorted(recipe.glob("round-*"), key=lambda folder: int(re.sub(r"\D", "", folder.name)))
     stages, before = [], 0.0
     for number, folder in enumerate([*rounds, recipe]):
@@ -79,16 +78,6 @@ def stages_of(recipe: Path) -> list[Stage]:
     if not stages:
         raise EvaluationError(f"{recipe} has no {ESTIMATOR}: let the recipe's first stage end")
     return stages
-
-
-def _seconds_of(file: Path) -> dict[tuple[int, str], float]:
-    """By stage and step. Of a recipe that was resumed a step that had ended has further lines, of nearly no time."""
-    found: dict[tuple[int, str], float] = {}
-    with file.open(newline="") as lines:
-        for stage, step, spent in csv.reader(lines):
-            key = (int(stage), step)
-            found[key] = max(found.get(key, 0.0), float(spent))
-    return found
 
 
 def measured(stage: Stage, environment: str, worlds: int, out: Path) -> dict[str, Any]:

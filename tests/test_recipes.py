@@ -24,7 +24,8 @@ from potlp_jax.learning.training import Trained
 from potlp_jax.recipes import recipe as recipes
 from potlp_jax.recipes.fitting import ESTIMATOR
 from potlp_jax.recipes.journal import Display
-from potlp_jax.recipes.recipe import PACKAGE, TIMES, _stages, follow, read_recipe
+from potlp_jax.recipes.recipe import PACKAGE, _stages, follow, read_recipe
+from potlp_jax.recipes.times import TIMES
 from potlp_jax.trials.config import trial_config_for
 
 SHIPPED = ("delivery", "firefighting", "firefighting-panorama", "parcels")

@@ -6,7 +6,6 @@ from eval.training_curve import Stage, draw, markdown, stages_of
 from potlp_jax.errors import EvaluationError
 
 TIMES = "0,training,60.0\n0,validation,30.0\n0,fit,120.0\n1,training,300.0\n1,fit,90.0\n"
-RESUMED = "0,training,1.0\n0,validation,0.5\n0,fit,2.0\n"
 
 
 @pytest.fixture
@@ -22,12 +21,6 @@ def recipe(tmp_path):
 
 def test_stages_count_from_nothing(recipe):
     assert stages_of(recipe) == [Stage(recipe / "round-0", 90.0, 210.0), Stage(recipe, 510.0, 600.0)]
-
-
-def test_runs_that_went_on_count_once(recipe):
-    before = stages_of(recipe)
-    (recipe / "times.csv").write_text(TIMES + RESUMED)
-    assert stages_of(recipe) == before
 
 
 def test_rounds_are_in_the_order_of_their_numbers(recipe):

@@ -13,10 +13,8 @@ rounds:                         # optional: PO-TLP drives with what was fitted, 
 
 import dataclasses
 import math
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,12 +32,10 @@ from potlp_jax.planning.policies import Policy
 from potlp_jax.recipes.collection import CollectConfig, Collected, collect, collection_of
 from potlp_jax.recipes.fitting import ESTIMATOR, FitConfig, fit
 from potlp_jax.recipes.journal import Display
+from potlp_jax.recipes.times import TIMES, Times
 
 PACKAGE: str = "potlp_jax.recipes"
 """Where the shipped recipes are, as package data."""
-
-TIMES: str = "times.csv"
-"""In the folder of a recipe that is followed: the stage, its step, and how many seconds a run spent on it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -203,7 +199,7 @@ def follow(
         recipe: what to make.
         out: gets ``training`` and ``validation``, the datasets, and what ``fit`` writes. With rounds these are of the
             last one, and ``round-0`` and so on in it hold those of the stages before. ``times.csv`` says how long each
-            step took; who resumes finds a line for each run that ended a step, and none for one that was killed.
+            step took, in all runs together.
         processes, cluster: where worlds are explored and driven through (``engine.opening.open_engine``).
         tell: called as worlds are explored.
         display: shows how the fits go.
@@ -214,6 +210,7 @@ def follow(
     # Each stage has a folder; that of the last one is ``out`` itself.
     folders = [*(out / f"round-{number}" for number in range(len(recipe.rounds))), out]
     records: list[Samples] = []
+    times = Times(out / TIMES)
     trained = None
     for number, (folder, stage) in enumerate(zip(folders, _stages(recipe, folders), strict=True)):
         # Let go of before the fit, which wants all cores and their memory.
@@ -221,7 +218,7 @@ def follow(
             for part in stage.parts:
                 config = dataclasses.replace(part.config, first_world=part.first)
                 into, told = folder / part.name, partial(tell, part.split)
-                with _timed(out, number, part.name):
+                with times.of(number, part.name):
                     generator = make(part.environment)
                     collect(generator, part.environment, part.split, part.worlds, into, config, engine, told)
         if stage.alone:
@@ -229,19 +226,10 @@ def follow(
         records += [read_dataset(folder / part.name) for part in stage.parts if part.split == Split.TRAINING]
         validation = read_dataset(folder / Split.VALIDATION.value)
         initial = folders[number - 1] / ESTIMATOR if number else None
-        with _timed(out, number, "fit"):
+        with times.of(number, "fit"):
             trained = fit(joined(records), validation, folder, stage.fit, display, initial)
     assert trained is not None
     return trained
-
-
-@contextmanager
-def _timed(out: Path, stage: int, step: str) -> Iterator[None]:
-    began = time.perf_counter()
-    yield
-    out.mkdir(parents=True, exist_ok=True)
-    with (out / TIMES).open("a", encoding="utf-8") as file:
-        file.write(f"{stage},{step},{time.perf_counter() - began:.1f}\n")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,6 +4,7 @@ from eval.mutants.mutant import Mutant
 
 PART = "resumption"
 
+_TIMES = "tests/test_recipe_times.py"
 _RECIPES = "tests/test_recipes.py"
 _ESTIMATORS = "tests/test_estimator.py"
 _SWEEPS = "tests/test_sweep.py"
@@ -53,5 +54,23 @@ MUTANTS = (
         "if False:",
         (_SWEEPS,),
         "reading_makes_no_store",
+    ),
+    Mutant(
+        PART,
+        "what earlier runs of a recipe spent is forgotten",
+        "potlp_jax/recipes/times.py",
+        "self._spent.get((stage, step), 0.0)",
+        "0.0",
+        (_TIMES,),
+        "earlier_runs",
+    ),
+    Mutant(
+        PART,
+        "a recipe's times are written at the end of a step alone",
+        "potlp_jax/recipes/times.py",
+        "keeping.start()",
+        "over.set(), keeping.start()",
+        (_TIMES,),
+        "killed",
     ),
 )
