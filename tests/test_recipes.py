@@ -55,7 +55,23 @@ def test_every_shipped_estimator_has_its_recipe():
     assert tuple(shipped_settings(PACKAGE)) == SHIPPED
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+def test_the_shipped_firefighting_estimator_goes_on_with_the_records_of_its_recipe():
+    recipe = read_recipe("firefighting")
+    estimator = read_estimator(shipped_files()["firefighting"])
+    sources = list(estimator.metadata["training_data"].values())
+    worlds = [("explorer", recipe.training_worlds)]
+    for part in recipe.rounds:
+        worlds += [("potlp", part.worlds), ("explorer", part.explored.worlds)]
+    assert [(source["driver"], source["worlds"]) for source in sources] == worlds
+    # From another file, in one pass; a recipe begins with new parameters.
+    assert estimator.metadata["initial"]
+    per_epoch = estimator.metadata["panoramas"] // recipe.fit.training.views_per_batch
+    assert estimator.metadata["training"]["steps"] == per_epoch
+    assert architecture_of(estimator.config).name == recipe.fit.network.kind
+    assert estimator.config.glances == recipe.collect.glances
+
+
+@pytest.mark.parametrize("name", [name for name in SHIPPED if name != "firefighting"])
 def test_a_shipped_recipe_is_what_made_the_shipped_file(name):
     recipe = read_recipe(name)
     world = make(recipe.environment).world(0, Split.TRAINING)
