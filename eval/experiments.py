@@ -31,10 +31,7 @@ class Experiment:
 
 _OTHERS = {"POTLP_EXTERNAL_DATA": "{data}"}
 
-_COLLECTED = (
-    "potlp collect firefighting --split validation --out {out} --set staying_sets=3 --set worlds_per_shard=20 "
-    "--set glances=false"
-)
+_COLLECTED = "potlp collect firefighting --split validation --out {out} --set staying_sets=3 --set worlds_per_shard=20"
 _DRIVEN = "--set driver=potlp --set estimator=firefighting --set drives=1 --set first_world=5000"
 _SHIPPED = "potlp_jax/learning/data/"
 
@@ -241,7 +238,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="scale",
         command="potlp collect firefighting --split training --worlds 10000 --out {out} --processes {processes} "
         "--set first_world=60000 --set spacing=[0,8] --set look_every=0 --set staying_sets=3 --set pursued=1 "
-        "--set worlds_per_shard=50 --set views_per_world=4 --set glances=false",
+        "--set worlds_per_shard=50 --set views_per_world=4",
     ),
     "scale-reading": Experiment(
         page="scale",
