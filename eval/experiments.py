@@ -186,7 +186,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "small-generator": Experiment(
         page="delivery",
         command="python -m eval.small_generator {all}/recipe-delivery --plans {data}/floorplans --out {out} "
-        "--processes {processes} --report docs/results/delivery/small_generator",
+        "--processes {processes} --report {out}/arms",
     ),
     "recipe-parcels": Experiment(
         page="delivery", command="potlp fit --recipe parcels --out {out} --processes {processes}"

@@ -1,12 +1,12 @@
-"""What larger buildings in training are good for: the delivery recipe's first stage without them.
+"""What campus buildings in training are good for: the delivery recipe's first stage without them.
 
     potlp fit --recipe delivery --out out/recipe --processes 2
-    python -m eval.small_generator out/recipe --plans PLANS --out out/small \
-        --report docs/results/delivery/small_generator
+    python -m eval.small_generator out/recipe --plans PLANS --out out/small --report out/small/arms
 
-The recipe's first stage learns from floors of 40 × 68 m at most, and from some larger buildings of other families
-beside them. Here the same network learns in as many passes from as many buildings, all of them the small floors.
-PO-TLP runs with both estimators in the same test worlds: generated floors, larger generated buildings, and real plans,
+The recipe's first stage learns from the floors of ``delivery``, 40 × 68 m at most, and from some campus buildings of
+the size and kind of real ones beside them. Here the same network learns in as many passes from as many buildings, all
+of them such floors.
+PO-TLP runs with both estimators in the same test worlds: generated floors, campus buildings, and real plans,
 for which ``PLANS`` is a folder of folders. Shares and their differences are paired by world, intervals clustered by
 building. The same command goes on where it was stopped. ``--report`` writes NAME.json.
 """
@@ -36,13 +36,13 @@ from potlp_jax.sweep.statistics import attainable_interval, attainable_share
 from potlp_jax.sweep.store import Row
 
 RECIPE = "delivery"
-LARGER, SMALL = "larger", "small"
-"""The arms: the recipe's first stage as it is, and without larger buildings."""
+CAMPUS, SMALL = "campus", "small"
+"""The arms: the recipe's first stage as it is, and without campus buildings."""
 
 _POTLP = (sys.executable, "-c", "from potlp_jax.cli import main; main()")
 
 
-def without_larger(recipe: Recipe) -> Recipe:
+def without_campus(recipe: Recipe) -> Recipe:
     """The first stage of a recipe, with further worlds of its own family in place of those beside them."""
     per_shard = recipe.collect.worlds_per_shard
     instead = sum(beside.worlds(recipe.training_worlds, per_shard) for beside in recipe.beside)
@@ -56,7 +56,7 @@ def fit_small(out: Path, processes: int) -> Path:
         file = out / "recipe.yaml"
         file.parent.mkdir(parents=True, exist_ok=True)
         # JSON is YAML.
-        file.write_text(json.dumps(json_copy(dataclasses.asdict(without_larger(read_recipe(RECIPE))))))
+        file.write_text(json.dumps(json_copy(dataclasses.asdict(without_campus(read_recipe(RECIPE))))))
         words = ("fit", "--recipe", str(file), "--out", str(folder), "--processes", str(processes))
         if subprocess.run([*_POTLP, *words], stdout=subprocess.DEVNULL, check=False).returncode:
             raise SystemExit(f"potlp {' '.join(words)} failed; what is finished is kept in {folder}")
@@ -85,7 +85,7 @@ def compare(environment: str, arms: Mapping[str, Sequence[Row]]) -> dict[str, An
         arms: the rows of each, in the same worlds.
 
     Returns:
-        ``worlds``, ``buildings``, ``mean_cost`` by policy and arm, ``share`` by arm and ``gain``, what larger buildings
+        ``worlds``, ``buildings``, ``mean_cost`` by policy and arm, ``share`` by arm and ``gain``, what campus buildings
         add to the share: each with the ends of its 95 % interval; and ``problems`` of the audit.
     """
     generator = make(environment)
@@ -97,7 +97,7 @@ def compare(environment: str, arms: Mapping[str, Sequence[Row]]) -> dict[str, An
         for arm, pairs in found.items()
         for policy in WITHOUT_ORACLE
     }
-    baseline, known = cost[LARGER, Policy.BASELINE], cost[LARGER, Policy.KNOWN_MAP]
+    baseline, known = cost[CAMPUS, Policy.BASELINE], cost[CAMPUS, Policy.KNOWN_MAP]
 
     def with_interval(ours: np.ndarray) -> list[float]:
         return [
@@ -112,7 +112,7 @@ def compare(environment: str, arms: Mapping[str, Sequence[Row]]) -> dict[str, An
         "buildings": len(set(clusters.tolist())),
         "mean_cost": {name: float(values.mean()) for name, values in means.items()},
         "share": {arm: with_interval(values) for arm, values in ours.items()},
-        "gain": with_interval(baseline - (ours[SMALL] - ours[LARGER])),
+        "gain": with_interval(baseline - (ours[SMALL] - ours[CAMPUS])),
         "audited": sum(len(rows) for rows in arms.values()),
         "problems": [problem for rows in arms.values() for problem in audit(rows, generator, Split.TEST)],
         "commits": sorted({row.commit for rows in arms.values() for row in rows}),
@@ -122,13 +122,13 @@ def compare(environment: str, arms: Mapping[str, Sequence[Row]]) -> dict[str, An
 def markdown(found: Mapping[str, Mapping[str, Any]]) -> str:
     """The table as it stands in docs/results."""
     lines = [
-        "| test worlds | number | known map | baseline | with larger buildings | small floors alone | larger buildings "
+        "| test worlds | number | known map | baseline | with campus buildings | small floors alone | campus buildings "
         "bring, points |",
         "|---|---|---|---|---|---|---|",
     ]
     for name, group in found.items():
         means = [f"{group['mean_cost'][policy]:.0f}" for policy in ("known-map", "baseline")]
-        shares = [_percent(group["share"][arm], "") + " %" for arm in (LARGER, SMALL)]
+        shares = [_percent(group["share"][arm], "") + " %" for arm in (CAMPUS, SMALL)]
         number = f"{group['worlds']} in {group['buildings']} buildings"
         lines.append(f"| {name} | {number} | {' | '.join(means + shares)} | {_percent(group['gain'], '+')} |")
     return "\n".join(lines)
@@ -149,10 +149,10 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--report", type=Path, metavar="NAME", help="without suffix: where the results go")
     options = parser.parse_args()
-    larger = options.recipe / "round-0" / ESTIMATOR
-    if not larger.is_file():
-        parser.error(f"{larger} is missing: name the folder that `potlp fit --recipe delivery --out` wrote")
-    estimators = {LARGER: larger, SMALL: fit_small(options.out, options.processes)}
+    campus = options.recipe / "round-0" / ESTIMATOR
+    if not campus.is_file():
+        parser.error(f"{campus} is missing: name the folder that `potlp fit --recipe delivery --out` wrote")
+    estimators = {CAMPUS: campus, SMALL: fit_small(options.out, options.processes)}
     beside = {one.environment: one.environment for one in read_recipe(RECIPE).beside}
     found = {}
     for name, environment in {**groups(options.plans), **beside}.items():

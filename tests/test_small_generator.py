@@ -1,4 +1,4 @@
-"""An estimator without larger buildings beside the recipe's own: as many buildings, and worlds paired."""
+"""An estimator without campus buildings beside the recipe's own: as many buildings, and worlds paired."""
 
 import dataclasses
 import json
@@ -8,7 +8,7 @@ import pytest
 
 from eval.delivery import WITHOUT_ORACLE
 from eval.savings import pairs_of
-from eval.small_generator import LARGER, SMALL, compare, markdown, without_larger
+from eval.small_generator import CAMPUS, SMALL, compare, markdown, without_campus
 from potlp_jax.codec import json_copy
 from potlp_jax.recipes.recipe import read_recipe
 from potlp_jax.sweep.store import Item, Row
@@ -24,9 +24,9 @@ def rows_of(world, known, ours, baseline):
     return [row(world, "known-map", known), row(world, "potlp", ours), row(world, "baseline", baseline)]
 
 
-def test_as_many_small_floors_stand_in_place_of_the_larger_buildings():
+def test_as_many_small_floors_stand_in_place_of_campus_buildings():
     recipe = read_recipe("delivery")
-    small = without_larger(recipe)
+    small = without_campus(recipe)
     assert recipe.beside
     assert (small.beside, small.rounds) == ((), ())
     # 2,400 floors, 240 buildings of a tenth and 120 of a twentieth.
@@ -36,7 +36,7 @@ def test_as_many_small_floors_stand_in_place_of_the_larger_buildings():
 
 def test_the_recipe_can_be_written_and_read(tmp_path):
     file = tmp_path / "recipe.yaml"
-    small = without_larger(read_recipe("delivery"))
+    small = without_campus(read_recipe("delivery"))
     file.write_text(json.dumps(json_copy(dataclasses.asdict(small))))
     assert read_recipe(file) == small
 
@@ -55,12 +55,12 @@ def test_pairs_have_every_policy_satisfied_and_reliable():
 
 def test_arms_are_compared_in_the_worlds_of_both(monkeypatch):
     monkeypatch.setattr("eval.small_generator.audit", lambda rows, generator, split: [])
-    larger = [*rows_of(0, 50.0, 60.0, 100.0), *rows_of(1, 50.0, 60.0, 100.0), *rows_of(2, 1.0, 9.0, 9.0)]
+    campus = [*rows_of(0, 50.0, 60.0, 100.0), *rows_of(1, 50.0, 60.0, 100.0), *rows_of(2, 1.0, 9.0, 9.0)]
     small = [*rows_of(0, 50.0, 80.0, 100.0), *rows_of(1, 50.0, 60.0, 100.0)]
-    found = compare("delivery", {LARGER: larger, SMALL: small})
+    found = compare("delivery", {CAMPUS: campus, SMALL: small})
     assert (found["worlds"], found["buildings"], found["audited"]) == (2, 2, 15)
     # Of 100 to be saved the one keeps 80, the other 60.
-    assert found["share"][LARGER] == pytest.approx([0.8, 0.8, 0.8])
+    assert found["share"][CAMPUS] == pytest.approx([0.8, 0.8, 0.8])
     assert found["share"][SMALL] == pytest.approx([0.6, 0.4, 0.8])
     assert found["gain"] == pytest.approx([0.2, 0.0, 0.4])
     assert np.isclose(found["mean_cost"][SMALL], 70.0)
