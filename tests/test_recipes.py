@@ -1,4 +1,4 @@
-"""Recipes: the shipped ones are what made the shipped estimators, and a small one makes an estimator."""
+"""Recipes: the shipped ones made the shipped estimators, or begin as one did, and a small one makes an estimator."""
 
 import dataclasses
 import json

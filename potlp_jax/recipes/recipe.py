@@ -1,4 +1,4 @@
-"""Recipes: everything that makes an estimator, in a file. The shipped estimators' recipes ship with them.
+"""Recipes: everything that makes an estimator, in a file. Some ship, one by the name of each shipped estimator.
 
 environment: firefighting
 training_worlds: 1300           # of the split training
