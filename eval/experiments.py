@@ -43,13 +43,10 @@ EXPERIMENTS: dict[str, Experiment] = {
         hours=0.5,
     ),
     # In little space, for what reads it beside other trials.
-    "table1-export": Experiment(
-        page="table1", command="potlp sweep export {all}/table1 --out {out}/rows.csv", hours=0.1
-    ),
+    "table1-export": Experiment(page="table1", command="potlp sweep export {all}/table1 --out {out}/rows.csv"),
     "table1-rows": Experiment(
         page="table1",
         command="python -m eval.compact_rows {all}/table1-export/rows.csv docs/results/table1/rows.csv.gz",
-        hours=0.1,
     ),
     # Its trials are compared with the rows of Table I, world by world.
     "observer": Experiment(page="table1", command="python -m eval.limit --out {out} --worlds 80 --arms ideal-observer"),
@@ -119,13 +116,10 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="python -m eval.table1 --estimator firefighting-panorama --out {out} --processes {processes} "
         "--report docs/results/panorama/test",
     ),
-    "panorama-export": Experiment(
-        page="panorama", command="potlp sweep export {all}/panorama --out {out}/rows.csv", hours=0.1
-    ),
+    "panorama-export": Experiment(page="panorama", command="potlp sweep export {all}/panorama --out {out}/rows.csv"),
     "panorama-rows": Experiment(
         page="panorama",
         command="python -m eval.compact_rows {all}/panorama-export/rows.csv docs/results/panorama/rows.csv.gz",
-        hours=0.1,
     ),
     "held-out-panorama": Experiment(
         page="panorama",

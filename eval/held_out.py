@@ -4,7 +4,8 @@
     python -m eval.held_out docs/results/panorama/rows.csv.gz --estimator firefighting-panorama --out out/panorama
 
 The formulas are ``HELD_OUT`` of the library, which no collection asks about. The costs of the trained tasks are read
-from a file of ``eval.compact_rows``; it has to be of the same estimator. The same command goes on where it was stopped.
+from a file of ``eval.compact_rows``; it has to be of the same estimator, and of trials
+that all ended satisfied, as those of Table I did. The same command goes on where it was stopped.
 ``--report`` writes NAME.json.
 """
 
@@ -67,8 +68,11 @@ def difference(
 
 
 def shared_worlds(costs: Costs, formulas: Iterable[str]) -> list[int]:
-    """The worlds in which every formula was run and satisfied by every policy."""
-    complete = [{world for (name, world), by in costs.items() if name == text and len(by) >= 3} for text in formulas]
+    """The worlds in which every formula has a cost of each of ``POLICIES``."""
+    wanted = set(POLICIES)
+    complete = [
+        {world for (name, world), by in costs.items() if name == text and wanted <= set(by)} for text in formulas
+    ]
     return sorted(set.intersection(*complete))
 
 

@@ -30,7 +30,8 @@ def test_a_world_that_was_drawn_twice_counts_twice():
 def test_worlds_are_those_that_all_formulas_have():
     assert shared_worlds(COSTS, ["F a", "F b"]) == [0, 1]
     assert shared_worlds(COSTS, ["F b"]) == [0, 1, 2]
-    incomplete = {**COSTS, ("F a", 2): {"known-map": 1.0, "baseline": 2.0}}
+    # As many policies, but not PO-TLP.
+    incomplete = {**COSTS, ("F a", 2): {"known-map": 1.0, "baseline": 2.0, "oracle": 1.0}}
     assert shared_worlds(incomplete, ["F a", "F b"]) == [0, 1]
 
 
