@@ -17,6 +17,7 @@ from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.loss import DataScale
 from potlp_jax.learning.map_images import encode_view, encode_world
 from potlp_jax.learning.painting import blank_painting, paint
+from potlp_jax.learning.panorama_learner import PanoramaOptions
 from potlp_jax.learning.training_options import TrainingConfig
 from potlp_jax.learning.training_steps import initial_state, make_train_step
 from potlp_jax.recipes.fitting import learner_after
@@ -170,7 +171,7 @@ def test_maps_are_painted_in_trials_as_in_the_training_data(samples, params, gla
     assert config.glances == glances
     other = dataclasses.replace(config, glances=not glances)
     begin = TrainedEstimator(params, other, metadata.domain, {}, "before", "0")
-    assert learner_after(begin, painted).config == config
+    assert learner_after(begin, painted, SIZES).config == config
     # And the estimator of a trial does as its configuration says: a door that it looks at from aside.
     world = _world(True)
     cell = jnp.array([5, 7], jnp.int32)
@@ -179,6 +180,16 @@ def test_maps_are_painted_in_trials_as_in_the_training_data(samples, params, gla
     seen = estimator.remember(render(world, cell, CAMERA), belief, cell).memory
     assert bool(belief.free[4, 10])
     assert bool(jnp.isfinite(seen.distance[4, 10])) == glances
+
+
+@pytest.mark.parametrize("own_within", [0, 2])
+def test_an_estimator_that_is_gone_on_from_has_the_paths_that_are_asked_for(samples, params, own_within):
+    before = dataclasses.replace(SIZES.learner(samples).config, own_within=2 - own_within)
+    begin = TrainedEstimator(params, before, samples.metadata.domain, {}, "before", "0")
+    asked = dataclasses.replace(SIZES, own_within=own_within)
+    assert learner_after(begin, samples, asked).config == asked.learner(samples).config
+    # Another kind of network has no such paths.
+    assert learner_after(begin, samples, PanoramaOptions()).config == before
 
 
 def _worlds():

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from potlp_jax.types import NO_SUBGOAL, Status
-from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals, frontier_cells
+from potlp_jax.world.frontiers import FrontierConfig, Subgoals, connected_parts, find_subgoals, frontier_cells
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy, make_world, pad_world
 from potlp_jax.world.sensing import SensorConfig, observe
 from tests.reference import frontiers as reference
@@ -90,6 +90,16 @@ def test_equals_the_reference(belief):
     cells, reachable, distance, config = belief
     found = find(belief_of(cells), jnp.asarray(reachable), jnp.asarray(distance), config)
     check_against_reference(found, cells, reachable, distance, config)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_parts_equal_those_of_flood_fill(seed):
+    cells = np.random.default_rng(seed).random((17, 25)) < 0.1 + 0.2 * seed
+    expected = np.zeros(cells.shape, int)
+    for part in reference.components(set(map(tuple, np.argwhere(cells).tolist()))):
+        row, column = min(part)
+        expected[tuple(np.array(sorted(part)).T)] = row * cells.shape[1] + column + 1
+    np.testing.assert_array_equal(jax.jit(connected_parts)(jnp.asarray(cells)), expected)
 
 
 def test_more_frontier_than_fits_one_block():

@@ -119,16 +119,15 @@ def left_part(cells: np.ndarray) -> np.ndarray:
 
 def beyond(cells: np.ndarray, letters: np.ndarray, seen: np.ndarray, places: list[tuple[int, int]]) -> Outlook:
     """The outlook from some places of a building that is imagined as it is; the hazard is avoided."""
-    scene, subgoals, stay = asked(cells, letters, seen, places)
-    return jax.jit(outlook)(scene, subgoals, stay)
+    return _outlook(*asked(cells, letters, seen, places))
 
 
-def asked(cells: np.ndarray, letters: np.ndarray, seen: np.ndarray, places: list[tuple[int, int]]):
+def asked(cells: np.ndarray, letters: np.ndarray, seen: np.ndarray, places: list[tuple[int, int]], own_within: int = 0):
     """What ``beyond`` asks."""
     belief = belief_of(np.where(seen, cells, BeliefMap.UNKNOWN), np.where(seen, letters, 0))
     _, imagined = true_squares(jnp.asarray(cells), jnp.asarray(letters), len(NAMES))
     stay = jnp.tile(jnp.array([[0, -1]], jnp.int8), (len(places), 1))
-    return scenery(belief, imagined), jnp.asarray(places, jnp.int32), stay
+    return scenery(belief, imagined, own_within), jnp.asarray(places, jnp.int32), stay
 
 
 @pytest.mark.parametrize("count", [0, 1, 16, 17, 20])
@@ -179,6 +178,63 @@ def test_a_way_does_not_come_back_by_its_own_frontier() -> None:
     seen = left_part(cells)
     found = beyond(cells, letters, seen, [(14, 9)])
     assert found.goal[0, 0, SEEN] == 0.0
+
+
+@pytest.mark.parametrize("gap", [6, 10, 30])
+def test_a_gap_is_open_from_both_sides(gap: int) -> None:
+    # One hallway, of which all was seen but a piece in its middle; the goal is at one of its ends.
+    cells = np.full((8, 64), BeliefMap.OCCUPIED, np.int8)
+    cells[2:6, 1:-1] = BeliefMap.FREE
+    first = 32 - gap // 2
+    seen = np.ones(cells.shape, bool)
+    seen[2:6, first : first + gap] = False
+    ends = [(3, first - 1), (3, first + gap)]
+    for goal, frontier in (((4, 60), 0), ((4, 3), 1)):
+        letters = np.zeros(cells.shape, np.int32)
+        letters[goal] = 1
+        assert float(beyond(cells, letters, seen, ends).goal[frontier, 0, SEEN]) == 1.0
+        # By their distance alone the frontiers of a small gap cannot be told apart.
+        within = _outlook(*asked(cells, letters, seen, ends, own_within=2))
+        assert float(within.goal[frontier, 0, SEEN]) == (gap >= 10)
+
+
+def test_a_frontier_beside_a_subgoals_own_is_not_reached_without_a_way() -> None:
+    # Two doors of a hallway into two rooms that only the hallway joins, four cells apart; the goal is in the hallway.
+    cells = np.full((20, 28), BeliefMap.OCCUPIED, np.int8)
+    cells[1:6, 1:-1] = cells[9:-1, 1:13] = cells[9:-1, 14:-1] = BeliefMap.FREE
+    cells[6:9, 9:12] = cells[6:9, 16:19] = BeliefMap.FREE
+    letters = np.zeros(cells.shape, np.int32)
+    letters[2, 2] = 1
+    seen = np.zeros(cells.shape, bool)
+    seen[:8] = True
+    doors = [(7, 10), (7, 17)]
+    assert np.asarray(beyond(cells, letters, seen, doors).goal[:, 0, SEEN]).tolist() == [0.0, 0.0]
+    # Where a doorway joins the rooms there is one.
+    cells[12:16, 13] = BeliefMap.FREE
+    assert np.asarray(beyond(cells, letters, seen, doors).goal[:, 0, SEEN]).tolist() == [1.0, 1.0]
+
+
+def test_a_long_frontier_is_its_own_however_far_it_goes() -> None:
+    # A hall of which one half was seen, so that its frontier is as long as the hall is wide.
+    cells = np.full((44, 24), BeliefMap.OCCUPIED, np.int8)
+    cells[1:-1, 1:-1] = BeliefMap.FREE
+    letters = np.zeros(cells.shape, np.int32)
+    letters[40, 4] = 1
+    seen = np.zeros(cells.shape, bool)
+    seen[:, :10] = True
+    ends = [(3, 9), (40, 9)]
+    assert np.asarray(beyond(cells, letters, seen, ends).goal[:, 0, SEEN]).tolist() == [0.0, 0.0]
+    within = _outlook(*asked(cells, letters, seen, ends, own_within=2))
+    assert float(within.goal[0, 0, SEEN]) == 1.0
+
+
+def test_a_subgoal_beside_the_frontier_has_the_frontier_that_it_is_near() -> None:
+    # As on a map of other cells.
+    cells, letters = house()
+    letters = np.zeros_like(letters)
+    letters[10, 3] = 1
+    found = beyond(cells, letters, left_part(cells), [(14, 9), (14, 8), (14, 7)])
+    assert np.asarray(found.goal[:, 0, SEEN]).tolist() == [0.0, 0.0, 0.0]
 
 
 def test_a_goal_before_a_wall_is_not_reached_from_behind_it() -> None:

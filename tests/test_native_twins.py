@@ -28,7 +28,7 @@ from potlp_jax.task.task import TaskSizes
 from potlp_jax.trials.config import trial_config_for
 from potlp_jax.types import NO_STATE
 from potlp_jax.world.camera import CameraConfig
-from potlp_jax.world.frontiers import FrontierConfig, find_subgoals
+from potlp_jax.world.frontiers import FrontierConfig, connected_parts, find_subgoals
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy
 from potlp_jax.world.renderer import obstacle_distances
 from potlp_jax.world.sensing import SensorConfig, observe, visible
@@ -213,6 +213,15 @@ def test_components_equal_those_grown_in_rounds(min_size):
         find = functools.partial(_components, config=FrontierConfig(max_subgoals=5, min_size=min_size))
         reachable = jnp.asarray(rng.random(cells.shape) < shares)
         _same(jax.vmap(find), jnp.asarray(cells), reachable, jnp.asarray(distances, jnp.float32))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.6, 1.0])
+def test_parts_equal_those_grown_in_rounds(share):
+    _needs("frontiers")
+    rng = np.random.default_rng(int(share * 10))
+    for shape in ((1, 1), (13, 29)):
+        cells = rng.random((8, *shape)) < share
+        _same(jax.vmap(connected_parts), jnp.asarray(cells))
 
 
 def _components(cells, reachable, distances, config):

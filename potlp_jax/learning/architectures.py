@@ -86,7 +86,7 @@ ARCHITECTURES: Mapping[str, Architecture] = MappingProxyType(
                 BuildingNetwork,
                 _building_operations,
                 _start_building,
-                before={"contrast": 0, "raw": 0, "glances": False},
+                before={"contrast": 0, "raw": 0, "glances": False, "own_within": 2},
             ),
         )
     }

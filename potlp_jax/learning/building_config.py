@@ -32,6 +32,9 @@ class BuildingConfig:
         exclusive_within: as in ``NetworkConfig``.
         glances: whether cells of which a part alone is in sight are painted, too, as in the training data
             (``learning.painting.paint``); networks of files that do not say it were trained without.
+        own_within: squares around a subgoal within which a path through what is imagined does not come out again: what
+            counts as the subgoal's own frontier; 0 for the connected part of the frontier that it is on. Networks of
+            files that do not say it were trained with 2.
         without: of ``ABLATABLE``, what the network is not shown; for measuring what each is good for, and for
             buildings of all sizes, among which a position says nothing.
     """
@@ -53,6 +56,7 @@ class BuildingConfig:
     step: float = 1.0
     exclusive_within: float = 0.0
     glances: bool = True
+    own_within: int = 0
     without: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -68,6 +72,8 @@ class BuildingConfig:
                 raise NetworkError(f"{name} is {getattr(self, name)}; give a positive number")
         if self.contrast < 0:
             raise NetworkError(f"contrast is {self.contrast}; give a number of channels, 0 for none")
+        if self.own_within < 0:
+            raise NetworkError(f"own_within is {self.own_within}; give a number of squares, 0 for its connected part")
         if self.raw < 0 or (self.raw and self.raw % 2 == 0):
             raise NetworkError(f"raw is {self.raw}; give an odd number of cells, 0 for none")
         for name in ("success_cost_scale", "failure_cost_scale", "step", "far", "fold"):

@@ -109,7 +109,7 @@ class BuildingEstimator:
         modulation = network.modulation(self.params, stay, go)
         places = network.places(self.params, encoded, subgoals.cells)
         imagined = jax.tree.map(jax.nn.sigmoid, encoded.squares)
-        beyond = outlook_of_classes(scenery(belief, imagined), subgoals, stay, task.class_mask)
+        beyond = outlook_of_classes(scenery(belief, imagined, self.config.own_within), subgoals, stay, task.class_mask)
 
         def ask(subgoal: Int32[Array, ""], found: Float32[Array, "3 S C"]) -> Float32[Array, "3 S C"]:
             seen = prospects(jax.tree.map(lambda array: array[subgoal], beyond), go)

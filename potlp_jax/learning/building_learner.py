@@ -111,7 +111,8 @@ class BuildingLearner:
         places = network.places(params, encoded, inputs.subgoals)
         asked = jnp.take_along_axis(places, inputs.subgoal_of[:, :, None], axis=1)
         imagined = jax.tree.map(jax.nn.sigmoid, encoded.squares)
-        beyond = prospects(_outlook_of_samples(belief, imagined, inputs, phi_stay), phi_go)
+        lanes = _outlook_of_samples(belief, imagined, inputs, phi_stay, self.config.own_within)
+        beyond = prospects(lanes, phi_go)
         answers = network.answer(params, asked, beyond, network.modulation(params, phi_stay, phi_go))
         loss = jax.vmap(_squares_loss, in_axes=(0, 0, 0, None))(
             encoded.squares, inputs.true_cells, inputs.true_letters, len(self.config.propositions)
@@ -143,6 +144,7 @@ class BuildingOptions:
     contrast: int = BuildingConfig.contrast
     raw: int = BuildingConfig.raw
     exclusive_within: float = BuildingConfig.exclusive_within
+    own_within: int = BuildingConfig.own_within
     without: tuple[str, ...] = BuildingConfig.without
 
     def learner(self, samples: Samples) -> BuildingLearner:
@@ -165,7 +167,7 @@ class BuildingOptions:
 
 
 def _outlook_of_samples(
-    belief: BeliefMap, imagined: Squares, inputs: BuildingInputs, phi_stay: Int8[Array, "G K P"]
+    belief: BeliefMap, imagined: Squares, inputs: BuildingInputs, phi_stay: Int8[Array, "G K P"], own_within: int
 ) -> Outlook:
     """The outlook of every sample, leading dimensions ``G K``; those that share a subgoal and ``phi_stay`` share it."""
 
@@ -173,7 +175,7 @@ def _outlook_of_samples(
         belief, imagined, inputs, stay = view
         cells = inputs.subgoals[inputs.subgoal_of[inputs.lanes]]
         asked = jnp.max(inputs.lane_of) + 1
-        lanes = outlook_of_first(asked, scenery(belief, imagined), cells, stay[inputs.lanes])
+        lanes = outlook_of_first(asked, scenery(belief, imagined, own_within), cells, stay[inputs.lanes])
         return jax.tree.map(lambda array: array[inputs.lane_of], lanes)
 
     # One view after the other: side by side all would be swept until the last one is done.

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float32, Int8, Int32
 
 from potlp_jax.learning.square_ways import INSIDE, SideWays, Ways, cheapest_ways, ways_into_squares, ways_to_sides
 from potlp_jax.learning.squares import PASSAGES, SIDES, SQUARE, Squares, in_squares
-from potlp_jax.world.frontiers import frontier_cells
+from potlp_jax.world.frontiers import connected_parts, frontier_cells
 from potlp_jax.world.grid import BeliefMap
 
 OF_WAY: int = 3
@@ -35,8 +35,8 @@ _IS_COST = (False, False, False, False, True, False, True)
 # From this share of cells on that nobody has seen, of those that are not known to be occupied, a square is a part of
 # what is not observed; with fewer a path through it would mostly cross what is.
 _HIDDEN = 0.6
-# Squares around a subgoal by which a path does not come back into what is observed: its own frontier.
-_OWN = 2
+# On a map of other cells the subgoal may lie this many cells beside the frontier: window, stride and edge for it.
+_NEAR = ((5, 5), (1, 1), "SAME")
 # Below this many obstacles a way is likely open.
 _OPEN = 0.5
 # A square as free as this can be walked in.
@@ -66,7 +66,9 @@ class Scenery:
         hidden: whether the square is a part of what is not observed.
         seen: whether a cell with each proposition was seen in it.
         open: whether a free cell was seen in it.
-        frontier: whether it has a cell of the frontier.
+        parts: the connected part of the frontier that each cell belongs to or lies near to (``connected_parts``).
+        lowest, highest: of the parts that have a cell in the square, 0 where it has no cell of the frontier.
+        own_within: how the frontier of a subgoal is told from others, as ``BuildingConfig`` has it.
         free: share of the unknown cells that are free, as imagined.
         holds: chance that an unknown cell with each proposition lies in it.
         passages, approach: as imagined.
@@ -76,19 +78,23 @@ class Scenery:
     hidden: Bool[Array, "*B rows columns"]
     seen: Bool[Array, "*B rows columns P"]
     open: Bool[Array, "*B rows columns"]
-    frontier: Bool[Array, "*B rows columns"]
+    parts: Int32[Array, "*B H W"]
+    lowest: Int32[Array, "*B rows columns"]
+    highest: Int32[Array, "*B rows columns"]
     free: Float32[Array, "*B rows columns"]
     holds: Float32[Array, "*B rows columns P"]
     passages: Float32[Array, "*B rows columns 6"]
     approach: Float32[Array, "*B rows columns P 4"]
+    own_within: int = struct.field(pytree_node=False, default=0)
 
 
-def scenery(belief: BeliefMap, imagined: Squares) -> Scenery:
+def scenery(belief: BeliefMap, imagined: Squares, own_within: int = 0) -> Scenery:
     """What is known of the squares of a belief, and what is imagined of the rest.
 
     Args:
         belief: one map.
         imagined: chances; of at least the map's squares, more are left out.
+        own_within: as ``BuildingConfig`` has it; static.
     """
     unseen, free = (in_squares(mask).sum(axis=(2, 3)).astype(jnp.float32) for mask in (belief.unknown, belief.free))
     rows, columns = unseen.shape
@@ -97,16 +103,23 @@ def scenery(belief: BeliefMap, imagined: Squares) -> Scenery:
     seen = jnp.any(in_squares(labelled & belief.free[:, :, None]), axis=(2, 3))
     # Of the square's free cells those that are not known to be free.
     rest = SQUARE * SQUARE * imagined.free - free
+    parts = connected_parts(frontier_cells(belief, belief.free))
+    inside = in_squares(parts)
+    highest = jnp.max(inside, axis=(2, 3))
+    lowest = jnp.min(jnp.where(inside > 0, inside, highest[:, :, None, None]), axis=(2, 3))
     return Scenery(
         unseen=unseen > 0,
         hidden=unseen > _HIDDEN * (unseen + free),
         seen=seen,
         open=free > 0,
-        frontier=jnp.any(in_squares(frontier_cells(belief, belief.free)), axis=(2, 3)),
+        parts=jnp.where(parts > 0, parts, jax.lax.reduce_window(parts, 0, jax.lax.max, *_NEAR)),
+        lowest=lowest,
+        highest=highest,
         free=jnp.clip(rest / jnp.maximum(unseen, 1.0), 0.0, 1.0),
         holds=jnp.where(seen | (unseen == 0)[:, :, None], 0.0, imagined.holds),
         passages=imagined.passages,
         approach=imagined.approach,
+        own_within=own_within,
     )
 
 
@@ -127,13 +140,14 @@ def outlook(scene: Scenery, subgoals: Int32[Array, "L 2"], stay: Int8[Array, "L 
     clear = jnp.prod(jnp.where(avoided, 1 - scene.holds[:, :, None], 1.0), axis=-1)
     barred = jnp.any(scene.seen[:, :, None] & avoided, axis=-1)
     away = _squares_away(scene, subgoals)
-    begins = (away == 0) | ((away == 1) & scene.frontier[:, :, None])
+    own, other = _frontiers_of(scene, subgoals, away)
+    begins = (away == 0) | ((away == 1) & own)
     start = ways_to_sides(jnp.where(begins, INSIDE + SQUARE * away.astype(jnp.float32), jnp.inf))
     passages = [scene.passages[:, :, number, None] for number in range(len(PASSAGES))]
     inside = scene.hidden[:, :, None]
     hidden = cheapest_ways(start, [jnp.where(inside, 1 - chance * clear, jnp.inf) for chance in passages])
     # Out by another frontier than the subgoal's own, and on through what is observed.
-    leaves = ways_to_sides(jnp.where((scene.open & scene.frontier)[:, :, None] & (away > _OWN), 0.0, jnp.inf))
+    leaves = ways_to_sides(jnp.where(scene.open[:, :, None] & other, 0.0, jnp.inf))
     out = jax.tree.map(jnp.add, hidden, leaves)
     inside = scene.open[:, :, None] & ~barred
     seen = ways_into_squares(cheapest_ways(out, [jnp.where(inside, 1 - chance, jnp.inf) for chance in passages]))
@@ -175,6 +189,20 @@ def _squares_away(scene: Scenery, subgoals: Int32[Array, "L 2"]) -> Int32[Array,
     down = jnp.abs(jnp.arange(rows, dtype=jnp.int32)[:, None, None] - row[None, None])
     across = jnp.abs(jnp.arange(columns, dtype=jnp.int32)[None, :, None] - column[None, None])
     return jnp.maximum(down, across)
+
+
+def _frontiers_of(
+    scene: Scenery, subgoals: Int32[Array, "L 2"], away: Int32[Array, "rows columns L"]
+) -> tuple[Bool[Array, "rows columns L"], Bool[Array, "rows columns L"]]:
+    """In which squares each subgoal's own frontier lies, and in which another one by which a path may come out."""
+    if scene.own_within:
+        frontier = (scene.highest > 0)[:, :, None] & (away >= 0)
+        return frontier, frontier & (away > scene.own_within)
+    part = scene.parts[subgoals[:, 0], subgoals[:, 1]][None, None]
+    lowest, highest = scene.lowest[:, :, None], scene.highest[:, :, None]
+    # In the subgoal's own square a path does not get anywhere yet.
+    other = (highest > 0) & ((lowest != part) | (highest != part)) & (away > 0)
+    return (lowest == part) | (highest == part), other
 
 
 def _of_way(scene: Scenery, clear: Float32[Array, "rows columns L"], arrived: Ways) -> Float32[Array, "*B of_way"]:

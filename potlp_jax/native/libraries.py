@@ -25,7 +25,7 @@ SWITCH: str = "POTLP_NATIVE"
 LIBRARIES: dict[str, tuple[str, ...]] = {
     "camera": ("obstacle_distances", "paint"),
     "distances": ("product_distances", "distance_table"),
-    "frontiers": ("find_components",),
+    "frontiers": ("find_components", "label_components"),
     "labels": ("true_labels",),
     "paths": ("shortest_path",),
     "search": ("best_first",),

@@ -88,7 +88,8 @@ def fit(
         config: what is fitted, and how.
         display: shows how it goes; of the first process alone.
         initial: an estimator to go on from, whose network is kept as it is, but for how its maps are painted, which is
-            as in the training data; a new one by default.
+            as in the training data, and how a subgoal's own frontier is told from others, which is as ``config`` has
+            it; a new one by default.
 
     Returns:
         The best parameters, which ``out`` / ``ESTIMATOR`` holds as well.
@@ -98,7 +99,7 @@ def fit(
         CheckpointError: ``out`` holds a damaged checkpoint, or one of another training.
     """
     begin = None if initial is None else read_estimator(initial)
-    learner = config.network.learner(training) if begin is None else learner_after(begin, training)
+    learner = config.network.learner(training) if begin is None else learner_after(begin, training, config.network)
     # Measuring counts: the time asked for is that of the whole command.
     began = time.perf_counter()
     plan = _plan(learner, training, out, config)
@@ -139,7 +140,7 @@ def _begin_journal(training: Samples, plan: TrainingConfig, out: Path, config: F
     return Journal(out, plan.steps, display)
 
 
-def learner_after(begin: TrainedEstimator, training: Samples) -> Learner:
+def learner_after(begin: TrainedEstimator, training: Samples, network: BuildingOptions | PanoramaOptions) -> Learner:
     """What is fitted where an estimator is gone on from."""
     known = begin.config
     require_propositions(known.propositions, training.metadata.propositions, begin.name, asker="the training data")
@@ -148,6 +149,9 @@ def learner_after(begin: TrainedEstimator, training: Samples) -> Learner:
     if isinstance(known, BuildingConfig):
         meant = training.metadata
         known = dataclasses.replace(known, glances=meant.glances, step=float(meant.resolution))
+        # What paths are counts as a choice and not as learned: an estimator of before goes on with those of now.
+        if isinstance(network, BuildingOptions):
+            known = dataclasses.replace(known, own_within=network.own_within)
     return learner_of(known)
 
 

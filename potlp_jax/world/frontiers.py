@@ -141,6 +141,31 @@ def find_subgoals(
     return by_platform("frontiers", *ways, frontier, distance)
 
 
+def connected_parts(cells: Bool[Array, "H W"]) -> Int32[Array, "H W"]:
+    """Which cells belong together: 8-connected components, told apart by their first cells.
+
+    Args:
+        cells: any cells, such as those of a frontier.
+
+    Returns:
+        For each of them the number of its component's first cell, counted row by row from 1; 0 for all others.
+    """
+    return by_platform("frontiers", _labelled_natively, _labelled_by_rounds, cells)
+
+
+def _labelled_natively(cells: Bool[Array, "H W"]) -> Int32[Array, "H W"]:
+    result = jax.ShapeDtypeStruct(cells.shape, jnp.int32)
+    return jax.ffi.ffi_call(target("label_components"), result, vmap_method="sequential")(cells)
+
+
+def _labelled_by_rounds(cells: Bool[Array, "H W"]) -> Int32[Array, "H W"]:
+    height, width = cells.shape
+    parent = _label(_listed(cells), width).parent[:-1].reshape(height + 2, width + 2)[1:-1, 1:-1]
+    # From cell numbers on the grid with its ring, which count from 0.
+    first = (parent // (width + 2) - 1) * width + parent % (width + 2)
+    return jnp.where(cells, first, 0)
+
+
 def _found_natively(frontier: Bool[Array, "H W"], distance: Float32[Array, "H W"], config: FrontierConfig) -> Subgoals:
     """In native code (``native/kernels/frontiers.cc``), one component after the other."""
     most = config.max_subgoals

@@ -103,7 +103,19 @@ ffi::Error FindComponents(ffi::Buffer<ffi::PRED> frontier, ffi::Buffer<ffi::F32>
   return ffi::Error::Success();
 }
 
+ffi::Error LabelComponents(ffi::Buffer<ffi::PRED> mask, ffi::ResultBuffer<ffi::S32> out_part) {
+  const int64_t height = mask.dimensions()[0], width = mask.dimensions()[1];
+  std::fill_n(out_part->typed_data(), height * width, 0);
+  for (const Component& component : Components(mask.typed_data(), height, width)) {
+    for (const int32_t cell : component.cells) out_part->typed_data()[cell] = component.cells.front() + 1;
+  }
+  return ffi::Error::Success();
+}
+
 }  // namespace
+
+XLA_FFI_DEFINE_HANDLER_SYMBOL(label_components, LabelComponents,
+                              ffi::Ffi::Bind().Arg<ffi::Buffer<ffi::PRED>>().Ret<ffi::Buffer<ffi::S32>>());
 
 XLA_FFI_DEFINE_HANDLER_SYMBOL(find_components, FindComponents,
                               ffi::Ffi::Bind()
