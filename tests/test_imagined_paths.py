@@ -199,18 +199,19 @@ def test_a_gap_is_open_from_both_sides(gap: int) -> None:
 
 
 def test_a_frontier_beside_a_subgoals_own_is_not_reached_without_a_way() -> None:
-    # Two doors of a hallway into two rooms that only the hallway joins, four cells apart; the goal is in the hallway.
-    cells = np.full((20, 28), BeliefMap.OCCUPIED, np.int8)
-    cells[1:6, 1:-1] = cells[9:-1, 1:13] = cells[9:-1, 14:-1] = BeliefMap.FREE
-    cells[6:9, 9:12] = cells[6:9, 16:19] = BeliefMap.FREE
+    # Two doors of a hallway into two rooms that only the hallway joins, of which one was looked into a little farther;
+    # the goal is in the hallway.
+    cells = np.full((24, 28), BeliefMap.OCCUPIED, np.int8)
+    cells[1:6, 1:-1] = cells[8:-1, 1:11] = cells[8:-1, 13:-1] = BeliefMap.FREE
+    cells[6:8, 8:11] = cells[6:8, 13:16] = BeliefMap.FREE
     letters = np.zeros(cells.shape, np.int32)
     letters[2, 2] = 1
     seen = np.zeros(cells.shape, bool)
-    seen[:8] = True
-    doors = [(7, 10), (7, 17)]
+    seen[:8] = seen[:10, 13:16] = True
+    doors = [(7, 9), (9, 14)]
     assert np.asarray(beyond(cells, letters, seen, doors).goal[:, 0, SEEN]).tolist() == [0.0, 0.0]
     # Where a doorway joins the rooms there is one.
-    cells[12:16, 13] = BeliefMap.FREE
+    cells[16:20, 11:13] = BeliefMap.FREE
     assert np.asarray(beyond(cells, letters, seen, doors).goal[:, 0, SEEN]).tolist() == [1.0, 1.0]
 
 

@@ -16,7 +16,8 @@ SUM = Mutant("a part", "a sum is a difference", "sums.py", "a + b", "a - b", ("t
 
 @pytest.fixture
 def tree(tmp_path):
-    """A tree with one function and its tests."""
+    """A tree with one function and its tests, which runs them quietly, as this one does."""
+    (tmp_path / "pyproject.toml").write_text('[tool.pytest.ini_options]\naddopts = "-q"\n')
     (tmp_path / "sums.py").write_text("def add(a, b):\n    return a + b  # a sum\n")
     (tmp_path / "tests").mkdir()
     (tmp_path / "tests" / "test_sums.py").write_text(

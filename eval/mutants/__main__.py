@@ -51,7 +51,8 @@ def stale(mutant: Mutant, root: Path = ROOT) -> str | None:
 
 def run_tests(folder: Path, mutant: Mutant) -> tuple[str, str]:
     """The verdict of a mutant's tests in a copy of the tree, and the first one that failed, or the time limit."""
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *mutant.tests]
+    # How many passed is read below, so it is no quieter than the tree has it.
+    command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", *mutant.tests]
     command += ["-k", mutant.only] if mutant.only else []
     # The copy is what is imported, whatever is installed.
     environment = os.environ | {

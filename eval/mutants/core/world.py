@@ -64,6 +64,15 @@ MUTANTS = (
     ),
     Mutant(
         PART,
+        "a connected part is numbered by a cell of the next row",
+        _FRONTIERS,
+        "first = (parent // (width + 2) - 1) * width",
+        "first = (parent // (width + 2)) * width",
+        ("tests/test_frontiers.py",),
+        "flood_fill",
+    ),
+    Mutant(
+        PART,
         "a component of the least size counts as a sliver",
         _FRONTIERS,
         "kept = is_root & ((size[:-1] >= config.min_size) | ~some_large)",
