@@ -122,7 +122,7 @@ def test_estimates_are_the_networks_answers_and_padding_cannot_succeed(params, f
         places = NETWORK.places(params, encoded, subgoals.cells)
         stay, go = phi[:, 0], phi[:, 1]
         # Each pair by itself, where the estimator solves what pairs share once.
-        scene = scenery(belief, jax.tree.map(jax.nn.sigmoid, encoded.squares))
+        scene = scenery(belief, jax.tree.map(jax.nn.sigmoid, encoded.squares), CONFIG.own_within)
         beyond = jax.lax.map(
             lambda cell: prospects(outlook(scene, jnp.tile(cell, (len(stay), 1)), stay), go), subgoals.cells
         )

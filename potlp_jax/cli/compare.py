@@ -127,10 +127,10 @@ def compare_policies(
 def _default_policy(
     generator: "Generator", split: "Split", world: int, changes: Mapping[str, Any], estimator: str | None
 ) -> str:
-    from potlp_jax.cli.inputs import default_policy, make_world, read_estimator, trial_config
+    from potlp_jax.cli.inputs import default_policy_with_note, make_world, read_estimator, trial_config
 
     made = make_world(generator, split, world)
-    return default_policy(made, trial_config(changes, generator), read_estimator(estimator)).value
+    return default_policy_with_note(made, trial_config(changes, generator), read_estimator(estimator)).value
 
 
 def _run(specification: "Specification", folder: Path, processes: int) -> "Results":

@@ -41,7 +41,9 @@ def record_file(trial: Path) -> Path:
     return trial / RECORD if trial.is_dir() else trial
 
 
-def default_policy(world: World, config: TrialConfig, given: TrainedEstimator | Estimator | None = None) -> Policy:
+def default_policy_with_note(
+    world: World, config: TrialConfig, given: TrainedEstimator | Estimator | None = None
+) -> Policy:
     """PO-TLP where an estimator is given or shipped for such worlds, otherwise the baseline, with a note."""
     policy = run.default_policy(world, config, given)
     if policy is not Policy.POTLP:

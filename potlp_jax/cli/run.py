@@ -74,7 +74,7 @@ def run_one(
     """Run one trial: one world, one task, one policy."""
     from potlp_jax.cli.doubts import of_worlds, warn_of_doubts
     from potlp_jax.cli.inputs import (
-        default_policy,
+        default_policy_with_note,
         make_world,
         read_estimator,
         read_split,
@@ -95,7 +95,7 @@ def run_one(
     made = make_world(generator, chosen_split, world)
     warn_of_doubts(asked, of_worlds(f"world {world} of {generator.name}/{chosen_split}", [made]))
     config = trial_config(setting_changes(simulations=simulations, search=search, camera=camera), generator)
-    chosen_policy = default_policy(made, config, trained) if named is None else named
+    chosen_policy = default_policy_with_note(made, config, trained) if named is None else named
     folder = None if out is None else make_folder(out)
     with progress_bar() as progress:
         # How many decisions a trial takes is not known before it ends.

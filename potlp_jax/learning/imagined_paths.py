@@ -85,10 +85,10 @@ class Scenery:
     holds: Float32[Array, "*B rows columns P"]
     passages: Float32[Array, "*B rows columns 6"]
     approach: Float32[Array, "*B rows columns P 4"]
-    own_within: int = struct.field(pytree_node=False, default=0)
+    own_within: int = struct.field(pytree_node=False)
 
 
-def scenery(belief: BeliefMap, imagined: Squares, own_within: int = 0) -> Scenery:
+def scenery(belief: BeliefMap, imagined: Squares, own_within: int) -> Scenery:
     """What is known of the squares of a belief, and what is imagined of the rest.
 
     Args:
