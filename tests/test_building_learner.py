@@ -20,7 +20,8 @@ from potlp_jax.learning.painting import blank_painting, paint
 from potlp_jax.learning.panorama_learner import PanoramaOptions
 from potlp_jax.learning.training_options import TrainingConfig
 from potlp_jax.learning.training_steps import initial_state, make_train_step
-from potlp_jax.recipes.fitting import learner_after
+from potlp_jax.recipes.fitting import _tell_of_changes, learner_after
+from potlp_jax.recipes.journal import Display
 from potlp_jax.task.task import Task
 from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
@@ -187,7 +188,10 @@ def test_an_estimator_that_is_gone_on_from_has_the_paths_that_are_asked_for(samp
     before = dataclasses.replace(SIZES.learner(samples).config, own_within=2 - own_within)
     begin = TrainedEstimator(params, before, samples.metadata.domain, {}, "before", "0")
     asked = dataclasses.replace(SIZES, own_within=own_within)
-    assert learner_after(begin, samples, asked).config == asked.learner(samples).config
+    learner, lines = learner_after(begin, samples, asked), []
+    assert learner.config == asked.learner(samples).config
+    _tell_of_changes(begin, learner, Display(say=lines.append))
+    assert lines == [f"own_within is {own_within}; before has {2 - own_within}"]
     # Another kind of network has no such paths.
     assert learner_after(begin, samples, PanoramaOptions()).config == before
 

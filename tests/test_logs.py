@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from flax import struct
 from typer.testing import CliRunner
 
 from potlp_jax.cli import app
@@ -33,6 +34,7 @@ from potlp_jax.logs.transforms import Transforms, headings, quaternion_of
 from potlp_jax.logs.working_grid import GridConfig
 from potlp_jax.logs.writing import BagFormat
 from potlp_jax.planning.distances.paths import KnownPath
+from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.policies import Policy
 from potlp_jax.task.task import Task
 from potlp_jax.trials.loop import run_trial
@@ -60,6 +62,25 @@ from tests.reference.tour import (
 )
 
 TASK = Task.shipped("toy-2")
+
+
+@struct.dataclass
+class Looks:
+    """An estimator of one's own that remembers panoramas: P_S is a hundredth of how many it was shown."""
+
+    memory: jax.Array
+
+    def encode(self, panorama):
+        return jnp.float32(panorama.shape[0] > 0)
+
+    def remember(self, seen, belief, cell):
+        return dataclasses.replace(self, memory=self.memory + seen)
+
+    def __call__(self, belief, subgoals, task):
+        shape = (subgoals.mask.shape[0], task.class_mask.shape[0])
+        chance = jnp.where(task.class_mask[None, :], self.memory / 100, 0.0)
+        cost = jnp.full(shape, 10.0)
+        return Estimates(success_probability=jnp.broadcast_to(chance, shape), success_cost=cost, failure_cost=cost)
 
 
 @pytest.fixture(scope="module")
@@ -446,6 +467,18 @@ def tour_step(robot):
     seen = first_seen_along(WORLD, tour())
     visits = [step for step, entered in enumerate(tour()) if entered == cell]
     return next(step for step in visits if np.count_nonzero((seen != NEVER_SEEN) & (seen <= step)) == known)
+
+
+def test_an_estimator_of_ones_own_is_shown_the_pictures_of_the_log(bags, tmp_path):
+    drive = drive_of(bags / "tour.bag", places_of(bags))
+    found, _ = replay(drive, TASK, Policy.POTLP, jax.random.key(0), NEAR, Looks(memory=jnp.float32(0)))
+    shown = [[one.success_probability for one in each.actions if one.subgoal is not None] for each in found.decisions]
+    assert sum(map(bool, shown)) > 2
+    # One picture more at every decision.
+    assert all(chances == pytest.approx([number / 100] * len(chances)) for number, chances in enumerate(shown, start=1))
+    blind = dataclasses.replace(drive, pictures={})
+    with pytest.raises(LogError, match="has no panorama"):
+        replay(blind, TASK, Policy.POTLP, jax.random.key(0), NEAR, Looks(memory=jnp.float32(0)))
 
 
 def test_a_task_over_other_names_than_the_labels_is_refused(bags):

@@ -69,6 +69,7 @@ def test_the_shipped_firefighting_estimator_goes_on_with_the_records_of_its_reci
     assert estimator.metadata["training"]["steps"] == per_epoch
     assert architecture_of(estimator.config).name == recipe.fit.network.kind
     assert estimator.config.glances == recipe.collect.glances
+    assert estimator.config.own_within == recipe.fit.network.own_within
 
 
 @pytest.mark.parametrize("name", [name for name in SHIPPED if name != "firefighting"])
@@ -327,7 +328,7 @@ def test_the_commands_collect_and_fit_by_a_recipe(tmp_path):
         (("fit", "data", "--validation", "other", "--processes", "2"), "a fit of a DATASET uses all cores by itself"),
         (
             ("fit", "data", "--validation", "other", "--initial", "mine.npz", "--set", "network.fovea=2"),
-            "--initial keeps the network of its estimator as it is: leave out --set network",
+            "--initial keeps the network of its estimator as it is, but for own_within: leave out --set network",
         ),
         (("fit", "--recipe", "soup"), "neither a file nor one of those that are shipped"),
     ],

@@ -94,8 +94,9 @@ def fit(
         fail("give a DATASET and --validation, or a recipe with --recipe")
     if initial is not None and not datasets:
         fail("--initial goes on from an estimator with a DATASET; a recipe makes one from nothing")
-    if initial is not None and any(word.startswith("network") for word in settings or []):
-        fail("--initial keeps the network of its estimator as it is: leave out --set network")
+    network = [word for word in settings or [] if word.startswith("network")]
+    if initial is not None and any(not word.startswith("network.own_within=") for word in network):
+        fail("--initial keeps the network of its estimator as it is, but for own_within: leave out --set network")
     if datasets and processes > 1:
         fail(
             "--processes is for collecting, as a recipe does: a fit of a DATASET uses all cores by itself; leave it out"

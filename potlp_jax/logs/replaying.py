@@ -12,6 +12,7 @@ from jaxtyping import Array, Int32, PRNGKeyArray, UInt8
 from potlp_jax.errors import LogError
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import TrainedEstimator
+from potlp_jax.learning.observing import ObservingEstimator
 from potlp_jax.logs.drive import Drive, PanoramaReader
 from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.planning.estimates import Estimator
@@ -149,7 +150,7 @@ def replay(
     here = Domain.of_world(drive.world, config.camera)
     asked = estimator_of(policy, task.propositions, here, estimator)
     reader = None
-    if isinstance(asked, TrainedEstimator):
+    if isinstance(asked, TrainedEstimator | ObservingEstimator):
         drive = from_first_picture(drive, config.camera)
         reader = PanoramaReader(drive, config.camera)
     run = drive_robot(

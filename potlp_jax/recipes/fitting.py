@@ -100,6 +100,7 @@ def fit(
     """
     begin = None if initial is None else read_estimator(initial)
     learner = config.network.learner(training) if begin is None else learner_after(begin, training, config.network)
+    _tell_of_changes(begin, learner, display)
     # Measuring counts: the time asked for is that of the whole command.
     began = time.perf_counter()
     plan = _plan(learner, training, out, config)
@@ -153,6 +154,16 @@ def learner_after(begin: TrainedEstimator, training: Samples, network: BuildingO
         if isinstance(network, BuildingOptions):
             known = dataclasses.replace(known, own_within=network.own_within)
     return learner_of(known)
+
+
+def _tell_of_changes(begin: TrainedEstimator | None, learner: Learner, display: Display) -> None:
+    """Say where what is fitted is not what an estimator that is gone on from was."""
+    if begin is None or not is_first():
+        return
+    for name in ("own_within", "glances", "step"):
+        before, now = (getattr(config, name, None) for config in (begin.config, learner.config))
+        if before != now:
+            display.say(f"{name} is {now}; {begin.name} has {before}")
 
 
 def _plan(learner: Learner, training: Samples, out: Path, config: FitConfig) -> TrainingConfig:
