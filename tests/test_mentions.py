@@ -39,6 +39,7 @@ MADE = {
     "changes.md": "docs/site_hooks.py",
     "api/index.md": "docs/site_hooks.py",
     "notebooks/1_first_plan.md": "docs/site_hooks.py",
+    "notebooks/3_train_an_estimator.md": "docs/site_hooks.py",
     "regret.md": "eval/bench/regret_report.py",
     "faults.md": "eval/faults/__main__.py",
     "X.md": "eval/bench/throughput.py",
