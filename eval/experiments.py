@@ -167,7 +167,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "curve-firefighting": Experiment(
         page="estimator",
         command="python -m eval.training_curve {all}/recipe-firefighting --environment firefighting --worlds 60 "
-        "--out {out} --report {out}/curve",
+        "--out {out} --report docs/results/estimator/curve",
     ),
     "recipe-delivery": Experiment(
         page="delivery", command="potlp fit --recipe delivery --out {out} --processes {processes}"

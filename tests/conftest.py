@@ -9,6 +9,7 @@ import ctypes
 import functools
 import gc
 import importlib.metadata
+import logging
 import os
 import shutil
 import tempfile
@@ -146,6 +147,15 @@ def pytest_runtest_teardown() -> None:
     if _resident() > min(max(_MOST_RESIDENT, _kept + _ROOM), _LIMIT):
         _forget_programs()
         _kept = _resident()
+
+
+@pytest.fixture(autouse=True)
+def as_much_is_logged_as_before() -> Iterator[None]:
+    """A command that is run within the process may be told to be quiet; the next test is not."""
+    package = logging.getLogger("potlp_jax")
+    level = package.level
+    yield
+    package.setLevel(level)
 
 
 @pytest.fixture(scope="module", autouse=True)
