@@ -150,6 +150,16 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="python -m eval.limit.worst {all}/delivery/generated --out {out} --trials 10 --buildings 8 "
         "--report docs/results/delivery/worst",
     ),
+    "worst-office": Experiment(
+        page="delivery",
+        command="python -m eval.limit.worst {all}/delivery/office --out {out} --trials 10 --buildings 8 "
+        "--report docs/results/delivery/worst_office",
+    ),
+    "worst-school": Experiment(
+        page="delivery",
+        command="python -m eval.limit.worst {all}/delivery/school --out {out} --trials 10 --buildings 8 "
+        "--report docs/results/delivery/worst_school",
+    ),
     "real-maps": Experiment(
         page="delivery",
         command="python -m eval.real_maps --out {out} --maps {data}/maps --worlds 50 --processes {processes} "
@@ -180,7 +190,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "small-generator": Experiment(
         page="delivery",
         command="python -m eval.small_generator {all}/recipe-delivery --plans {data}/floorplans --out {out} "
-        "--processes {processes} --report {out}/arms",
+        "--processes {processes} --report docs/results/delivery/small_generator",
     ),
     "recipe-parcels": Experiment(
         page="delivery", command="potlp fit --recipe parcels --out {out} --processes {processes}"

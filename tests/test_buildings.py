@@ -35,7 +35,8 @@ levels:
     - [1, 2, {}]
     - [2, 3, {}]
     - [3, 0, {}]
-    - [4, 7, {}]
+    - [4, 5, {}]
+    - [6, 7, {}]
     doors:
     - [5, 6, {name: [1, middle], type: [1, DOOR]}]
     floors:
@@ -43,7 +44,7 @@ levels:
     lanes:
     - [8, 9, {}]
 """
-"""Two rooms of 5 m by 5 m, 20 pixels a metre, and a door of 1 m in the wall between them."""
+"""Two rooms of 5 m by 5 m, 20 pixels a metre, and a door of 1 m in the wall between them, which ends at its posts."""
 
 
 @pytest.fixture
@@ -73,6 +74,22 @@ def test_doors_of_an_unknown_type_are_closed(office):
     with pytest.warns(MapWarning, match="closed: 'middle'"):
         read = load_building(office)
     assert [round(part.area) for part in clean_map(read).cut_off] == pytest.approx([23], abs=3)
+
+
+def test_walls_may_go_through_the_doors_that_open(office):
+    office.write_text(TWO_ROOMS.replace("DOOR", "hinged").replace("    doors:", "    - [4, 7, {}]\n    doors:"))
+    assert clean_map(load_building(office)).cut_off == ()
+
+
+def test_a_closed_door_lets_no_outside_in(office):
+    """Without floors, what walls and doors enclose is inside."""
+    outer = (
+        TWO_ROOMS.replace("DOOR", "bricked").replace("    - [0, 1, {}]\n", "").replace("[5, 6, {name", "[0, 1, {name")
+    )
+    office.write_text(outer[: outer.index("    floors:")])
+    with pytest.warns(MapWarning, match="closed: 'middle'"):
+        read = load_building(office)
+    assert read.free.sum() * read.frame.resolution**2 == pytest.approx(50, rel=0.1)
 
 
 def test_metres_and_levels_without_floors(office):
@@ -115,6 +132,47 @@ def test_levels_are_named(office, tmp_path):
     plan.write_text(gazebo([]))
     with pytest.raises(MapError, match=r"only a building\.yaml of Open-RMF has levels"):
         load_building(plan, "L1")
+
+
+def outer_walls(width, height):
+    return [box(0, 0, width), box(0, height, width), box(0, 0, height, HALF_PI), box(width, 0, height, HALF_PI)]
+
+
+@pytest.mark.parametrize("rooms", [1, 3, 4])
+def test_rooms_at_a_closed_outer_wall_are_inside(tmp_path, rooms):
+    """Rooms of 6 m by 5 m in a row, with doors of 1 m between them."""
+    between = [
+        wall for room in range(1, rooms) for wall in (box(6 * room, 0, 2, HALF_PI), box(6 * room, 3, 2, HALF_PI))
+    ]
+    file = tmp_path / "row.world"
+    file.write_text(gazebo([*outer_walls(6 * rooms, 5), *between]))
+    read = load_building(file)
+    assert read.closed_gaps == 0
+    assert clean_map(read).cut_off == ()
+    assert read.free.sum() * read.frame.resolution**2 == pytest.approx(30 * rooms, rel=0.08)
+
+
+def test_degrees_and_models_within_models_are_read(tmp_path):
+    turned = gazebo([*outer_walls(12, 5), box(6, 0, 2, HALF_PI), box(6, 3, 2, HALF_PI)], "3 -2 0 0 0 0.5")
+    inner = "".join([box(0, 0, 2, HALF_PI), box(0, 3, 2, HALF_PI)])
+    nested = (
+        gazebo(outer_walls(12, 5), "3 -2 0 0 0 28.64788975654116")
+        .replace("<pose>3 -2", "<pose degrees='true'>3 -2")
+        .replace("</model>", f"<model name='n'><pose>6 0 0 0 0 0</pose>{inner}</model></model>")
+    )
+    files = tmp_path / "turned.world", tmp_path / "nested.world"
+    for file, text in zip(files, (turned, nested), strict=True):
+        file.write_text(text)
+    expected, found = (load_building(file) for file in files)
+    np.testing.assert_array_equal(found.occupied, expected.occupied)
+    np.testing.assert_array_equal(found.free, expected.free)
+
+
+def test_included_files_are_said_to_be_left_out(tmp_path):
+    file = tmp_path / "floor.world"
+    file.write_text(gazebo([*leaking(), "<include><uri>model://table</uri></include>"]))
+    with pytest.warns(MapWarning, match="1 included files are left out"):
+        load_building(file)
 
 
 def box(x, y, length, yaw=0.0, height=2.5, thickness=0.1, roll=0.0):
@@ -170,6 +228,10 @@ def test_boxes_that_are_in_nobodys_way_are_no_walls(tmp_path):
         ("<!DOCTYPE a [<!ENTITY b 'c'>]><sdf>&b;</sdf>", "declares entities"),
         (gazebo([box(0, 0, 2).replace("<size>2", "<size>two")]), "must be 3 numbers"),
         (gazebo([box(0, 0, 2).replace("<pose>0 0", "<pose relative_to='x'>0 0")]), "relative to a frame by name"),
+        (
+            gazebo([box(0, 0, 2).replace("<pose>0 0", "<pose rotation_format='quat_xyzw'>0 0")]),
+            "'quat_xyzw' is not read",
+        ),
         ("<sdf", "valid XML"),
     ],
 )
@@ -195,6 +257,25 @@ def test_large_buildings_have_larger_pixels():
     assert frame.resolution == 0.1
     with pytest.raises(MapError, match="check the scale"):
         frame_around(Path("plan"), [(0, 0), (1e6, 1e6)])
+
+
+def test_every_level_has_labels_of_its_own(office):
+    text = office.read_text()
+    office.write_text(text + text[text.index("  L1:") :].replace("  L1:", "  L2:", 1).replace("pantry", "lab"))
+    label = ["map", "label", str(office), "--level", "L1", "--named", "pantry"]
+    labelled = CliRunner().invoke(app, label)
+    assert labelled.exit_code == 0, labelled.stderr
+    assert office.with_suffix(".L1.places.yaml").is_file()
+    assert make(f"map:{office},level=L1").propositions == ("pantry",)
+    assert make(f"map:{office},level=L2").propositions == ("lab", "desk")
+
+
+def test_labels_of_no_level_are_said_not_to_be_read(office):
+    labelled = CliRunner().invoke(app, ["map", "label", str(office), "--named", "pantry"])
+    assert labelled.exit_code == 0, labelled.stderr
+    assert make(f"map:{office}").propositions == ("pantry",)
+    with pytest.warns(MapWarning, match="belongs to no level and is not read"):
+        assert make(f"map:{office},level=L1").propositions == ("pantry", "desk")
 
 
 def test_every_command_takes_every_format(office, tmp_path):

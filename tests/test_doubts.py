@@ -82,6 +82,15 @@ def test_a_name_that_is_not_the_automatons_formula_is_not_explained():
     assert structure_of(Task.from_hoa(lied)) is None
 
 
+def test_a_name_about_other_places_is_not_explained():
+    """Spot drops a proposition that the language does not depend on, and keeps the formula as the name."""
+    text = Task.from_formula("F goal").to_hoa().replace('name: "F goal"', 'name: "F goal | F (goal & cellar)"')
+    task = Task.from_hoa(text)
+    assert task.text == "F goal | F (goal & cellar)"
+    assert structure_of(task) is None
+    assert not find_doubts(task, propositions_given=True)
+
+
 def test_surroundings_are_what_free_cells_of_the_worlds_hold():
     toy = make("toy")
     worlds = [toy.world(number) for number in range(3)]

@@ -2,15 +2,18 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import Outcome
 from potlp_jax.trials.rules import OUTCOMES, RUNNING, Knowledge, Stop, arrive, budget, first_tally
-from potlp_jax.world.grid import BeliefMap, belief_from_numpy
+from potlp_jax.world.grid import BeliefMap, belief_from_numpy, make_world
 
 PROPOSITIONS = ("goal", "hazard")
 TASK = Task.from_formula("!hazard U goal", PROPOSITIONS)
@@ -61,6 +64,51 @@ def test_a_frontier_without_anything_unobserved_beside_it_has_nothing_to_show():
     assert _due(closed, closed)
     # Elsewhere the robot goes for what is known.
     assert not _due(closed, closed, is_frontier=False)
+
+
+def test_where_the_horizon_cuts_the_way_the_robot_goes_on_as_if_it_did_not():
+    """A hallway to and fro, one cell wide: the way back from its end is longer than the horizon."""
+    occupied = np.ones((14, 15), bool)
+    occupied[1:-1:2, 1:-1] = False
+    for turn, row in enumerate(range(2, 12, 2)):
+        occupied[row, 13 if turn % 2 else 1] = False
+    letters = np.zeros((14, 15), np.int32)
+    letters[1, 13] = 1
+    world = make_world(occupied, letters, (11, 1), propositions=("goal",))
+    task, horizon = world.task("F goal"), 5
+    whole, cut = (
+        run_trial(
+            world, task, "baseline", jax.random.key(0), TrialConfig(decision=DecisionConfig(path_horizon=longest))
+        )
+        for longest in (None, horizon)
+    )
+    np.testing.assert_array_equal(cut.path, whole.path)
+    assert len(cut.decisions) > len(whole.decisions)
+    assert len(cut.decisions) <= len(whole.decisions) + len(cut.path) // horizon
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("dead_end_factor", 0.0),
+        ("dead_end_factor", float("inf")),
+        ("commitment", -0.1),
+        ("commitment", float("nan")),
+        ("path_horizon", 0),
+    ],
+)
+def test_settings_of_decisions_that_make_no_sense_are_named(name, value):
+    with pytest.raises(ValueError, match=f"{name} is "):
+        DecisionConfig(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("budget_factor", 0.0), ("budget_factor", float("nan")), ("replan_distance", -1.0), ("panoramas", 0)],
+)
+def test_settings_of_trials_that_make_no_sense_are_named(name, value):
+    with pytest.raises(ValueError, match=f"{name} is "):
+        TrialConfig(**{name: value})
 
 
 def test_the_budget_ends_a_leg():

@@ -88,7 +88,7 @@ def test_where_all_chances_are_small_none_is_left_out():
 
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])
 def test_what_is_no_share_is_named(share):
-    with pytest.raises(ValueError, match=r"least_chance is .*, must lie between 0 and 1"):
+    with pytest.raises(ValueError, match=r"least_chance is .*; give a number from 0 to 1"):
         DecisionConfig(least_chance=share)
 
 

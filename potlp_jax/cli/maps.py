@@ -187,7 +187,12 @@ def label_map(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", metavar="LABELS.yaml", help="Default: FILE.places.yaml beside the map."),
+        typer.Option(
+            "--out",
+            "-o",
+            metavar="LABELS.yaml",
+            help="Default: FILE.places.yaml beside the map, or FILE.LEVEL.places.yaml.",
+        ),
     ] = None,
     add: Annotated[bool, typer.Option("--add", help="Add to the labels that the file holds already.")] = False,
     named: Annotated[
@@ -202,9 +207,16 @@ def label_map(
     """Say in metres where propositions are true, and check that a robot gets there."""
     from potlp_jax.environments.ros.buildings import load_building
     from potlp_jax.environments.ros.cleaning import clean_map
-    from potlp_jax.environments.ros.places import Places, check_points, load_places, place_letters, save_places
+    from potlp_jax.environments.ros.places import (
+        Places,
+        check_points,
+        load_places,
+        place_letters,
+        places_file,
+        save_places,
+    )
 
-    target = file.with_suffix(".places.yaml") if out is None else out
+    target = places_file(file, level) if out is None else out
     # Labels are typed by hand; overwriting them by a repeated command would lose work.
     if target.exists() and not add:
         fail(f"{target} exists: --add adds to it, --out writes another file")
@@ -263,12 +275,13 @@ def preview_map(
 
     from potlp_jax.environments.ros.buildings import load_building
     from potlp_jax.environments.ros.cleaning import clean_map
+    from potlp_jax.environments.ros.places import places_file
     from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig
     from potlp_jax.view.map_preview import draw_map, draw_places
     from potlp_jax.view.style import save_figure
 
     # Where `map:FILE.yaml` looks for labels too.
-    beside = file.with_suffix(".places.yaml")
+    beside = places_file(file, level)
     found = labels or (beside if beside.is_file() else None)
     if found is None:
         image_map = load_building(file, level)

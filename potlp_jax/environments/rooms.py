@@ -15,6 +15,9 @@ from potlp_jax.errors import WorldError
 from potlp_jax.world.grid import World, make_world, pad_world
 from potlp_jax.world.settings import Settings
 
+OBSTACLE = 3
+"""Cells of a side of an obstacle."""
+
 
 @dataclasses.dataclass(frozen=True)
 class RoomsConfig:
@@ -23,10 +26,11 @@ class RoomsConfig:
     Attributes:
         propositions: names; each gets ``patches`` patches.
         smallest, largest: bounds of the floor's height and width, drawn apart; arrays always have the largest size.
-        room: least side of a room, walls left out. Rooms are up to about twice as large.
+        room: least side of a room, walls left out; the last room of a row may be one cell narrower. Rooms are up to
+            about twice as large.
         door_width: of every door.
         loops: probability of a door between neighbouring rooms that the spanning tree does not join.
-        obstacles: probability of an obstacle in the middle of a room.
+        obstacles: probability of an obstacle in the middle of a room that has space to go around it.
         patches, patch_radius: how many patches a proposition has, and how far a patch reaches from its middle.
     """
 
@@ -105,12 +109,14 @@ def _floor(
     occupied = np.zeros((rows[-1] + 1, columns[-1] + 1), bool)
     occupied[rows] = True
     occupied[:, columns] = True
-    # Three cells a side, in the middle of a room: small enough to leave a way around it in the smallest room.
     for i in range(len(rows) - 1):
         for j in range(len(columns) - 1):
-            if rng.random() < config.obstacles:
+            sides = rows[i + 1] - rows[i] - 1, columns[j + 1] - columns[j] - 1
+            # The draw is part of the world, also where an obstacle would leave no way around it.
+            if rng.random() < config.obstacles and min(sides) >= OBSTACLE + 2:
                 row, column = (rows[i] + rows[i + 1]) // 2, (columns[j] + columns[j + 1]) // 2
-                occupied[row - 1 : row + 2, column - 1 : column + 2] = True
+                around = OBSTACLE // 2
+                occupied[row - around : row + around + 1, column - around : column + around + 1] = True
     for first, second in _doors(rng, config, len(rows) - 1, len(columns) - 1):
         _carve(rng, occupied, config.door_width, rows, columns, first, second)
     return occupied

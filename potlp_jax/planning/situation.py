@@ -13,6 +13,7 @@ from flax import struct
 from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
+from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, require_fields
 from potlp_jax.planning.distances.product import (
     distance_table,
     product_distances,
@@ -57,10 +58,11 @@ class DecisionConfig:
     path_horizon: int | None = None
 
     def __post_init__(self) -> None:
-        if self.commitment < 0.0:
-            raise ValueError(f"commitment is {self.commitment}, must be at least 0")
-        if not 0.0 <= self.least_chance <= 1.0:
-            raise ValueError(f"least_chance is {self.least_chance}, must lie between 0 and 1")
+        require_fields(self, ("dead_end_factor",), POSITIVE, ValueError)
+        require_fields(self, ("commitment",), NOT_NEGATIVE, ValueError)
+        require_fields(self, ("least_chance",), SHARE, ValueError)
+        if self.path_horizon is not None:
+            require_fields(self, ("path_horizon",), AT_LEAST_ONE, ValueError)
 
     def horizon(self, height: int, width: int) -> int:
         """Moves in the path of one decision on a map of this size."""

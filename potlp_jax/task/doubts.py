@@ -82,6 +82,9 @@ def structure_of(task: Task) -> Structure | None:
         structure = read_formula(task.text)
     except UnreadableError:
         return None
+    # Writers of automata drop what the language does not depend on; such a formula is not about this task's places.
+    if not set(names_of(structure)) <= set(task.propositions):
+        return None
     return structure if same_language(structure, task.dfa, task.propositions) else None
 
 

@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from potlp_jax.checks import AT_LEAST_ONE, LIMIT, NOT_NEGATIVE, require_fields
 from potlp_jax.codec import with_settings
 from potlp_jax.environments.base import Generator
 from potlp_jax.errors import PotlpWarning
@@ -45,10 +46,9 @@ class TrialConfig:
     revealed: bool = False
 
     def __post_init__(self) -> None:
-        if self.panoramas < 1:
-            raise ValueError(f"panoramas is {self.panoramas}, must be at least 1")
-        if self.look_every < 0:
-            raise ValueError(f"look_every is {self.look_every}, must be at least 0")
+        require_fields(self, ("panoramas",), AT_LEAST_ONE, ValueError)
+        require_fields(self, ("look_every", "replan_distance"), NOT_NEGATIVE, ValueError)
+        require_fields(self, ("budget_factor",), LIMIT, ValueError)
 
 
 def trial_config_for(source: World | Generator) -> TrialConfig:

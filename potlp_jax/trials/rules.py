@@ -163,8 +163,8 @@ class Stop:
         replan_distance: cells after which a changed map is worth a new decision. While nothing new is known there is
             nothing to decide: going on to the target is what makes every policy reach it (liveness).
         budget: cells that may still be travelled.
-        is_frontier: the target is a frontier, so that there is nothing to see there once nothing unobserved is beside
-            it.
+        is_frontier: the path ends at a frontier, so that there is nothing to see there once nothing unobserved is
+            beside it.
     """
 
     replan_distance: Float32[Array, "*batch"]
@@ -238,6 +238,8 @@ def stop_of(move: Move, tally: "Tally", belief: BeliefMap, config: TrialConfig) 
     """
     # To the end of the task, or of the known part of an optimistic path, the robot goes without a frontier in mind.
     is_frontier = (move.kind == MoveKind.ACTION) | (move.kind == MoveKind.FRONTIER) | (move.kind == MoveKind.FALLBACK)
+    # Where the horizon cuts the path it ends on the way, where nothing was to be seen anyhow.
+    is_frontier &= jnp.all(move.path.cells[move.path.length] == move.target_cell)
     return Stop(
         replan_distance=jnp.float32(config.replan_distance),
         # In float32 on host and device alike, so that a leg ends on the same cell in a trial and in a batch.

@@ -4,10 +4,10 @@ A plan in metres becomes an `OccupancyMap` like that of a ROS map, so that clean
 second way. What is outside of the building is unknown.
 
 Plans whose windows are gaps, as doors are, leak. `close_outer_walls` continues every wall that ends, for up to
-`WIDEST_GAP` metres, where it meets another wall. With all these pieces in place, what has most of its edge on the
-border of the drawing (beyond the plan, or walls along a whole side of it) is outside. Pieces beside it stay and close
-the outer walls; the others are doors within the building, and are left out. What was closed is kept in
-``OccupancyMap.closed`` and drawn by the preview: it is a guess, to be looked at.
+`WIDEST_GAP` metres, where it meets another wall. With all these pieces in place, what is connected with the edge of
+the picture is outside. Pieces beside it stay and close the outer walls; the others are doors within the building, and
+are left out. What was closed is kept in ``OccupancyMap.closed`` and drawn by the preview: it is a guess, to be looked
+at. Where a wall goes around the whole plan nothing is closed, and a yard within it belongs to the building.
 """
 
 import math
@@ -36,13 +36,6 @@ MOST_PIXELS = 1 << 24
 
 WIDEST_GAP = 4.0
 """Metres of an outer wall that are missing, at most, where it is closed."""
-
-WHOLE_SIDE = 0.9
-"""Share of a side of the plan from which on a wall along it is the border of the drawing rather than of a room."""
-
-BORDER_SHARE = 0.6
-"""Share of its edge that a part has on the border of the drawing from which on it lies outside of the building: more
-than the half that a room in a corner has there, if the border of the drawing is the building's own wall."""
 
 MARGIN = 1.0
 """Metres around the outermost walls."""
@@ -115,46 +108,14 @@ def close_outer_walls(walls: Sequence[Wall], frame: GridFrame) -> tuple[Bool[np.
     drawn = draw_areas([wall.corners for wall in walls], frame) > 0
     pieces = draw_areas([piece.corners for wall in walls for piece in _continued(wall, drawn, frame)], frame)
     pieces[drawn] = 0
-    outside = _outside(drawn | (pieces > 0), _border(walls, frame))
+    all_closed = drawn | (pieces > 0)
+    outside = ~(all_closed | enclosed(all_closed))
     # Two pixels more on all sides: the outer half of a closed gap touches it.
     beside = np.asarray(ndimage.binary_dilation(outside, np.ones((5, 5), bool)), dtype=bool)
     closed = np.isin(pieces, np.setdiff1d(pieces[beside], 0))
     # Gaps within the building are open again.
     labels = component_labels(~(drawn | closed))
     return drawn, closed, (labels > 0) & ~np.isin(labels, np.unique(labels[outside]))
-
-
-def _border(walls: Sequence[Wall], frame: GridFrame) -> Bool[np.ndarray, "H W"]:
-    """Beyond the plan, and the walls that run along a whole side of it: the border of the drawing."""
-    points = np.array([corner for wall in walls for corner in wall.corners])
-    low, high = points.min(axis=0), points.max(axis=0)
-    long = []
-    for wall in walls:
-        start, end = np.array(wall.start), np.array(wall.end)
-        for axis in (0, 1):
-            near = min(abs(start[axis] - low[axis]), abs(start[axis] - high[axis])) <= wall.thickness
-            spans = abs(end - start)[1 - axis] >= WHOLE_SIDE * (high - low)[1 - axis]
-            if near and spans and abs(end - start)[axis] <= wall.thickness:
-                long.append(wall.corners)
-    border = draw_areas(long, frame) > 0
-    border[[0, -1]] = border[:, [0, -1]] = True
-    return border
-
-
-def _outside(walls: Bool[np.ndarray, "H W"], border: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Parts of the free space that have `BORDER_SHARE` of their edge on the border of the drawing."""
-    labels = component_labels(~walls)
-    count = int(labels.max()) + 1
-    # An edge is a pixel just beside a part; near the border the part lies outside unless its own walls are longer.
-    grown = np.asarray(ndimage.grey_dilation(labels, size=(3, 3)))
-    edge = (labels == 0) & (grown > 0)
-    edges = np.bincount(grown[edge], minlength=count)
-    bordering = np.bincount(grown[edge & border], minlength=count)
-    outside = bordering > BORDER_SHARE * edges
-    # The ring around the plan has the picture's own edge.
-    outside[np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))] = True
-    outside[0] = False
-    return outside[labels]
 
 
 def _continued(wall: Wall, drawn: Bool[np.ndarray, "H W"], frame: GridFrame) -> list[Wall]:

@@ -1,11 +1,11 @@
 """Reads buildings from Gazebo worlds (SDF): boxes at the height of a robot are walls.
 
     sdf > world > model[@name] > link > collision > geometry > box > size      x y z in metres
-    pose of model, link and collision: x y z roll pitch yaw; each is relative to the one around it
+    pose of model, link and collision: x y z roll pitch yaw; each is relative to the one around it; degrees="true"
 
-Poses are composed in the plane; a box that is tilted, or another shape than a box or a plane, is left out, with a
-warning. The floors of the KTH campus are such files; doors and windows are gaps in them, so that outer walls are closed
-(`environments.ros.drawn_maps`).
+Models may hold models. Poses are composed in the plane; a box that is tilted, another shape than a box or a plane, and
+an ``include`` of another file are left out, with a warning. The floors of the KTH campus are such files; doors and
+windows are gaps in them, so that outer walls are closed (`environments.ros.drawn_maps`).
 
 References:
     Aydemir, Jensfelt and Folkesson, What can we learn from 38,000 rooms?, IROS 2012 (the floors of KTH).
@@ -15,7 +15,8 @@ References:
 import math
 import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from potlp_jax.environments.ros.drawn_maps import Wall, close_outer_walls, drawn_map, frame_around
@@ -38,16 +39,19 @@ def read_world(file: Path) -> OccupancyMap:
         MapError: the file is missing, is no SDF, has no walls, or a pose or size makes no sense.
 
     Warns:
-        MapWarning: shapes that are left out.
+        MapWarning: shapes and included files that are left out.
     """
     root = read_xml(file, MapError)
     if root.tag != "sdf":
         raise MapError(file, one_line(root.tag), "the file must hold a world of SDF")
     walls, left_out = _walls(file, root)
-    if not walls:
-        raise MapError(file, "", "has no box at the height of a robot: there are no walls")
+    included = sum(1 for _ in root.iter("include"))
+    if included:
+        warnings.warn(f"{file}: {included} included files are left out", MapWarning, stacklevel=2)
     if left_out:
         warnings.warn(f"{file}: {left_out} shapes that are no upright boxes are left out", MapWarning, stacklevel=2)
+    if not walls:
+        raise MapError(file, "", "has no box at the height of a robot: there are no walls")
     frame = frame_around(file, [corner for wall in walls for corner in wall.corners])
     drawn, closed, free = close_outer_walls(walls, frame)
     return drawn_map(file, free, drawn | closed, frame, kind="Gazebo world", closed=closed)
@@ -56,19 +60,27 @@ def read_world(file: Path) -> OccupancyMap:
 def _walls(file: Path, root: ElementTree.Element) -> tuple[list[Wall], int]:
     """The walls, and how many shapes are none that can be read."""
     walls, left_out = [], 0
-    for model in root.findall("world/model") + root.findall("model"):
-        for link in model.findall("link"):
-            for collision in link.findall("collision"):
-                if collision.find("geometry/plane") is not None:
-                    continue
-                chain = (_pose(file, part) for part in (model, link, collision))
-                size = collision.findtext("geometry/box/size")
-                pose = _composed(chain)
-                if size is None or pose is None:
-                    left_out += 1
-                elif (wall := _wall(pose, _numbers(file, "box: size", size, 3))) is not None:
-                    walls.append(wall)
+    for chain in _collisions(root):
+        collision = chain[-1]
+        if collision.find("geometry/plane") is not None:
+            continue
+        size = collision.findtext("geometry/box/size")
+        pose = _composed(_pose(file, part) for part in chain)
+        if size is None or pose is None:
+            left_out += 1
+        elif (wall := _wall(pose, _numbers(file, "box: size", size, 3))) is not None:
+            walls.append(wall)
     return walls, left_out
+
+
+def _collisions(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, ...]]:
+    """Of every collision the parts whose poses lead to it: the models, outermost first, the link and itself last."""
+    models = deque((model,) for model in root.findall("world/model") + root.findall("model"))
+    while models:
+        chain = models.popleft()
+        for link in chain[-1].findall("link"):
+            yield from ((*chain, link, collision) for collision in link.findall("collision"))
+        models.extend((*chain, model) for model in chain[-1].findall("model"))
 
 
 def _wall(pose: Pose, size: list[float]) -> Wall | None:
@@ -89,8 +101,16 @@ def _pose(file: Path, part: ElementTree.Element) -> Pose | None:
         return 0.0, 0.0, 0.0, 0.0
     if element.get("frame") or element.get("relative_to"):
         raise MapError(file, f"{part.tag} {part.get('name')}: pose", "is relative to a frame by name; write it plainly")
-    x, y, z, roll, pitch, yaw = _numbers(file, f"{part.tag} {part.get('name')}: pose", element.text or "", 6)
+    where = f"{part.tag} {part.get('name')}: pose"
+    if (form := element.get("rotation_format", "euler_rpy")) != "euler_rpy":
+        raise MapError(file, where, f"rotation_format {short(form)} is not read; write it as roll, pitch and yaw")
+    x, y, z, *angles = _numbers(file, where, element.text or "", 6)
+    roll, pitch, yaw = (math.radians(angle) for angle in angles) if _in_degrees(element) else angles
     return None if max(abs(roll), abs(pitch)) > 1e-6 else (x, y, z, yaw)
+
+
+def _in_degrees(pose: ElementTree.Element) -> bool:
+    return pose.get("degrees", "false") in ("true", "1")
 
 
 def _composed(chain: Iterable[Pose | None]) -> Pose | None:

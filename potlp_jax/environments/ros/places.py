@@ -40,6 +40,11 @@ Point = tuple[float | int, float | int]
 """Metres (x, y) in the map's frame."""
 
 
+def places_file(file: Path, level: str | None = None) -> Path:
+    """The file of a map's labels: beside it, and of every level that is named one of its own."""
+    return file.with_suffix(".places.yaml" if level is None else f".{level.replace('/', '_')}.places.yaml")
+
+
 @dataclass(frozen=True)
 class Disc:
     """All that is near a point, in metres."""

@@ -19,7 +19,7 @@ References:
 
 import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +60,9 @@ def read_level(file: Path, level: str | None = None) -> OccupancyMap:
     walls = [_wall(file, level, edge, points) for edge in _list(file, level, found, "walls")]
     if not walls:
         raise MapError(file, f"levels: {level}: walls", "the level has no walls")
-    doors = list(_open_doors(file, level, found, points))
+    doors, closed = _doors(file, level, found, points)
+    # Walls end at the posts of a door: a closed one stands between them as a wall does.
+    walls += closed
     floors = [_corners(file, level, floor, points) for floor in _list(file, level, found, "floors")]
     corners = [wall.corners for wall in walls]
     frame = frame_around(file, [corner for each in (*corners, *floors) for corner in each])
@@ -130,21 +132,24 @@ def _wall(file: Path, level: str, edge: Any, points: Sequence[Point]) -> Wall:
     return Wall(start, end, WALL_THICKNESS)
 
 
-def _open_doors(file: Path, level: str, found: Mapping[str, Any], points: Sequence[Point]) -> Iterator[Wall]:
-    closed = []
+def _doors(file: Path, level: str, found: Mapping[str, Any], points: Sequence[Point]) -> tuple[list[Wall], list[Wall]]:
+    """The doors that open, as thick as they cut walls, and the others, as thick as walls."""
+    opening, closed, names = [], [], []
     for edge in _list(file, level, found, "doors"):
         start, end, values = _edge(file, f"levels: {level}: doors", edge, points)
         if _value(values, "type") in OPEN_DOORS:
-            yield Wall(start, end, DOOR_THICKNESS)
+            opening.append(Wall(start, end, DOOR_THICKNESS))
         else:
-            closed.append(str(_value(values, "name") or "(no name)"))
-    if closed:
+            closed.append(Wall(start, end, WALL_THICKNESS))
+            names.append(str(_value(values, "name") or "(no name)"))
+    if names:
         known = ", ".join(OPEN_DOORS)
         warnings.warn(
-            f"{file}: levels: {level}: doors of no type that opens ({known}) are closed: {short(', '.join(closed))}",
+            f"{file}: levels: {level}: doors of no type that opens ({known}) are closed: {short(', '.join(names))}",
             MapWarning,
             stacklevel=3,
         )
+    return opening, closed
 
 
 def _places(file: Path, level: str, found: Mapping[str, Any], points: Sequence[Point]) -> Places | None:

@@ -1,11 +1,13 @@
 """Worlds on real buildings: a ROS map, cleaned until it can serve as the truth, with propositions placed in metres.
 
-``map:FILE.yaml`` takes the propositions from ``FILE.places.yaml`` beside it (`environments.ros.places`). Options
-follow after commas: ``map:FILE.yaml,places=OTHER.yaml,resolution=0.2,radius=0.1``. Names of files hold no comma.
+``map:FILE.yaml`` takes the propositions from ``FILE.places.yaml`` beside it (`environments.ros.places`), and
+``map:FILE.yaml,level=NAME`` from ``FILE.NAME.places.yaml``. Options follow after commas:
+``map:FILE.yaml,places=OTHER.yaml,resolution=0.2,radius=0.1``. Names of files hold no comma.
 
 Costs are in metres, since ``World.resolution`` is the size of a cell in metres.
 """
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,8 +22,8 @@ from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.ros.buildings import load_building
 from potlp_jax.environments.ros.cleaning import CleanMap, clean_map, warn_of_cut_off
 from potlp_jax.environments.ros.occupancy_map import OccupancyMap
-from potlp_jax.environments.ros.places import MAX_PROPOSITIONS, Places, load_places, place_letters
-from potlp_jax.errors import MapError
+from potlp_jax.environments.ros.places import MAX_PROPOSITIONS, Places, load_places, place_letters, places_file
+from potlp_jax.errors import MapError, MapWarning
 from potlp_jax.world.grid import World, make_world
 
 PREFIX = "map:"
@@ -37,7 +39,7 @@ class RosMapConfig:
 
     Attributes:
         file: the map, in one of the formats of `environments.ros.buildings`.
-        places: YAML of the propositions, or the propositions; None: ``FILE.places.yaml`` beside the map.
+        places: YAML of the propositions, or the propositions; None: `places_file` beside the map.
         resolution: size of a working cell in metres, not finer than the map's pixels; None: 0.2, or larger on large
             maps (`environments.ros.working_grid`).
         radius: the robot's radius in metres, by which obstacles grow.
@@ -73,7 +75,8 @@ class RosMap(Generator):
             MapError: the map or the places cannot be used; the message names the file, the field, and what to do.
 
         Warns:
-            MapWarning: a part of the building cannot be reached, or cells are larger than usual; see also
+            MapWarning: a part of the building cannot be reached, cells are larger than usual, or labels of no level lie
+                beside a building of which a level is named; see also
                 `potlp_jax.environments.ros.buildings.load_building`.
         """
         self.config = config
@@ -146,9 +149,17 @@ def parse_spec(spec: str) -> RosMapConfig:
 
 
 def _find_places(config: RosMapConfig, image_map: OccupancyMap) -> Places:
-    file = Path(config.file).with_suffix(".places.yaml") if config.places is None else Path(str(config.places))
+    file = places_file(Path(config.file), config.level) if config.places is None else Path(str(config.places))
     if config.places is not None or file.is_file():
         return load_places(file)
+    of_no_level = places_file(Path(config.file))
+    if of_no_level.is_file():
+        warnings.warn(
+            f"{of_no_level} belongs to no level and is not read: if its labels are those of {config.level}, rename it "
+            f"{file.name}, or add places={of_no_level}",
+            MapWarning,
+            stacklevel=3,
+        )
     clean = clean_map(image_map, config.resolution, config.radius)
     named = None if image_map.places is None else reachable_places(image_map.places, clean)
     if named is not None and 0 < len(named.propositions) <= MAX_PROPOSITIONS:
