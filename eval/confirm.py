@@ -11,6 +11,7 @@ all do, with 95 % confidence. What was run is kept: the same command at the same
 
 import argparse
 import dataclasses
+import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,7 +24,7 @@ from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.sweep.rows import provenance, source_commit
 from potlp_jax.sweep.runner import RESULTS
 from potlp_jax.sweep.specification import Specification, specification_from_store
-from potlp_jax.sweep.store import Item, Row, Store
+from potlp_jax.sweep.store import Row, Store
 from potlp_jax.sweep.work import Work
 
 COMPARED = ("world_digest", "outcome", "path", "cost", "decisions", "status")
@@ -89,14 +90,14 @@ def confirm(folder: Path, trials: int, kept: Path) -> dict[str, Any]:
     facts, rows = store.facts(), drawn(store.rows(), trials)
     store.close()
     found = _read(kept)
-    missing = [row for row in rows if row.item not in found]
+    missing = [row for row in rows if _key(row) not in found]
     kept.parent.mkdir(parents=True, exist_ok=True)
     with kept.open("a") as file:
         for before, now in run_again(specification_from_store(facts["specification"]), missing):
-            found[before.item] = differences(before, now)
-            line = {"commit": source_commit(), **dataclasses.asdict(before.item), "differs": found[before.item]}
+            found[_key(before)] = differences(before, now)
+            line = {"commit": source_commit(), "row": _key(before), "differs": found[_key(before)]}
             print(json.dumps(line), file=file, flush=True)
-    different = [{**dataclasses.asdict(row.item), "differs": found[row.item]} for row in rows if found[row.item]]
+    different = [{**dataclasses.asdict(row.item), "differs": found[_key(row)]} for row in rows if found[_key(row)]]
     return {
         "trials": len(rows),
         "same": len(rows) - len(different),
@@ -105,14 +106,21 @@ def confirm(folder: Path, trials: int, kept: Path) -> dict[str, Any]:
     }
 
 
-def _read(kept: Path) -> dict[Item, list[str]]:
-    """What was run at this commit."""
-    found = {}
+def _key(row: Row) -> str:
+    """Tells rows apart that differ in anything that is compared: what was found of one is nothing about another."""
+    values = [*dataclasses.astuple(row.item), row.configuration, *(getattr(row, name) for name in COMPARED)]
+    return hashlib.sha256(repr(values).encode()).hexdigest()
+
+
+def _read(kept: Path) -> dict[str, list[str]]:
+    """What was run at this commit; of changes that are not committed nothing is kept: they may have changed again."""
+    found: dict[str, list[str]] = {}
+    if source_commit().endswith("+"):
+        return found
     for line in kept.read_text().splitlines() if kept.is_file() else []:
         entry = json.loads(line)
-        if entry.pop("commit") == source_commit():
-            different = entry.pop("differs")
-            found[Item(**entry)] = different
+        if entry["commit"] == source_commit():
+            found[entry["row"]] = entry["differs"]
     return found
 
 
@@ -137,9 +145,11 @@ def main() -> None:
     if missing:
         parser.error(f"no sweep in {', '.join(missing)}: name folders that potlp sweep --out wrote")
     enable_compilation_cache()
+    names = ["/".join(folder.resolve().parts[-2:]) for folder in options.sweeps]
+    if len(set(names)) < len(names):
+        parser.error(f"two of the sweeps have one name: {', '.join(names)}; run them apart")
     found = {}
-    for folder in options.sweeps:
-        name = "/".join(folder.parts[-2:])
+    for name, folder in zip(names, options.sweeps, strict=True):
         found[name] = confirm(folder, options.trials, options.out / f"{name.replace('/', '-')}.jsonl")
         print(f"{name}: {found[name]['same']} of {found[name]['trials']} the same", flush=True)
     print(markdown(found))

@@ -33,7 +33,10 @@ def write_specification(folder: Path, specification: Mapping[str, Any]) -> Path:
     """A sweep's file in its folder; JSON is YAML."""
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "sweep.yaml"
-    file.write_text(json.dumps(specification))
+    estimator = Path(str(specification.get("estimator")))
+    # A specification's files lie beside it; those of a command beside where it is given.
+    found = {"estimator": str(estimator.resolve())} if estimator.is_file() else {}
+    file.write_text(json.dumps({**specification, **found}))
     return file
 
 

@@ -71,7 +71,7 @@ def run_arm(folder: Path, environment: str, estimator: Path, worlds: int, proces
         "policies": WITHOUT_ORACLE,
         "worlds": worlds,
         "split": Split.TEST.value,
-        "estimator": str(estimator.resolve()),
+        "estimator": str(estimator),
     }
     sweep(folder, specification, processes)
     return read_rows(folder)

@@ -6,6 +6,7 @@ import json
 import jax
 import numpy as np
 import pytest
+import yaml
 from typer.testing import CliRunner
 
 from potlp_jax.cli import app
@@ -402,3 +403,82 @@ def test_a_record_is_audited_by_the_command(tmp_path):
         assert (code, "1 trials, 0 problems" in said) == (1, False)
     for unknown in ({"world_number": None}, {"environment": ""}, {"environment": "log:drive.bag"}):
         assert _command(dataclasses.replace(trial, **unknown), tmp_path)[0] == 2
+
+
+# Tasks from files.
+
+
+MAIL = """HOA: v1
+NAMED
+States: 2
+Start: 0
+AP: 1 "goal"
+Acceptance: 1 Inf(0)
+--BODY--
+State: 0
+[0] 1
+[!0] 0
+State: 1 {0}
+[t] 1
+--END--
+"""
+"""Reach the goal, as an automaton."""
+
+
+@pytest.mark.parametrize("name", ["", 'name: "deliver the mail"', 'name: "F goal"'])
+def test_a_sweep_of_an_automaton_is_audited_whatever_becomes_of_its_file(tmp_path, monkeypatch, name):
+    file, out = tmp_path / "tasks" / "mail.hoa", tmp_path / "out"
+    file.parent.mkdir()
+    file.write_text(MAIL.replace("NAMED\n", f"{name}\n" if name else ""))
+    sweep = file.with_name("sweep.yaml")
+    sweep.write_text("environments: [toy]\ntasks: [mail.hoa]\npolicies: [baseline]\nworlds: 2\n")
+    # Files are named as the specification has them, beside it.
+    monkeypatch.chdir(tmp_path)
+    command = ["sweep", str(sweep), "--out", str(out), "--processes", "1"]
+    ran = CliRunner().invoke(app, command)
+    assert ran.exit_code == 0, ran.output
+    file.rename(file.with_name("elsewhere.hoa"))
+    audited = CliRunner().invoke(app, ["audit", str(out)])
+    assert (audited.exit_code, "4 trials, 0 problems" in audited.output) == (0, True), audited.output
+    store = Store(out / RESULTS, read_only=True)
+    rows = store.rows()
+    store.close()
+    assert {row.item.task for row in rows} == {"F goal" if "F goal" in name else "mail.hoa"}
+    # A word that does not do what the automaton asks for is found.
+    lied = [dataclasses.replace(row, outcome="stuck") for row in rows]
+    specification = specification_from_dict(
+        {**yaml.safe_load(sweep.read_text()), "tasks": ["elsewhere.hoa"]}, "", file.parent
+    )
+    automata = {rows[0].item.task: specification.automata[0][1]}
+    assert len({row.item for row, _ in audit_rows(lied, Split.VALIDATION, automata=automata)}) == len(rows)
+
+
+def test_a_sweep_does_not_go_on_with_another_automaton(tmp_path):
+    file, out = tmp_path / "mail.hoa", tmp_path / "out"
+    file.write_text(MAIL.replace("NAMED\n", ""))
+    sweep = tmp_path / "sweep.yaml"
+    sweep.write_text("environments: [toy]\ntasks: [mail.hoa]\npolicies: [baseline]\nworlds: 1\n")
+    command = ["sweep", str(sweep), "--out", str(out), "--processes", "1"]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    file.write_text(MAIL.replace("NAMED\n", "").replace("[0] 1", "[!0] 1").replace("[!0] 0", "[0] 0"))
+    refused = CliRunner().invoke(app, command)
+    assert refused.exit_code == 2
+    assert "automata" in refused.output
+
+
+@pytest.mark.parametrize("name", ["", 'name: "deliver the mail"'])
+def test_a_trial_of_an_automaton_without_a_formula_is_audited(tmp_path, name):
+    file = tmp_path / "mail.hoa"
+    file.write_text(MAIL.replace("NAMED\n", f"{name}\n" if name else ""))
+    trial = run("toy", str(file), "baseline", 0)
+    assert _command(trial, tmp_path)[0] == 0
+    code, said = _command(dataclasses.replace(trial, outcome=Outcome.STUCK), tmp_path)
+    assert (code, "is not what the word says" in said) == (1, True)
+
+
+def test_a_shipped_task_is_its_formula():
+    specification = specification_from_dict(
+        {"environments": ["firefighting"], "tasks": ["firefighting-4"], "policies": ["baseline"], "worlds": 1}, ""
+    )
+    assert specification.cells[0].task == Task.shipped("firefighting-4").text
+    assert specification.automata == ()

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import sys
 from collections import Counter
 
@@ -61,6 +62,8 @@ def test_what_was_run_is_kept_and_a_report_written(sweep, tmp_path, monkeypatch,
         "argv",
         ["confirm", str(sweep), "--trials", "3", "--out", str(tmp_path), "--report", str(tmp_path / "page")],
     )
+    # Of changes that are not committed nothing is kept.
+    monkeypatch.setattr(program, "source_commit", lambda: "one")
     program.main()
     assert "out/toy: 3 of 3 the same" in capsys.readouterr().out
     assert json.loads((tmp_path / "page.json").read_text())["sweeps"]["out/toy"]["same"] == 3
@@ -69,11 +72,35 @@ def test_what_was_run_is_kept_and_a_report_written(sweep, tmp_path, monkeypatch,
     monkeypatch.setattr(program, "run_again", lambda specification, rows: asked.extend(rows) or iter(()))
     program.main()
     assert asked == []
-    # At another commit nothing of it counts.
-    monkeypatch.setattr(program, "source_commit", lambda: "another")
-    with pytest.raises(KeyError):
+    # At another commit nothing of it counts, nor where the source was changed.
+    for commit in ("another", "one+"):
+        monkeypatch.setattr(program, "source_commit", lambda commit=commit: commit)
+        with pytest.raises(KeyError):
+            program.main()
+    assert len(asked) == 6
+
+
+def test_what_was_found_of_a_row_is_nothing_about_another(sweep, tmp_path, monkeypatch):
+    """Two sweeps of the same trials in one file: of other settings, or of another commit."""
+    monkeypatch.setattr(program, "source_commit", lambda: "one")
+    facts, rows = rows_of(sweep)
+    assert confirm(sweep, 9, tmp_path / "kept.jsonl")["same"] == 9
+    other = tmp_path / "toy"
+    other.mkdir()
+    store = Store(other / RESULTS)
+    store.agree(facts)
+    store.finish([dataclasses.replace(row, cost=row.cost + 1) for row in rows])
+    store.close()
+    assert confirm(other, 9, tmp_path / "kept.jsonl")["same"] == 0
+
+
+def test_two_sweeps_of_one_name_are_refused(sweep, tmp_path, monkeypatch, capsys):
+    again = tmp_path / "out" / "toy"
+    shutil.copytree(sweep, again)
+    monkeypatch.setattr(sys, "argv", ["confirm", str(sweep), str(again), "--out", str(tmp_path / "kept")])
+    with pytest.raises(SystemExit):
         program.main()
-    assert len(asked) == 3
+    assert "two of the sweeps have one name" in capsys.readouterr().err
 
 
 def test_a_folder_without_a_sweep_is_named(tmp_path, monkeypatch, capsys):

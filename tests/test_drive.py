@@ -4,6 +4,7 @@ import base64
 import dataclasses
 import json
 import math
+import signal
 import time
 
 import cv2
@@ -15,6 +16,7 @@ from eval.live.__main__ import run_stream
 from eval.live.perturbation import Network, Perturbation
 from eval.live.server import RosbridgeServer
 from eval.live.simulator import FLOOR, Behaviour, SimulatedLink, SteppedInbox
+from potlp_jax.cli.drive import _interruption
 from potlp_jax.drive.config import DriveConfig, Mode, Topics
 from potlp_jax.drive.driving import drive_robot
 from potlp_jax.drive.inbox import Inbox
@@ -27,6 +29,7 @@ from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.places import Disc, Polygon
 from potlp_jax.errors import RobotError
 from potlp_jax.task.task import Task
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.world.grid import BeliefMap
 
 TASK = Task.from_formula("!fire U exit", FLOOR.propositions)
@@ -324,13 +327,20 @@ def test_a_map_that_says_the_same_is_no_reason_to_give_up(seed):
 ORDINARY = Behaviour()
 
 
-def driven(mode, behaviour=ORDINARY, *, before=lambda _link: None, tasks=1, **settings):
-    """Trials of a drive, and the link."""
+def begun(mode, behaviour=ORDINARY, *, before=lambda _link: None, options=None, **settings):
+    """A drive, and the link."""
     config = dataclasses.replace(CONFIG, mode=mode, **settings)
     link = SimulatedLink(FLOOR, behaviour, Network(Perturbation(), np.random.default_rng(0)))
     before(link)
     inbox = SteppedInbox(link, config, TASK.propositions)
-    drive = drive_robot(link, TASK, "baseline", jax.random.key(0), config, inbox=inbox, clock=link.clock)
+    key = jax.random.key(0)
+    drive = drive_robot(link, TASK, "baseline", key, config, inbox=inbox, clock=link.clock, **(options or {}))
+    return drive, link
+
+
+def driven(mode, behaviour=ORDINARY, *, before=lambda _link: None, tasks=1, **settings):
+    """Trials of a drive, and the link."""
+    drive, link = begun(mode, behaviour, before=before, **settings)
     trials = [trial for trial, _ in zip(drive, range(tasks), strict=False)]
     drive.close()
     return trials, link
@@ -397,6 +407,43 @@ def test_another_formula_takes_over_and_one_that_is_none_does_not():
     (first, second), _ = driven(Mode.ADVISE, before=lambda link: link.ask_for("F exit"), tasks=2)
     assert first.outcome == "unfinished"
     assert (second.outcome, second.task_text) == ("satisfied", "F exit")
+
+
+def test_a_robot_stands_while_somebody_has_the_record_of_a_trial_that_ended_on_the_way():
+    drive, link = begun(Mode.NAVIGATE, options={"trial_config": TrialConfig(budget_factor=0.06)})
+    trial = next(drive)
+    assert trial.outcome == "budget"
+    assert link.cancelled
+    assert not link._way
+
+
+def test_a_formula_that_comes_while_somebody_has_the_record_is_the_next_task():
+    drive, link = begun(Mode.ADVISE)
+    assert next(drive).outcome == "satisfied"
+    link.ask_for("!fire U exit")
+    link.step(2.0)
+    assert [trial.task_text for trial in drive] == ["!fire U exit"]
+
+
+def test_who_interrupts_a_drive_has_its_record():
+    asked = iter(range(1000))
+    drive, link = begun(Mode.NAVIGATE, options={"interrupted": lambda: next(asked) > 0})
+    link.ask_for("F exit")
+    (trial,) = drive
+    assert trial.outcome == "unfinished"
+    assert trial.decisions
+    assert link.cancelled
+
+
+def test_ctrl_c_is_asked_for_and_a_second_one_ends_at_once():
+    before = signal.getsignal(signal.SIGINT)
+    with _interruption() as interrupted:
+        assert not interrupted()
+        signal.raise_signal(signal.SIGINT)
+        assert interrupted()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_without_a_map_the_error_says_what_to_look_at():

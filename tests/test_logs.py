@@ -383,10 +383,13 @@ def test_a_trial_is_written_replayed_and_viewed(trial, tmp_path):
     trial.save(tmp_path / "trial.json")
     written = _potlp("log", "write", tmp_path, "--out", tmp_path / "drive", "--format", "mcap", "--height", 64)
     assert written.exit_code == 0, written.output
+    labels, out = tmp_path / "drive.labels.yaml", tmp_path / "replay"
+    text = labels.read_text()
+    labels.write_text(f"# mine\n{text}")
     again = _potlp("log", "write", tmp_path, "--out", tmp_path / "drive", "--format", "mcap")
     assert again.exit_code == 2
     assert "exists already" in again.stderr
-    labels, out = tmp_path / "drive.labels.yaml", tmp_path / "replay"
+    assert labels.read_text() == f"# mine\n{text}"
     result = _potlp("log", "replay", tmp_path / "drive", "--labels", labels, "--task", "!hazard U goal", "--out", out)
     assert result.exit_code == 0, result.output
     assert "no estimator is shipped for logs: the policy is baseline" in result.stderr

@@ -107,6 +107,20 @@ class FirstLook(Painter):
         return jnp.where(subgoals.mask, 0, -1)
 
 
+@struct.dataclass
+class FirstLookOfMany(FirstLook):
+    """Looks on the way, too: its panoramas are not those of decisions."""
+
+    looks_on_the_way = True
+
+
+def test_what_was_seen_on_the_way_has_no_number_in_the_record():
+    asked = FirstLookOfMany(memory=blank_painting(*WORLD.shape))
+    found = run_trial(WORLD, TOY.task("2"), Policy.POTLP, jax.random.key(0), CONFIG, environment="toy", estimator=asked)
+    assert not any(decision.observations for decision in found.decisions)
+    assert views_of(found, asked)
+
+
 def test_an_estimator_of_ones_own_says_which_panorama_it_answers_from(trial):
     first = FirstLook(memory=blank_painting(*WORLD.shape))
     found = run_trial(WORLD, TOY.task("2"), Policy.POTLP, jax.random.key(0), CONFIG, environment="toy", estimator=first)

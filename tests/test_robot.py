@@ -10,13 +10,15 @@ from flax import struct
 
 import potlp_jax
 from potlp_jax.errors import RobotError
+from potlp_jax.learning.labels import TrueMapEstimator
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import BeliefMap, load_trial
 from potlp_jax.trials.replay import views_of
-from potlp_jax.trials.robot import GrowingRobot, Leg
+from potlp_jax.trials.robot import GrowingRobot, Leg, SimulatedRobot
 from potlp_jax.trials.setbacks import SetbackConfig
 from potlp_jax.view.decisions import describe_decision
 from potlp_jax.view.replay_page import replay_data
-from potlp_jax.world.grid import belief_from_numpy, moved_layer
+from potlp_jax.world.grid import belief_from_numpy, make_world, moved_layer
 
 PROPOSITIONS = ("fire", "exit")
 TASK = potlp_jax.Task.from_formula("!fire U exit", PROPOSITIONS)
@@ -368,6 +370,49 @@ class Breaks(Rover):
 def test_a_broken_contract_is_named(fault, said):
     with pytest.raises(RobotError, match=said):
         driven(Breaks(fault))
+
+
+@pytest.mark.parametrize("lost", ["top", "right"])
+def test_a_map_that_loses_a_part_is_refused(lost):
+    """A window that moves with the robot: what was decided there before could not be told on it."""
+
+    class Window(Rover):
+        left = False
+
+        @property
+        def origin(self):
+            return (1 if self.left and lost == "top" else 0), 0
+
+        def observe(self):
+            cells, letters = self.arrays()
+            window = np.s_[self.origin[0] :, : -1 if self.left and lost == "right" else None]
+            return (
+                belief_from_numpy(cells[window], letters[window], propositions=PROPOSITIONS),
+                (self.cell[0] - self.origin[0], self.cell[1]),
+            )
+
+        def advance(self, path, stop):
+            leg = super().advance(path, stop)
+            self.left = True
+            return leg
+
+    with pytest.raises(RobotError, match="loses no row or column"):
+        driven(Window((3, 2)))
+
+
+def test_the_record_says_which_estimator_was_asked_also_where_the_map_is_known():
+    letters = np.where(FLOOR == "f", 1, np.where(FLOOR == "e", 2, 0))
+    world = make_world(FLOOR == "#", letters, (1, 1), propositions=PROPOSITIONS)
+    of_ones_own = TrueMapEstimator(world=world)
+    config = TrialConfig()
+    asked, not_asked = (
+        potlp_jax.run_robot(
+            SimulatedRobot(world, config), TASK, policy, KEY, config, world=world, estimator=of_ones_own
+        )
+        for policy in ("potlp", "baseline")
+    )
+    assert "TrueMapEstimator" in asked.versions["estimator"]
+    assert "estimator" not in not_asked.versions
 
 
 def test_a_late_leg_is_noted():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from eval.delivery import WITHOUT_ORACLE
-from eval.savings import pairs_of
+from eval.savings import pairs_of, write_specification
 from eval.small_generator import CAMPUS, SMALL, compare, markdown, without_campus
 from potlp_jax.codec import json_copy
 from potlp_jax.recipes.recipe import read_recipe
@@ -39,6 +39,15 @@ def test_the_recipe_can_be_written_and_read(tmp_path):
     small = without_campus(read_recipe("delivery"))
     file.write_text(json.dumps(json_copy(dataclasses.asdict(small))))
     assert read_recipe(file) == small
+
+
+def test_an_estimator_is_named_beside_where_the_command_is_given(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.npz").touch()
+    for given, written in (("own.npz", str(tmp_path / "own.npz")), ("firefighting", "firefighting")):
+        file = write_specification(tmp_path / "trials", {"worlds": 1, "estimator": given})
+        assert json.loads(file.read_text()) == {"worlds": 1, "estimator": written}
+    assert json.loads(write_specification(tmp_path / "trials", {"worlds": 1}).read_text()) == {"worlds": 1}
 
 
 def test_pairs_have_every_policy_satisfied_and_reliable():

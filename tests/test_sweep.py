@@ -24,7 +24,7 @@ from eval.limit.worst import experiment_of
 from eval.real_maps.__main__ import exchange
 from eval.savings import decisions_of
 from potlp_jax.cli import app
-from potlp_jax.cli.report import page_title
+from potlp_jax.cli.report import _notable, page_title
 from potlp_jax.cli.sweep import forget_broken
 from potlp_jax.codec import shipped_settings
 from potlp_jax.engine.engine import Broken, Here
@@ -33,6 +33,7 @@ from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import ConfigurationError, EngineError, StoreError, SweepError
 from potlp_jax.planning.policies import Policy
+from potlp_jax.sweep.results import charged_cost
 from potlp_jax.sweep.rows import path_text, read_path
 from potlp_jax.sweep.runner import RESULTS, Sweep, run_sweep
 from potlp_jax.sweep.specification import (
@@ -655,7 +656,7 @@ def test_a_report_of_the_folder_one_stands_in_has_its_name(tmp_path, monkeypatch
 def test_a_report_writes_each_policy_in_its_colour():
     policies = ["known-map", "baseline", "first", "second"]
     rows = {policy: _row(Item("toy", "F goal", policy, 0)) for policy in policies}
-    data = {policy: Shown(f"worst {policy}", policy, 0, 1.0, 2.0, {}) for policy in policies}
+    data = {policy: Shown(f"worst {policy}", policy, 0, 1.0, "satisfied", 2.0, {}) for policy in policies}
     page = report_page("a", [], policies, [Cell("toy", "F goal", [rows], [data["second"]])])
     styles = policy_styles(policies)
     for policy in policies[1:]:
@@ -664,6 +665,19 @@ def test_a_report_writes_each_policy_in_its_colour():
     assert page.count(f'style="color: {styles["second"].colour}"') == 2
     # The page's own ink, which a dark screen turns.
     assert "<td>known-map</td>" in page
+
+
+def test_a_trial_that_gave_up_is_none_of_the_best():
+    def pair(world, cost, outcome="satisfied", status=0):
+        rows = {policy: _row(Item("toy", "F goal", policy, world), cost=100.0) for policy in ("known-map", "baseline")}
+        ours = _row(Item("toy", "F goal", "potlp", world), cost=cost)
+        return rows | {"potlp": dataclasses.replace(ours, outcome=outcome, status=status, budget=1000.0)}
+
+    pairs = [pair(0, 90.0), pair(1, 3.0, "stuck"), pair(2, 120.0), pair(3, 1.0, status=int(Status.TREE_OVERFLOW))]
+    found = [(reason, ours.item.world) for reason, ours, _ in _notable(pairs, "potlp", 1)]
+    assert found == [("worst 1", 1), ("best 1", 0)]
+    # Drawn as it counts: 90 + 1000 + 120, beside 300 of the baseline.
+    assert [charged_cost(entry["potlp"]) for entry in pairs[:3]] == [90.0, 1000.0, 120.0]
 
 
 def test_a_report_without_replays_runs_nothing_again(finished, tmp_path, monkeypatch):

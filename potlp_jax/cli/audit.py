@@ -57,7 +57,7 @@ def _sweep(folder: Path) -> tuple[int, list[tuple[str, str]]]:
         specification, rows = specification_from_store(store.facts()["specification"]), store.rows()
 
     def judged() -> Iterator[tuple[str, str]]:
-        judgements = audit_rows(rows, specification.split, specification.seed)
+        judgements = audit_rows(rows, specification.split, specification.seed, automata=dict(specification.automata))
         for row, problem in itertools.chain(audit_items(rows, specification), judgements):
             item = row.item
             yield f"{item.environment}, {item.task}, {item.policy}, world {item.world}", problem
@@ -72,8 +72,10 @@ def _trial(path: Path) -> tuple[int, list[tuple[str, str]]]:
     from potlp_jax.cli.inputs import record_file
     from potlp_jax.environments.registry import make
     from potlp_jax.environments.splits import Split
+    from potlp_jax.task.task import Task
     from potlp_jax.trials.record import LOG_PREFIX, ROBOT_PREFIX, load_trial
     from potlp_jax.verify.audit import problems_of
+    from potlp_jax.verify.semantics import can_be_judged
 
     file = record_file(path)
     trial = load_trial(file)
@@ -86,5 +88,8 @@ def _trial(path: Path) -> tuple[int, list[tuple[str, str]]]:
     if not environment or split not in list(Split) or trial.world_number is None:
         fail(f"{file}: does not say from which environment, split and number its world is: {trial.environment!r}")
     generator = make(environment)
-    problems = problems_of(trial, generator.task(trial.task_text), generator.world(trial.world_number, Split(split)))
+    # An automaton without a formula is what it is: the record has the only copy.
+    is_formula = can_be_judged(trial.task_text, generator.propositions)
+    task = generator.task(trial.task_text) if is_formula else Task.from_hoa(trial.task_hoa, generator.propositions)
+    problems = problems_of(trial, task, generator.world(trial.world_number, Split(split)))
     return 1, [(str(file), problem) for problem in problems]

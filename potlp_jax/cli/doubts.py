@@ -66,4 +66,4 @@ def warn_of_sweep(specification: Specification) -> None:
         surroundings = surroundings_of(generator, specification.split, specification.first_world)
         for cell in specification.cells:
             if cell.environment == name:
-                warn_of_doubts(generator.task(cell.task), surroundings)
+                warn_of_doubts(specification.task_of(cell, generator), surroundings)

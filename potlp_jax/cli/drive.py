@@ -1,7 +1,12 @@
 """``potlp drive``: a robot behind rosbridge, driven or advised."""
 
 import dataclasses
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -71,8 +76,8 @@ class TopicNames:
 
 [cyan]potlp drive robot:9090 -t 1 -l office.yaml --navigate --out out/monday[/cyan] - drive, by Nav2
 
-[dim]Ends with exit code 1 if a task was not satisfied. Ctrl-C stops the robot. Needs the extra drive, and rosbridge on
-the robot; no ROS here. docs/robots.md goes through a first drive.[/dim]
+[dim]Ends with exit code 1 if a task was not satisfied. Ctrl-C stops the robot, and the record is written. Needs the
+extra drive, and rosbridge on the robot; no ROS here. docs/robots.md goes through a first drive.[/dim]
 """,
 )
 @spread("names", TopicNames)
@@ -156,23 +161,25 @@ def drive(
     link = RosbridgeLink(robot)
     trials = []
     try:
-        for trial in drive_robot(
-            link,
-            asked,
-            policy,
-            jax.random.key(0),
-            config,
-            places=places,
-            estimator=read_estimator(estimator),
-            name=robot,
-            listener=(lambda _decision, _belief: None) if json else _print_decision,
-        ):
-            trials.append(trial)
-            files = [] if folder is None else _write(trial, folder, len(trials))
-            if not json:
-                console().print(f"{trial.outcome}: {len(trial.decisions)} decisions along {trial.cost:.2f} m")
-                for file in files:
-                    console().print(f"wrote {file}")
+        with _interruption() as interrupted:
+            for trial in drive_robot(
+                link,
+                asked,
+                policy,
+                jax.random.key(0),
+                config,
+                places=places,
+                estimator=read_estimator(estimator),
+                name=robot,
+                listener=(lambda _decision, _belief: None) if json else _print_decision,
+                interrupted=interrupted,
+            ):
+                trials.append(trial)
+                files = [] if folder is None else _write(trial, folder, len(trials))
+                if not json:
+                    console().print(f"{trial.outcome}: {len(trial.decisions)} decisions along {trial.cost:.2f} m")
+                    for file in files:
+                        console().print(f"wrote {file}")
     finally:
         link.close()
     if json:
@@ -180,6 +187,28 @@ def drive(
     # A dry run has done what it was to do; a task that gave way to another was not to be satisfied.
     if chosen[0] is not Mode.DRY and trials[-1].outcome is not Outcome.SATISFIED:
         raise typer.Exit(FAILED)
+
+
+@contextmanager
+def _interruption() -> Iterator[Callable[[], bool]]:
+    """Whether Ctrl-C was pressed: once, and the trial ends and is written; again, and the command ends at once."""
+    pressed = threading.Event()
+    before = signal.getsignal(signal.SIGINT)
+
+    def press(number: int, frame: FrameType | None) -> None:
+        if pressed.is_set():
+            raise KeyboardInterrupt
+        pressed.set()
+
+    # Only the main thread may ask for signals; elsewhere, as in a test, Ctrl-C is somebody else's.
+    mine = threading.current_thread() is threading.main_thread()
+    if mine:
+        signal.signal(signal.SIGINT, press)
+    try:
+        yield pressed.is_set
+    finally:
+        if mine:
+            signal.signal(signal.SIGINT, before)
 
 
 def _formula(task: str, places: "Places | None") -> str:

@@ -87,13 +87,21 @@ def _subject(policies: Sequence[str]) -> str:
 
 
 def _notable(pairs: "Sequence[Pair]", policy: str, count: int) -> "Iterator[tuple[str, Row, Row]]":
-    """The worlds that cost the policy most, and saved it most, against the baseline; with the baseline's row."""
+    """The worlds that cost the policy most, and saved it most, against the baseline; with the baseline's row.
+
+    As figures do, they leave unreliable trials out, and charge unsatisfied ones their budget.
+    """
+    from potlp_jax.sweep.results import charged_cost, reliable_pairs
     from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP
 
     # The two that savings are measured between have none of their own to be notable for.
     if policy in (BASELINE, KNOWN_MAP):
         return
-    ordered = sorted(pairs, key=lambda pair: pair[policy].cost - pair[BASELINE].cost, reverse=True)
+    ordered = sorted(
+        reliable_pairs(pairs),
+        key=lambda pair: charged_cost(pair[policy]) - charged_cost(pair[BASELINE]),
+        reverse=True,
+    )
     for place, pair in enumerate(ordered[:count]):
         yield f"worst {place + 1}", pair[policy], pair[BASELINE]
     # Of few worlds none is shown both as one of the worst and as one of the best.
@@ -112,6 +120,7 @@ def _shown(sweep: "Sweep", reason: str, row: "Row", baseline: "Row") -> "Shown":
         policy=row.item.policy,
         world=row.item.world,
         cost=row.cost,
+        outcome=row.outcome,
         baseline=baseline.cost,
         data=replay_data(trial, views_of(trial, sweep.work.asked(row.item.environment, row.item.policy))),
     )

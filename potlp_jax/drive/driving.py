@@ -41,6 +41,7 @@ def drive_robot(
     name: str = "",
     listener: Callable[[Decision, BeliefMap], None] = lambda _decision, _belief: None,
     inbox: Inbox | None = None,
+    interrupted: Callable[[], bool] = lambda: False,
     clock: Callable[[], float] = time.monotonic,
 ) -> Generator[Trial, None, None]:
     """Drive, or advise, a robot behind a link.
@@ -58,6 +59,7 @@ def drive_robot(
         name: of the robot, for the records.
         listener: is told each decision before it is carried out.
         inbox: what hears the robot; by default one that waits for the network.
+        interrupted: whether the drive shall end; asked again and again. The trial ends ``unfinished``, and is the last.
         clock: seconds, of the same kind as the inbox's.
 
     Yields:
@@ -74,10 +76,13 @@ def drive_robot(
     mover = mover_of(config, link)
     desk = _Desk(inbox, task)
     try:
-        while desk.task is not None:
+        # Also a formula that was heard while its listener had the last trial.
+        while not interrupted() and (desk.task is not None or desk.has_another()):
             asked = desk.begin()
-            robot, advertiser = _robot(link, inbox, mover, asked, desk, config, trial_config, places, clock)
-            yield run_robot(
+            robot, advertiser = _robot(
+                link, inbox, mover, asked, desk, config, trial_config, places, interrupted, clock
+            )
+            trial = run_robot(
                 robot,
                 asked,
                 policy,
@@ -88,6 +93,9 @@ def drive_robot(
                 listener=_listener(advertiser, listener, config),
                 name=name,
             )
+            # A trial may end on the way to a goal; whoever has the record may take long with it.
+            mover.stop()
+            yield trial
     finally:
         # However it ends: nobody is left driving.
         mover.stop()
@@ -102,6 +110,7 @@ def _robot(
     config: DriveConfig,
     trial_config: TrialConfig | None,
     places: Places | None,
+    interrupted: Callable[[], bool],
     clock: Callable[[], float],
 ) -> tuple[RemoteRobot, Advertiser]:
     advertiser = Advertiser(link, config.topics.advice, task, lambda: (robot.frame, robot.frame_id))
@@ -119,7 +128,7 @@ def _robot(
         task.propositions,
         places=places,
         camera=(TrialConfig() if trial_config is None else trial_config).camera,
-        interrupted=desk.has_another,
+        interrupted=lambda: interrupted() or desk.has_another(),
         say=say,
         clock=clock,
     )

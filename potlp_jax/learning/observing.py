@@ -52,7 +52,10 @@ class AnswersFromPanoramas(Protocol):
     """An estimator whose answers about a subgoal come from one of the panoramas that it was shown."""
 
     def observations(self, subgoals: Subgoals) -> Int32[Array, " S"]:
-        """Number of that panorama for each subgoal, counted from 0 as they were shown; anything where masked. Pure."""
+        """Number of that panorama for each subgoal, counted from 0 as they were shown; anything where masked. Pure.
+
+        Records keep it for estimators that do not look on the way: a panorama is then that of a decision.
+        """
         ...
 
 

@@ -75,8 +75,11 @@ def write_trial(trial: Trial, out: Path, kind: BagFormat, labels: Path, height: 
         cell = jax.numpy.asarray(trial.path[step], jax.numpy.int32)
         return np.asarray(photograph(trial.world, cell, jax.random.key(step), config.camera, config.disturbance))
 
-    labels.write_text(labels_text(trial.world), "utf-8")
-    return write_drive(out, kind, trial.world, trial.path, trial.first_seen, panorama, config.camera, height)
+    text = labels_text(trial.world)
+    count = write_drive(out, kind, trial.world, trial.path, trial.first_seen, panorama, config.camera, height)
+    # After the bag: where one is there already, its labels are kept, too.
+    labels.write_text(text, "utf-8")
+    return count
 
 
 def write_drive(

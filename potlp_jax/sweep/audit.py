@@ -1,6 +1,7 @@
 """Check the rows of a sweep against worlds that are made anew, by rules that the planner does not share."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 
 import jax
 import numpy as np
@@ -11,13 +12,18 @@ from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.sweep.rows import read_path
 from potlp_jax.sweep.specification import Cell, Specification
 from potlp_jax.sweep.store import Row
+from potlp_jax.task.task import Task
 from potlp_jax.trials.rules import trial_key
 from potlp_jax.verify.audit import problems_of_ending, problems_of_path
 from potlp_jax.world.grid import World, world_digest
 
 
 def audit_rows(
-    rows: Sequence[Row], split: Split, seed: int = 0, generator_of: Callable[[str], Generator] = make
+    rows: Sequence[Row],
+    split: Split,
+    seed: int = 0,
+    generator_of: Callable[[str], Generator] = make,
+    automata: Mapping[str, str] = MappingProxyType({}),
 ) -> Iterator[tuple[Row, str]]:
     """What is wrong with the trials of a sweep.
 
@@ -26,6 +32,7 @@ def audit_rows(
         split: from which its worlds are.
         seed: of its trials' keys.
         generator_of: the family of worlds of an environment's name.
+        automata: HOA texts of the sweep's tasks that were read from files (``Specification.automata``).
 
     Returns:
         Each row with one sentence for each of its problems, ordered by environment and world; rows without any are not
@@ -41,7 +48,9 @@ def audit_rows(
         if world is None or made != (environment, number):
             world = generator.generate(world_key(split, number, generator.name))
         made = (environment, number)
-        yield from ((row, problem) for problem in problems_of_row(row, world, seed))
+        automaton = automata.get(row.item.task)
+        task = row.item.task if automaton is None else Task.from_hoa(automaton, generator.propositions)
+        yield from ((row, problem) for problem in problems_of_row(row, world, task, seed))
 
 
 def audit_items(rows: Sequence[Row], specification: Specification) -> Iterator[tuple[Row, str]]:
@@ -62,12 +71,13 @@ def audit_items(rows: Sequence[Row], specification: Specification) -> Iterator[t
             yield row, "is of an environment, a task, a policy or a world that the sweep does not have"
 
 
-def problems_of_row(row: Row, world: World, seed: int = 0) -> list[str]:
+def problems_of_row(row: Row, world: World, task: str | Task, seed: int = 0) -> list[str]:
     """What is wrong with one trial; an empty list if nothing is.
 
     Args:
         row: of the store.
         world: the one of the row's environment, split and number.
+        task: the row's, a formula or an automaton.
         seed: of the sweep's keys.
 
     Returns:
@@ -86,4 +96,4 @@ def problems_of_row(row: Row, world: World, seed: int = 0) -> list[str]:
     if row.steps != len(path) - 1:
         found.append(f"has {row.steps} steps, its path {len(path) - 1}")
     found += problems_of_ending(row.outcome, row.cost, row.budget)
-    return found + problems_of_path(world, path, row.cost, row.outcome, row.item.task)
+    return found + problems_of_path(world, path, row.cost, row.outcome, task)

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
-from potlp_jax.sweep.statistics import UNRELIABLE, Comparison, TrialResult
+from potlp_jax.sweep.statistics import SATISFIED, UNRELIABLE, Comparison, TrialResult
 from potlp_jax.sweep.store import Row, Store
 
 Pair = Mapping[str, Row]
@@ -139,6 +139,11 @@ def compare_pairs(
 def reliable_pairs(pairs: Sequence[Pair]) -> list[Pair]:
     """The pairs that figures may be made of: no trial of theirs has an ``UNRELIABLE`` bit."""
     return [pair for pair in pairs if not any(row.status & UNRELIABLE for row in pair.values())]
+
+
+def charged_cost(row: Row) -> float:
+    """What a trial counts for: its cost, or its budget where it did not end satisfied. Giving up is not cheap."""
+    return row.cost if row.outcome == SATISFIED else row.budget
 
 
 def _result(row: Row) -> TrialResult:

@@ -1,7 +1,7 @@
 """What a sweep runs: environments × tasks × policies × worlds, with settings, read from a YAML file.
 
     environments: [firefighting]
-    tasks: [1, 2, 3, 4]            # numbers of the environment's tasks, or formulas
+    tasks: [1, 2, 3, 4]            # numbers of the environment's tasks, formulas, or .hoa files beside this file
     policies: [known-map, baseline, oracle, potlp]
     worlds: 200                    # per environment and task; impossible ones are redrawn
     split: validation              # optional, as are all below
@@ -25,18 +25,28 @@ from typing import Any
 
 from potlp_jax import plugins
 from potlp_jax.codec import config_from_dict, differences, json_copy, read_settings, settings_file, with_settings
+from potlp_jax.environments.base import Generator
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
 from potlp_jax.errors import PluginError, SpecificationError, TaskError, WorldError
 from potlp_jax.files import short
 from potlp_jax.learning.estimator import shipped_files
 from potlp_jax.planning.policies import Policy, named_policy
+from potlp_jax.task.doubts import structure_of
+from potlp_jax.task.reading import read_task
+from potlp_jax.task.shipped import shipped_tasks
+from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """One cell of the sweep's grid: ``worlds`` trials of every policy. ``task`` is a formula or a ``.hoa`` file."""
+    """One cell of the sweep's grid: ``worlds`` trials of every policy.
+
+    Attributes:
+        environment: by its name.
+        task: a formula, or the name of a ``.hoa`` file that has none (``Specification.automata``).
+    """
 
     environment: str
     task: str
@@ -55,6 +65,8 @@ class Specification:
         config: settings of every trial whose policy has none of its own.
         seed: of the trials' keys (not of the worlds).
         policy_configs: settings of the trials of single policies, in the order of the policies.
+        automata: tasks of the cells that were read from files, and what the files held, in HOA format: the sweep is of
+            these automata, whatever becomes of the files.
     """
 
     cells: tuple[Cell, ...]
@@ -66,6 +78,12 @@ class Specification:
     config: TrialConfig = TrialConfig()
     seed: int = 0
     policy_configs: tuple[tuple[str, TrialConfig], ...] = ()
+    automata: tuple[tuple[str, str], ...] = ()
+
+    def task_of(self, cell: Cell, generator: Generator) -> Task:
+        """The task of a cell, over the propositions of its environment."""
+        automaton = dict(self.automata).get(cell.task)
+        return generator.task(cell.task) if automaton is None else Task.from_hoa(automaton, generator.propositions)
 
     def config_of(self, policy: str) -> TrialConfig:
         """The settings of a policy's trials."""
@@ -85,7 +103,8 @@ class Specification:
         }
         # Left out where there are none: the same trials as ever are the same sweep as ever.
         own = {policy: dataclasses.asdict(config) for policy, config in self.policy_configs}
-        return data | {"policy_settings": own} if own else data
+        further = {"policy_settings": own, "automata": dict(self.automata)}
+        return data | {name: entry for name, entry in further.items() if entry}
 
 
 def specification_from_store(data: Mapping[str, Any]) -> Specification:
@@ -103,6 +122,7 @@ def specification_from_store(data: Mapping[str, Any]) -> Specification:
             (policy, config_from_dict(TrialConfig, settings, f"policy_settings: {policy}"))
             for policy, settings in data.get("policy_settings", {}).items()
         ),
+        automata=tuple(data.get("automata", {}).items()),
     )
 
 
@@ -164,8 +184,9 @@ def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = 
     policies = _policies(_list(data, "policies", where), where)
     environments = [str(name) for name in _list(data, "environments", where)]
     split = _split(data.get("split", Split.VALIDATION.value), environments, where)
+    automata: dict[str, str] = {}
     cells = [
-        Cell(environment, _formula(environment, task, where))
+        Cell(environment, _task(environment, task, folder, automata, where))
         for environment in environments
         for task in _list(data, "tasks", where)
     ]
@@ -187,6 +208,7 @@ def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = 
         config=config,
         seed=_number(data, "seed", 0, where, default=0),
         policy_configs=_policy_configs(data.get("policy_settings", {}), policies, config, f"{where}: policy_settings"),
+        automata=tuple(automata.items()),
     )
 
 
@@ -261,18 +283,36 @@ def _split(name: Any, environments: Sequence[str], where: str) -> Split:
     return Split(name)
 
 
-def _formula(environment: str, task: Any, where: str) -> str:
-    """A task by number as its formula, any other (a formula, a ``.hoa`` file) as it is. Raises for what is no task."""
+def _task(environment: str, given: Any, folder: Path, automata: dict[str, str], where: str) -> str:
+    """A task's name in its cell: its formula, or where a file's automaton has none the file's name.
+
+    Args:
+        environment: by its name.
+        given: in the specification: a number, a formula, the name of a shipped task or of a ``.hoa`` file.
+        folder: what names of files are relative to.
+        automata: what files hold, in HOA format, by the name in the cell; added to.
+        where: names the specification in messages.
+
+    Raises:
+        SpecificationError: it is no task of the environment.
+    """
     generator = make(environment)
     # To Python, True is a whole number; and YAML reads `~`, dates and fractions as neither text nor number.
-    if isinstance(task, bool) or not isinstance(task, int | str):
-        raise SpecificationError(f"{where}: tasks: give numbers or formulas, found {short(task)}")
-    # Compiled here only to be checked, so that a wrong task ends the command and not a worker.
+    if isinstance(given, bool) or not isinstance(given, int | str):
+        raise SpecificationError(f"{where}: tasks: give numbers or formulas, found {short(given)}")
+    text = str(given)
+    is_file = text.endswith(".hoa")
+    # Compiled here, so that a wrong task ends the command and not a worker.
     try:
-        generator.task(task)
+        task = generator.task(str(folder / text) if is_file else given)
     except TaskError as error:
         raise SpecificationError(f"{where}: tasks: {error}") from error
-    return generator.tasks.get(str(task), str(task))
+    if not is_file:
+        return task.text if text in shipped_tasks() else generator.formula(given)
+    name = text if structure_of(task) is None else task.text
+    # Over its own propositions, so that it can be read over those of every environment of the sweep.
+    automata[name] = read_task(str(folder / text)).to_hoa()
+    return name
 
 
 def _common_config(environments: Sequence[str], where: str) -> TrialConfig:

@@ -151,7 +151,7 @@ class Work:
     def _tasks(self) -> dict[tuple[str, str], tuple[Task, TaskArrays]]:
         """Tasks by environment and formula, padded per environment to one size: one compilation serves all."""
         tasks = {
-            (cell.environment, cell.task): self._generator(cell.environment).task(cell.task)
+            (cell.environment, cell.task): self.specification.task_of(cell, self._generator(cell.environment))
             for cell in self.specification.cells
         }
         # Sizes differ by environment at most: maps have other shapes there, so that programs differ anyway.

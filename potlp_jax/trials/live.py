@@ -83,8 +83,9 @@ def run_robot(
         setbacks=setbacks,
         listener=listener,
     )
-    here = Domain.of_robot(float(watched.last_map.resolution))
-    asked = estimator_of(policy, task.propositions, here, estimator) if world is None else estimator
+    resolution = float(watched.last_map.resolution)
+    here = Domain.of_robot(resolution) if world is None else Domain.of_world(world, config.camera)
+    asked = estimator_of(policy, task.propositions, here, estimator)
     trial = _recorded(run, watched, task, policy, config, asked)
     return dataclasses.replace(trial, environment=f"{ROBOT_PREFIX}{name}")
 

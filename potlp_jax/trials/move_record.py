@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from potlp_jax.learning.observing import observations_of
+from potlp_jax.learning.observing import looks_on_the_way, observations_of
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.history import ActionTerms
 from potlp_jax.planning.move import Move, MoveKind
@@ -74,6 +74,9 @@ def decision_of(
 
 def _observations(estimator: Estimator | None, move: Move) -> tuple[int, ...]:
     """Per subgoal, the decision whose panorama its estimates come from; there is one panorama per decision."""
+    # What was seen on the way has no number among the decisions: such answers come from no single panorama of theirs.
+    if looks_on_the_way(estimator):
+        return ()
     # A subgoal may be out of sight from here and be known from an earlier panorama.
     numbers = observations_of(estimator, move.subgoals)
     return () if numbers is None else tuple(np.asarray(numbers)[np.asarray(move.subgoals.mask)].tolist())

@@ -73,7 +73,7 @@ class Robot(Protocol):
 
 @runtime_checkable
 class GrowingRobot(Robot, Protocol):
-    """A robot whose map changes its shape, or where it begins, between two calls of ``observe``."""
+    """A robot whose map may grow on any side between two calls of ``observe``; it loses no row or column."""
 
     @property
     def origin(self) -> Cell:

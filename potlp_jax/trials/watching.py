@@ -47,6 +47,7 @@ class WatchedRobot:
         self.history = MapHistory()
         self._late: list[str] = []
         self._belief: BeliefMap | None = None
+        self._origin_before: Cell = (0, 0)
         self._expected: Cell | None = None
         # Where the last leg led, in the lattice that never moves.
         self._leg: tuple[Cell, ...] = ()
@@ -75,7 +76,7 @@ class WatchedRobot:
         belief, cell = observed
         self._check_map(belief)
         self._check_cell(belief, cell)
-        self._belief = belief
+        self._belief, self._origin_before = belief, self.origin
         self.history.add(belief, self.origin, len(self._leg))
         self._leg = ()
         return belief, cell
@@ -123,6 +124,17 @@ class WatchedRobot:
             raise RobotError(
                 f"the robot's map had {_size(before)} cells and has {_size(belief)} now: a robot whose map grows tells "
                 "where it begins, as the property origin (GrowingRobot)"
+            )
+        # Earlier decisions and the path are told on the last map: there is no place on it for what it has lost.
+        now, then = self.origin, self._origin_before
+        ends = zip(now, belief.cells.shape, then, before.cells.shape, strict=True)
+        if not all(
+            first <= first_then and first + size >= first_then + size_then
+            for first, size, first_then, size_then in ends
+        ):
+            raise RobotError(
+                f"the robot's map had {_size(before)} cells from {then} on and has {_size(belief)} from {now} on: "
+                "a map may grow, but loses no row or column (potlp_jax.drive.lattice makes such maps)"
             )
 
     def _check_cell(self, belief: BeliefMap, cell: Cell) -> None:

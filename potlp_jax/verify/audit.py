@@ -3,7 +3,8 @@
 The truth is a world that the caller makes anew, from its environment, split and number: a record that was made in
 another one, or whose copy of the world was changed, is found by that.
 
-The word is judged by ``potlp_jax.verify.semantics``, an evaluator of the formula's semantics; moves, letters, cost and
+The word is judged by ``potlp_jax.verify.semantics``, an evaluator of the formula's semantics (a task that is an
+automaton without a formula by the automaton's table: nothing else says what was to be done); moves, letters, cost and
 what was observed when are checked against the world by rules of this file alone. Nothing of how the library plans,
 moves or simulates is used: a mistake made there is not made here again.
 """
@@ -19,7 +20,7 @@ from jaxtyping import Int32
 
 from potlp_jax.task.task import Task
 from potlp_jax.trials.record import NEVER_SEEN, Outcome, Trial
-from potlp_jax.verify.semantics import word_satisfies, word_violates
+from potlp_jax.verify.semantics import can_be_judged, word_satisfies, word_violates
 from potlp_jax.world.grid import World
 from potlp_jax.world.settings import Settings
 
@@ -52,7 +53,7 @@ def problems_of(trial: Trial, task: Task, world: World) -> list[str]:
         One sentence for each problem. One about a violation of the task begins with ``violates``.
     """
     found = _world_differences(trial.world, world) + _task_differences(trial, task)
-    found += problems_of_path(world, trial.path, trial.cost, trial.outcome, task.text)
+    found += problems_of_path(world, trial.path, trial.cost, trial.outcome, task)
     # What follows looks cells up in the map and letters in the automaton, and needs both to be the trial's.
     if found or trial.first_seen.shape != world.shape:
         return found or ["the table of first observations has another shape than the map"]
@@ -76,7 +77,7 @@ def problems_of_path(
     path: Sequence[Cell] | Int32[np.ndarray, "steps 2"],
     cost: float,
     outcome: str,
-    formula: str,
+    task: str | Task,
 ) -> list[str]:
     """What is wrong with a path that some planner took; an empty list if nothing is.
 
@@ -85,7 +86,8 @@ def problems_of_path(
         path: cells entered in order, the start first.
         cost: what the planner says that the path costs, in the unit of the world's resolution.
         outcome: how the planner says that the trial ended; ``"satisfied"`` is the value that matters.
-        formula: the task, co-safe linear temporal logic over the world's propositions.
+        task: a formula, co-safe linear temporal logic over the world's propositions; or a task, which is judged by its
+            formula, or where its text is none by its automaton.
 
     Returns:
         One sentence for each problem. One about a violation of the task begins with ``violates``.
@@ -106,12 +108,22 @@ def problems_of_path(
     elif not math.isclose(true_cost, cost, rel_tol=_TOLERANCE, abs_tol=_TOLERANCE):
         found.append(f"the cost is said to be {cost}, the moves cost {true_cost}")
     word = _word_of(world, cells)
-    if word_satisfies(formula, world.propositions, word) != (outcome == Outcome.SATISFIED):
+    satisfied, violated = _judged(task, world.propositions, word)
+    if satisfied != (outcome == Outcome.SATISFIED):
         found.append(f"outcome {outcome} is not what the word says")
     # A start that violates is nobody's move.
-    if len(word) > 1 and word_violates(formula, world.propositions, word):
+    if len(word) > 1 and violated:
         found.append("violates the formula")
     return found
+
+
+def _judged(task: str | Task, propositions: tuple[str, ...], word: Sequence[int]) -> tuple[bool, bool]:
+    """Whether a word satisfies and whether it violates a task."""
+    if isinstance(task, Task) and not can_be_judged(task.text, propositions):
+        states = _states_of(task, word)
+        return any(task.dfa.accepting[state] for state in states), bool(task.dfa.trap[states[-1]])
+    formula = task.text if isinstance(task, Task) else task
+    return word_satisfies(formula, propositions, word), word_violates(formula, propositions, word)
 
 
 def _world_differences(claimed: World, world: World) -> list[str]:

@@ -100,6 +100,15 @@ def word_violates(formula: str, propositions: Sequence[str], word: Sequence[int]
     return not _can_reach_done(_after(formula, tuple(propositions), word), _own_letters(formula, tuple(propositions)))
 
 
+def can_be_judged(formula: str, propositions: Sequence[str]) -> bool:
+    """Whether the text is a co-safe formula over these propositions. The name of an automaton may be anything."""
+    try:
+        word_satisfies(formula, propositions, ())
+    except TaskError:
+        return False
+    return True
+
+
 # Parser
 
 

@@ -25,6 +25,7 @@ class Shown:
     policy: str
     world: int
     cost: float
+    outcome: str
     baseline: float
     data: Mapping[str, Any]
 
@@ -193,11 +194,13 @@ def _trials(number: int, shown: Sequence[Shown], replays: list[str], styles: Map
     for index, trial in enumerate(shown):
         name = f"replay-{number}-{index}"
         replays.append(f'<script type="application/json" id="{name}">{embed_json(trial.data)}</script>\n')
-        cells = (str(trial.world), f"{trial.cost:.1f}", f"{trial.baseline:.1f}")
+        cells = (str(trial.world), trial.outcome, f"{trial.cost:.1f}", f"{trial.baseline:.1f}")
         rows += f"<tr><td>{html.escape(trial.reason)}</td>{_policy_cell(trial.policy, styles)}"
         rows += "".join(f"<td>{text}</td>" for text in cells)
         rows += f'<td><button type="button" data-replay="{name}" aria-expanded="false">replay</button></td></tr>'
-    head = "".join(f"<th scope=col>{name}</th>" for name in ("trial", "policy", "world", "cost", "baseline", ""))
+    head = "".join(
+        f"<th scope=col>{name}</th>" for name in ("trial", "policy", "world", "outcome", "cost", "baseline", "")
+    )
     return (
         f'<h3>Trials to look at</h3><div class="scroll trials"><table><thead><tr>{head}</tr></thead>'
         f'<tbody>{rows}</tbody></table></div><div class="replay-place"></div>'

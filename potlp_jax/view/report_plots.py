@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from potlp_jax.sweep.results import Pair
+from potlp_jax.sweep.results import Pair, charged_cost
 from potlp_jax.sweep.statistics import BASELINE
 from potlp_jax.view.comparisons import scatter_costs
 from potlp_jax.view.style import FAINT, INK, figure_bytes, new_figure, policy_styles
@@ -20,10 +20,10 @@ def scatter(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
 
 
 def cumulative(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
-    """Costs summed over the worlds, in the order of their numbers."""
+    """Costs summed over the worlds, in the order of their numbers; unsatisfied trials are charged their budget."""
     figure, axes = _axes(5.2, 4.6)
     for policy, style in policy_styles(policies).items():
-        total = np.cumsum([pair[policy].cost for pair in pairs])
+        total = np.cumsum([charged_cost(pair[policy]) for pair in pairs])
         axes.plot(np.arange(1, len(pairs) + 1), total, style.line, color=style.colour, linewidth=1.6, label=policy)
     axes.set(xlim=(0, max(len(pairs), 1)), xlabel="worlds", ylabel="cost of all of them")
     # From 0: only then are lengths in the plot in proportion to costs.
@@ -33,7 +33,10 @@ def cumulative(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
 
 
 def savings_by_world(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
-    """What each policy saves against the baseline, worlds in order of it: few large savings, or many small ones."""
+    """What each policy saves against the baseline, worlds in order of it: few large savings, or many small ones.
+
+    Unsatisfied trials are charged their budget.
+    """
     figure, axes = _axes(5.2, 4.6)
     axes.axhline(0.0, color=FAINT, linewidth=1.0)
     # Each world in the middle of its share of the axis.
@@ -43,7 +46,7 @@ def savings_by_world(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
         if policy == BASELINE:
             continue
         # Sorted by policy: a curve shows a distribution, points of one column belong to different worlds.
-        saved = np.sort([pair[BASELINE].cost - pair[policy].cost for pair in pairs])[::-1]
+        saved = np.sort([charged_cost(pair[BASELINE]) - charged_cost(pair[policy]) for pair in pairs])[::-1]
         axes.plot(share, saved, style.line, color=style.colour, linewidth=1.6, label=policy)
     axes.set(xlim=(0, 100), xlabel="worlds (%), most saved first", ylabel="saved against the baseline")
     _legend(axes)
