@@ -75,7 +75,9 @@ def _walls(file: Path, root: ElementTree.Element) -> tuple[list[Wall], int]:
 
 def _collisions(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, ...]]:
     """Of every collision the parts whose poses lead to it: the models, outermost first, the link and itself last."""
-    models = deque((model,) for model in root.findall("world/model") + root.findall("model"))
+    models: deque[tuple[ElementTree.Element, ...]] = deque(
+        (model,) for model in root.findall("world/model") + root.findall("model")
+    )
     while models:
         chain = models.popleft()
         for link in chain[-1].findall("link"):
