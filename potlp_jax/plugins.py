@@ -4,12 +4,15 @@ Environments, policies, cameras and estimators of other packages are found here,
 its own. A name is resolved again in every process, so it means the same in the workers of a sweep.
 """
 
+import hashlib
 import importlib
 import importlib.metadata
+import inspect
 import os
 import re
 import sys
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 from potlp_jax.errors import PluginError
@@ -42,6 +45,19 @@ def reference_of(found: Any) -> str:
     """``module:attribute`` of a function or class, or of the class of anything else: how records name it."""
     named = found if hasattr(found, "__qualname__") else type(found)
     return f"{named.__module__}:{named.__qualname__}"
+
+
+def source_digest(found: Any) -> str | None:
+    """Twelve hexadecimal digits of the file that defines a function or class, or the class of anything else.
+
+    None where there is no file, as in a notebook.
+    """
+    named = found if hasattr(found, "__qualname__") else type(found)
+    try:
+        file = inspect.getsourcefile(named)
+        return None if file is None else hashlib.sha256(Path(file).read_bytes()).hexdigest()[:12]
+    except (OSError, TypeError):
+        return None
 
 
 def load(name: str, *, group: str, kind: str, known: Iterable[str] = ()) -> Any:

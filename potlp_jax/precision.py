@@ -6,6 +6,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Int32
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -41,6 +42,14 @@ def in_32_bits(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, 
         return cast(_Result, _resumed_in_32_bits(result)) if isinstance(result, Generator) else result
 
     return narrowed
+
+
+def whole_numbers(given: Any, what: str, error: type[Exception]) -> Int32[Array, "*shape"]:
+    """Whole numbers of any type, Python's included, as the kernels take them. Raises ``error`` for other numbers."""
+    array = jnp.asarray(given)
+    if not jnp.issubdtype(array.dtype, jnp.integer):
+        raise error(f"{what} has the type {array.dtype}: give whole numbers")
+    return array.astype(jnp.int32)
 
 
 def _resumed_in_32_bits(results: Generator[Any]) -> Iterator[Any]:

@@ -66,7 +66,7 @@ from enum import IntFlag
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, UInt32
+from jaxtyping import Array, Integer, UInt32
 
 UNREACHABLE: float = float("inf")
 """Cost of what cannot be reached."""
@@ -83,6 +83,13 @@ NO_SUBGOAL: int = -1
 NO_ACTION: int = -1
 """Index of the chosen action where there is none (accepting root, dead end or invalid input, told apart in
 ``status``)."""
+
+
+StateLike = Integer[Array, ""] | Integer[np.ndarray, ""] | int | np.integer
+"""A state of the automaton as callers may give it: a whole number of any type."""
+
+CellLike = Integer[Array, "2"] | Integer[np.ndarray, "2"] | tuple[StateLike, StateLike]
+"""A cell, likewise."""
 
 
 class Status(IntFlag):

@@ -1,5 +1,8 @@
 """What a caller's own program may ask of the planner: sharding with its checks on, and keys used once."""
 
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,6 +34,73 @@ def test_a_search_within_shard_map_is_the_search(config):
     found, expected = jax.jit(sharded)(chances, keys), jax.jit(plans)(chances, keys)
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("kind", [jnp.int8, jnp.uint8, jnp.uint32, jnp.int16])
+def test_cells_and_states_may_be_whole_numbers_of_any_type(kind):
+    world, config = TOY.world(0), DecisionConfig(frontiers=FrontierConfig(max_subgoals=4))
+    cell, state = world.start, jnp.int32(TASK.dfa.initial)
+    sensor = SensorConfig(range_cells=5.0)
+
+    @jax.jit
+    def decided(cell, state):
+        belief = potlp_jax.observe(potlp_jax.BeliefMap.unobserved(world), world, cell, sensor)
+        subgoals = potlp_jax.frontier_subgoals(belief, cell, state, TASK.arrays, config)
+        shape = (4, TASK.arrays.class_mask.shape[0])
+        estimates = potlp_jax.Estimates(
+            success_probability=jnp.full(shape, 0.5), success_cost=jnp.ones(shape), failure_cost=jnp.ones(shape)
+        )
+        return potlp_jax.decide_from_estimates(
+            belief, subgoals, estimates, TASK.arrays, cell, state, jax.random.key(0), config
+        )
+
+    expected = decided(cell, state)
+    as_python = tuple(int(entry) for entry in cell), int(TASK.dfa.initial)
+    for found in (decided(cell.astype(kind), state.astype(kind)), decided(*as_python)):
+        np.testing.assert_array_equal(found.path.cells, expected.path.cells)
+        assert float(found.value) == float(expected.value)
+
+
+def test_who_asks_for_a_derivative_is_told_what_to_do():
+    def value(chances):
+        return plan(chances, jax.random.key(0), BestFirstConfig(simulations=20)).value
+
+    chances = jnp.full((S, C), 0.5)
+    with pytest.raises(NotImplementedError, match="stop_gradient"):
+        jax.jvp(value, (chances,), (chances,))
+    assert jax.grad(lambda chances: jnp.sum(chances) + value(jax.lax.stop_gradient(chances)))(chances).shape == (S, C)
+
+
+OF_ANOTHER_TYPE = """
+from potlp_jax import BeliefMap, BestFirstConfig, DecisionConfig, FrontierConfig, frontier_subgoals, make
+world = make("toy").world(0)
+belief, task = BeliefMap.unobserved(world), world.task("F goal")
+for make in (
+    lambda: DecisionConfig(search="uct"),
+    lambda: BestFirstConfig(simulations=1e3),
+    lambda: FrontierConfig(max_subgoals=8.0),
+    lambda: frontier_subgoals(belief, (1.5, 1.0), 0, task.arrays),
+    lambda: frontier_subgoals(belief, world.start, 0, task),
+):
+    try:
+        print("no error", make())
+    except ValueError as error:
+        print(error)
+"""
+
+
+def test_what_has_another_type_is_refused_by_name():
+    """In a program of its own: here annotations are checked."""
+    told = subprocess.run([sys.executable, "-c", OF_ANOTHER_TYPE], capture_output=True, text=True, check=True).stdout
+    expected = (
+        "search is 'uct'; give a BestFirstConfig",
+        "simulations is 1000.0, must be a whole",
+        "must be whole",
+        "cell has the type float32: give whole",
+        "the task is a Task; give its arrays",
+    )
+    for line, said in zip(told.splitlines(), expected, strict=True):
+        assert said in line
 
 
 def test_no_key_is_used_twice():

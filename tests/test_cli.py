@@ -267,6 +267,14 @@ def test_a_trial_has_the_key_of_its_world_in_a_sweep(monkeypatch):
     assert (keys[0] == jax.random.fold_in(jax.random.key(0), 3)).all()
 
 
+def test_nothing_of_an_earlier_trial_stays_beside_a_record(tmp_path):
+    out = ("--out", str(tmp_path))
+    assert _potlp("run", "toy", "--policy", "baseline", *out).exit_code == 0
+    (tmp_path / "replay.html").write_text("of the first trial")
+    assert _potlp("run", "toy", "--policy", "baseline", "--world", "1", "--no-animation", *out).exit_code == 0
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["trial.json", "trial.png"]
+
+
 def test_run_as_json_is_the_summary(recorded, tmp_path):
     data = _json(
         _potlp(

@@ -16,7 +16,8 @@ from eval.live.__main__ import run_stream
 from eval.live.perturbation import Network, Perturbation
 from eval.live.server import RosbridgeServer
 from eval.live.simulator import FLOOR, Behaviour, SimulatedLink, SteppedInbox
-from potlp_jax.cli.drive import _interruption
+from potlp_jax.cli.drive import _interruption, _write
+from potlp_jax.cli.inputs import RECORD
 from potlp_jax.drive.config import DriveConfig, Mode, Topics
 from potlp_jax.drive.driving import drive_robot
 from potlp_jax.drive.inbox import Inbox
@@ -444,6 +445,14 @@ def test_ctrl_c_is_asked_for_and_a_second_one_ends_at_once():
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_drive_writes_over_no_other(tmp_path):
+    """Neither over one of the same command nor over one of an earlier: no drive can be had again."""
+    (trial,), _ = driven(Mode.DRY)
+    written = [_write(trial, tmp_path)[0] for _ in range(3)]
+    assert written == [tmp_path / RECORD, tmp_path / "2" / RECORD, tmp_path / "3" / RECORD]
+    assert all(file.is_file() for file in written)
 
 
 def test_without_a_map_the_error_says_what_to_look_at():

@@ -241,7 +241,14 @@ def test_clean_writes_over_no_map(office, tmp_path):
         assert result.exit_code == 2
         assert "would overwrite the map itself" in result.stderr
     assert before == (office.read_bytes(), office.with_suffix(".pgm").read_bytes())
-    result = potlp("map", "clean", office, "--out", tmp_path / "clean.png")
+    clean = tmp_path / "clean.yaml"
+    assert potlp("map", "clean", office, "--out", clean).exit_code == 0
+    # Mended by hand, say.
+    clean.with_suffix(".pgm").write_bytes(b"mine")
+    result = potlp("map", "clean", office, "--out", clean)
+    assert (result.exit_code, "exists: remove it" in result.stderr) == (2, True)
+    assert clean.with_suffix(".pgm").read_bytes() == b"mine"
+    result = potlp("map", "clean", office, "--out", tmp_path / "other.png")
     assert result.exit_code == 2
     assert "must end in .yaml" in result.stderr
     with pytest.raises(MapError, match=r"must end in \.yaml"):

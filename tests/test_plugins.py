@@ -9,7 +9,7 @@ from potlp_jax.cli import completion
 from potlp_jax.environments.families import FAMILIES
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.toy import Toy
-from potlp_jax.errors import EstimatorError, PluginError
+from potlp_jax.errors import EstimatorError, PluginError, StoreError, WorldError
 from potlp_jax.learning.estimator import named_estimator
 from potlp_jax.planning.policies import Policy, named_policy
 from potlp_jax.sweep.runner import RESULTS, run_sweep
@@ -43,6 +43,30 @@ def tall():
     return Toy(ToyConfig(height=11))
 
 number = 3
+
+def forgets(situation, estimates, key, config, intention):
+    nearest(situation, estimates, key, config, intention)
+
+class Unnamed(Toy):
+    def __init__(self):
+        pass
+
+from potlp_jax.environments.base import Generator
+
+class Undrawn(Generator):
+    name, propositions = "undrawn", ("goal",)
+
+class Empty(Small):
+    tasks = {1: "F goal"}
+
+    def draw(self, key):
+        pass
+
+class Bare(Generator):
+    name = "bare"
+
+    def draw(self, key):
+        pass
 """
 
 
@@ -89,6 +113,8 @@ def test_an_environment_by_entry_point(installed):
         ("gone", "environment 'gone' (entry point 'foreign_worlds:Gone'): foreign_worlds has no attribute 'Gone'"),
         ("foreign_worlds:number", "environment 'foreign_worlds:number': int is no environment"),
         ("foreign_worlds:Big", "foreign_worlds has no attribute 'Big'"),
+        ("foreign_worlds:Undrawn", "cannot be made: Can't instantiate abstract class Undrawn"),
+        ("foreign_worlds:Bare", "environment 'foreign_worlds:Bare': its class has no propositions"),
         ("no_such_worlds:Small", "importing no_such_worlds failed: ModuleNotFoundError: No module named 'no_such"),
         ("broken_worlds:Small", "importing broken_worlds failed: ModuleNotFoundError: No module named 'a_library"),
     ],
@@ -97,6 +123,42 @@ def test_errors_say_what_is_wrong(name, message):
     with pytest.raises(PluginError) as error:
         make(name)
     assert message in str(error.value)
+
+
+def test_what_others_forgot_is_named(elsewhere):
+    with pytest.raises(PluginError, match=r"policy foreign_worlds:forgets returned NoneType, expected a Move"):
+        run("foreign_worlds:Small", policy="foreign_worlds:forgets")
+    empty = make("foreign_worlds:Empty")
+    with pytest.raises(WorldError, match="the environment 'small' drew NoneType, expected a World"):
+        empty.world(0)
+    # In a dictionary a number is a number.
+    assert empty.task("1").text == empty.task(1).text == "F goal"
+
+
+@pytest.mark.parametrize(
+    "used",
+    [
+        {"environments": ["foreign_worlds:Small"]},
+        {"policies": ["foreign_worlds:nearest"]},
+        {"policies": ["potlp"], "estimator": "foreign_worlds:guess"},
+    ],
+)
+def test_a_sweep_does_not_go_on_with_what_was_written_otherwise(elsewhere, used):
+    given = {"environments": ["toy"], "tasks": ["F goal"], "policies": ["baseline"], "worlds": 1} | used
+    run_sweep(specification_from_dict(given, "here"), elsewhere / "out")
+    run_sweep(specification_from_dict(given | {"worlds": 2}, "here"), elsewhere / "out")
+    file = elsewhere / "foreign_worlds.py"
+    file.write_text(file.read_text() + "changed = True\n")
+    with pytest.raises(StoreError, match="was begun with another source"):
+        run_sweep(specification_from_dict(given | {"worlds": 3}, "here"), elsewhere / "out")
+
+
+def test_what_comes_with_the_package_is_known_by_its_commit(tmp_path):
+    given = {"environments": ["toy"], "tasks": ["F goal"], "policies": ["baseline"], "worlds": 1}
+    run_sweep(specification_from_dict(given, "here"), tmp_path)
+    store = Store(tmp_path / RESULTS, read_only=True)
+    assert "source" not in store.facts()
+    store.close()
 
 
 def test_references_are_told_from_names_and_files():

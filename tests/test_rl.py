@@ -122,6 +122,14 @@ def test_an_action_that_is_masked_makes_no_move_and_ends_stuck(env):
     assert float(time_step.reward) == -4.0 * (7 + 11)
 
 
+@pytest.mark.parametrize("beyond", [-1, -2, 0, 1000])
+def test_an_action_that_does_not_exist_makes_no_move(env, beyond):
+    state, _ = jax.jit(env.reset)(jax.random.key(3))
+    action = beyond if beyond < 0 else env.num_actions + beyond
+    _, time_step = jax.jit(env.step)(state, jnp.int32(action))
+    assert float(time_step.extras["cost"]) == 0.0
+
+
 def test_an_episode_that_its_budget_ends_is_truncated():
     generator = Toy(ToyConfig(height=7, width=11))
     tight = TaskEnv([generator.world(0)], generator.task(1), config=TrialConfig(budget_factor=0.1))

@@ -33,7 +33,7 @@ from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import ConfigurationError, EngineError, StoreError, SweepError
 from potlp_jax.planning.policies import Policy
-from potlp_jax.sweep.results import charged_cost
+from potlp_jax.sweep.results import charged_cost, pair_rows, remarks_on_worlds
 from potlp_jax.sweep.rows import path_text, read_path
 from potlp_jax.sweep.runner import RESULTS, Sweep, run_sweep
 from potlp_jax.sweep.specification import (
@@ -667,6 +667,23 @@ def test_a_report_writes_each_policy_in_its_colour():
     assert "<td>known-map</td>" in page
 
 
+def test_policies_that_were_in_different_worlds_are_not_compared():
+    """An environment that draws from more than its key makes another world in every process."""
+    rows = [_row(Item("toy", "F goal", policy, world)) for policy in ("baseline", "potlp") for world in (3, 4)]
+    assert len(pair_rows(rows, ["baseline", "potlp"])) == 2
+    rows[3] = dataclasses.replace(rows[3], world_digest="another")
+    with pytest.raises(StoreError, match="toy: world 4 was not the same for all policies"):
+        pair_rows(rows, ["baseline", "potlp"])
+
+
+def test_worlds_that_are_one_world_are_told():
+    pairs = [{"baseline": _row(Item("toy", "F goal", "baseline", world))} for world in range(3)]
+    (line,) = remarks_on_worlds(pairs)
+    assert line.startswith("All 3 worlds are the same one")
+    other = {"baseline": dataclasses.replace(pairs[0]["baseline"], world_digest="another")}
+    assert remarks_on_worlds([*pairs, other]) == remarks_on_worlds(pairs[:1]) == []
+
+
 def test_a_trial_that_gave_up_is_none_of_the_best():
     def pair(world, cost, outcome="satisfied", status=0):
         rows = {policy: _row(Item("toy", "F goal", policy, world), cost=100.0) for policy in ("known-map", "baseline")}
@@ -740,6 +757,7 @@ def test_export_has_a_line_per_trial(finished, tmp_path):
     assert _potlp("sweep", "export", finished, "--out", tmp_path / "a.csv").exit_code == 0
     with (tmp_path / "a.csv").open() as file:
         read = list(csv.DictReader(file))
+    assert {(row["split"], row["seed"]) for row in read} == {("validation", "0")}
     assert [(row["policy"], int(row["world"]), float(row["cost"])) for row in read] == [
         (row.item.policy, row.item.world, row.cost) for row in _rows(finished)
     ]

@@ -1,6 +1,7 @@
 """``potlp drive``: a robot behind rosbridge, driven or advised."""
 
 import dataclasses
+import itertools
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -122,7 +123,8 @@ def drive(
         float, typer.Option("--patience", help="Seconds for which map and pose are waited for.")
     ] = 30.0,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for a record and a page of each task.")
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for a record and a page of each task; the second is in 2, and so on."),
     ] = None,
     json: Json = False,
 ) -> None:
@@ -175,7 +177,7 @@ def drive(
                 interrupted=interrupted,
             ):
                 trials.append(trial)
-                files = [] if folder is None else _write(trial, folder, len(trials))
+                files = [] if folder is None else _write(trial, folder)
                 if not json:
                     console().print(f"{trial.outcome}: {len(trial.decisions)} decisions along {trial.cost:.2f} m")
                     for file in files:
@@ -225,14 +227,16 @@ def _print_decision(decision: "Decision", belief: "BeliefMap") -> None:
     )
 
 
-def _write(trial: "Trial", folder: Path, number: int) -> list[Path]:
+def _write(trial: "Trial", folder: Path) -> list[Path]:
     from potlp_jax.cli.inputs import RECORD
     from potlp_jax.cli.view import PAGE
     from potlp_jax.trials.replay import Views
     from potlp_jax.view.replay_page import replay_page
 
-    # Several tasks, a folder each: every command that reads a record takes its folder.
-    own = folder if number == 1 else make_folder(folder / str(number))
+    # A folder each, because every command that reads a record takes its folder; and no drive can be had again, so that
+    # one of an earlier command stays where it is.
+    numbered = (make_folder(folder / str(number)) for number in itertools.count(2))
+    own = next(place for place in itertools.chain([folder], numbered) if not (place / RECORD).exists())
     trial.save(own / RECORD)
     (own / PAGE).write_text(replay_page(trial, Views()), "utf-8")
     return [own / RECORD, own / PAGE]

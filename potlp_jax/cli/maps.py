@@ -137,6 +137,9 @@ def write_clean_map(
     own = {path.resolve() for path in (image_map.settings.file, image_map.settings.image)}
     if own & {out.resolve(), out.with_suffix(".pgm").resolve()}:
         fail(f"--out {out} would overwrite the map itself; give another name")
+    # It is written to be mended by hand; a repeated command would lose that.
+    if there := [str(written) for written in (out, out.with_suffix(".pgm")) if written.exists()]:
+        fail(f"{' and '.join(there)} exists: remove it, or give another name with --out")
     clean = clean_map(image_map, resolution, radius, read_start(start), "--start")
     out.parent.mkdir(parents=True, exist_ok=True)
     image = save_map(out, clean.free, clean.frame)

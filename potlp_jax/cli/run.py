@@ -150,11 +150,15 @@ def _why_infeasible(generator: "Generator", split: "Split", task: "Task", config
 
 def _write(trial: "Trial", folder: Path, animation: bool) -> list[Path]:
     from potlp_jax.cli.inputs import RECORD
+    from potlp_jax.cli.view import PAGE
     from potlp_jax.view.animation import save_animation
     from potlp_jax.view.maps import draw_trial
     from potlp_jax.view.style import save_figure
 
     files = [folder / RECORD, folder / "trial.png"]
+    # What shows an earlier trial would stand beside the record of this one.
+    for shown in ("trial.gif", PAGE):
+        (folder / shown).unlink(missing_ok=True)
     trial.save(files[0])
     save_figure(draw_trial(trial), files[1])
     if animation:

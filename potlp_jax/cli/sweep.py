@@ -226,12 +226,13 @@ def print_cell(out: Console, cell: "CellResults", split: str) -> None:
         cell: the results.
         split: from which the worlds are, for the heading.
     """
+    from potlp_jax.sweep.results import remarks_on_worlds
     from potlp_jax.view.comparisons import comparison_table, remark_lines
 
     redrawn = f", {cell.redrawn} impossible ones left out" if cell.redrawn else ""
     out.print(f"{cell.environment}/{split}, task {cell.task}: {len(cell.pairs)} worlds{redrawn}", style="bold")
     out.print(comparison_table(cell.comparison))
-    for line in remark_lines(cell.comparison):
+    for line in [*remark_lines(cell.comparison), *remarks_on_worlds(cell.pairs)]:
         out.print(line)
 
 
@@ -244,7 +245,8 @@ def export(
     from potlp_jax.cli.inputs import open_store
 
     with open_store(folder) as store:
-        rows = [_flat(row) for row in store.rows()]
+        specification = store.facts()["specification"]
+        rows = [_flat(row) | {name: specification[name] for name in ("split", "seed")} for row in store.rows()]
     if out.suffix == ".csv":
         _write_csv(rows, out)
     elif out.suffix == ".parquet":

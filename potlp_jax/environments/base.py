@@ -58,7 +58,10 @@ class Generator(abc.ABC):
     @in_32_bits
     def generate(self, key: PRNGKeyArray) -> World:
         """The world of this key, with the settings and the name of its family. Raises WorldError as ``draw``."""
-        return self.signed(self.draw(key))
+        world: Any = self.draw(key)
+        if not isinstance(world, World):
+            raise WorldError(f"the environment {self.name!r} drew {type(world).__name__}, expected a World: make_world")
+        return self.signed(world)
 
     def signed(self, world: World) -> World:
         """The world with the settings and the name of this family. Raises PropositionsError for other propositions."""
@@ -120,7 +123,8 @@ class Generator(abc.ABC):
             TaskError: a number that is none of the tasks.
         """
         # It would be read as a formula, in which 1 and 0 are constants.
-        formula = self.tasks.get(str(text), str(text))
+        # A file of settings makes numbers of such names, and so may a dictionary in Python.
+        formula = {str(name): formula for name, formula in self.tasks.items()}.get(str(text), str(text))
         if formula.strip().isdecimal():
             known = ", ".join(f"{number} ({entry})" for number, entry in self.tasks.items()) or "none"
             raise TaskError(f"{self.name} has no task {text}; it has: {known}. Or give a formula.")

@@ -26,10 +26,16 @@ def make(name: str) -> Generator:
             return plugins.load(reference, group=plugins.ENVIRONMENTS, kind="environment")(name)
     found = plugins.load(NAMED.get(name, name), group=plugins.ENVIRONMENTS, kind="environment", known=FAMILIES)
     # A class or a function makes one; an object is one.
-    generator = found() if callable(found) else found
+    try:
+        generator = found() if callable(found) else found
+    except TypeError as error:
+        # Such as a class without ``draw``, or one that needs arguments.
+        raise PluginError(f"environment {name!r}: cannot be made: {error}") from error
     if not isinstance(generator, Generator):
         raise PluginError(
             f"environment {name!r}: {type(generator).__name__} is no environment: derive its class from "
             "potlp_jax.Generator"
         )
+    if missing := [field for field in ("name", "propositions") if not hasattr(generator, field)]:
+        raise PluginError(f"environment {name!r}: its class has no {' and no '.join(missing)}; see potlp_jax.Generator")
     return generator

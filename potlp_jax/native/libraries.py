@@ -15,7 +15,7 @@ import jax
 import jax.ffi
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
-from jax.interpreters import batching, mlir
+from jax.interpreters import ad, batching, mlir
 
 from potlp_jax.native.build import BuildError, NoCompilerError, built_library
 
@@ -129,7 +129,15 @@ def _vectorise(leaves: Sequence[Any], axes: Sequence[Any], *, native: Any, twin:
     return _choice.bind(*leaves, native=of_rows[0], twin=of_rows[1], shapes=wider), [0] * len(wider)
 
 
+def _no_derivative(*_: Any, **__: Any) -> Any:
+    raise NotImplementedError(
+        "the planner, its distances and its sensing choose among alternatives and have no derivatives: put "
+        "jax.lax.stop_gradient around what goes in"
+    )
+
+
 batching.primitive_batchers[_choice] = _vectorise
+ad.primitive_jvps[_choice] = _no_derivative
 mlir.register_lowering(_choice, mlir.lower_fun(lambda *leaves, twin, **_: twin(*leaves), multiple_results=True))
 mlir.register_lowering(
     _choice, mlir.lower_fun(lambda *leaves, native, **_: native(*leaves), multiple_results=True), platform="cpu"

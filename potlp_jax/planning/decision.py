@@ -21,9 +21,9 @@ from potlp_jax.planning.estimates import Estimates, check_shapes
 from potlp_jax.planning.move import Move
 from potlp_jax.planning.policies import search_move
 from potlp_jax.planning.situation import DecisionConfig, assess, is_in_map
-from potlp_jax.precision import in_32_bits
+from potlp_jax.precision import in_32_bits, whole_numbers
 from potlp_jax.task.task import TaskArrays
-from potlp_jax.types import NO_SUBGOAL, UNREACHABLE, Status, status_array, status_if
+from potlp_jax.types import NO_SUBGOAL, UNREACHABLE, CellLike, StateLike, Status, status_array, status_if
 from potlp_jax.world.frontiers import Subgoals
 from potlp_jax.world.grid import BeliefMap
 
@@ -31,8 +31,8 @@ from potlp_jax.world.grid import BeliefMap
 @in_32_bits
 def frontier_subgoals(
     belief: BeliefMap,
-    cell: Int32[Array, "2"],
-    state: Int32[Array, ""],
+    cell: CellLike,
+    state: StateLike,
     task: TaskArrays,
     config: DecisionConfig = DecisionConfig(),
 ) -> Subgoals:
@@ -86,8 +86,8 @@ def decide_from_estimates(
     subgoals: Subgoals,
     estimates: Estimates,
     task: TaskArrays,
-    cell: Int32[Array, "2"],
-    state: Int32[Array, ""],
+    cell: CellLike,
+    state: StateLike,
     key: PRNGKeyArray,
     config: DecisionConfig = DecisionConfig(),
     intention: Intention | None = None,
@@ -122,6 +122,7 @@ def decide_from_estimates(
       ProblemError: another argument has a wrong shape.
       PropositionsError: belief and task are not over the same propositions.
     """
+    cell, state = whole_numbers(cell, "cell", ProblemError), whole_numbers(state, "state", ProblemError)
     _check_shapes(belief, subgoals, cell, state)
     check_shapes(estimates, subgoals.mask.shape[0], task.class_mask.shape[0])
     # Assessed again, although the caller may have called `frontier_subgoals`: arrays in between are the caller's.
@@ -134,7 +135,7 @@ def decide_from_estimates(
     return search_move(situation.with_status_of(estimates), estimates, key, config, intention)
 
 
-def _check_shapes(belief: BeliefMap, subgoals: Subgoals, cell: Int32[Array, "2"], state: Int32[Array, ""]) -> None:
+def _check_shapes(belief: BeliefMap, subgoals: Subgoals, cell: Int32[Array, "*_"], state: Int32[Array, "*_"]) -> None:
     """Check what the caller brings, while tracing; raises ProblemError for what does not fit the map or the mask."""
     count, grid = subgoals.mask.shape, belief.cells.shape
     expected = {

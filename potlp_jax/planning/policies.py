@@ -20,7 +20,7 @@ from typing import Any, Protocol, cast, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int32, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from potlp_jax import plugins
 from potlp_jax.errors import PluginError
@@ -47,7 +47,7 @@ from potlp_jax.planning.situation import (
 )
 from potlp_jax.precision import in_32_bits
 from potlp_jax.task.task import TaskArrays
-from potlp_jax.types import NO_ACTION, Status, status_if
+from potlp_jax.types import NO_ACTION, CellLike, StateLike, Status, status_if
 from potlp_jax.world.grid import BeliefMap
 
 
@@ -69,14 +69,14 @@ class Policy(StrEnum):
 @in_32_bits
 def decide(
     belief: BeliefMap,
-    cell: Int32[Array, "2"],
-    state: Int32[Array, ""],
+    cell: CellLike,
+    state: StateLike,
     task: TaskArrays,
     estimator: Estimator | None,
     key: PRNGKeyArray,
     intention: Intention | None = None,
     *,
-    policy: "Policy | PolicyFunction",
+    policy: "Policy | PolicyFunction | str",
     config: DecisionConfig,
 ) -> Move:
     """The next move of ``policy``: pure, for jit and vmap.
@@ -85,11 +85,11 @@ def decide(
         belief: what is known of the map.
         cell: the robot's cell.
         state: the automaton's state, the letter of the robot's cell read.
-        task: arrays of the task.
+        task: arrays of the task, ``task.arrays``.
         estimator: answers P_S, R_S and R_F for the policies that ask; None for the others.
         key: for what the policy draws: of the searches ``UctConfig`` alone.
         intention: that of the move before; without one the robot chooses afresh.
-        policy: one of the library's or a function of the user's; static.
+        policy: one of the library's, also by its name, or a function of the user's; static.
         config: settings; static.
 
     Returns:
@@ -99,9 +99,11 @@ def decide(
         PropositionsError: belief, task and estimator are not over the same propositions.
         ValueError: the policy searches and there is no estimator.
         EstimatesError: the estimator's answer has other shapes than were asked for.
+        ProblemError: cell or state are no whole numbers, or the task is not its arrays.
+        PluginError: there is no policy of the name, or the user's returned no move.
     """
     situation = assess(belief, cell, state, task, config.frontiers, config.irrevocable_last)
-    estimates = None if estimator is None else ask(estimator, belief, situation.subgoals, task, state)
+    estimates = None if estimator is None else ask(estimator, belief, situation.subgoals, task, situation.state)
     situation = situation.with_status_of(estimates)
     intention = Intention.none() if intention is None else intention
     return policy_function(policy)(situation, estimates, key, config, intention)
@@ -138,8 +140,9 @@ class PolicyFunction(Protocol):
     ) -> Move: ...
 
 
-def policy_function(policy: Policy | PolicyFunction) -> PolicyFunction:
+def policy_function(policy: Policy | PolicyFunction | str) -> PolicyFunction:
     """The function of a policy: that of the name, or the function itself."""
+    policy = named_policy(policy)
     # A user's function is called like the library's own: there is one signature.
     if not isinstance(policy, Policy):
         return functools.partial(_reported_move, policy)
@@ -151,6 +154,11 @@ def policy_function(policy: Policy | PolicyFunction) -> PolicyFunction:
 def _reported_move(policy: PolicyFunction, situation: Situation, *arguments: Any) -> Move:
     """The move of a user's function with the bits of its situation, also where it was not made by ``move_to``."""
     move = policy(situation, *arguments)
+    if not isinstance(move, Move):
+        raise PluginError(
+            f"policy {policy_name(policy)} returned {type(move).__name__}, expected a Move, as planning.move.move_to "
+            "makes it"
+        )
     return dataclasses.replace(move, status=move.status | situation.status)
 
 

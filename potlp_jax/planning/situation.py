@@ -14,6 +14,7 @@ from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
 from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, require_fields
+from potlp_jax.errors import ProblemError
 from potlp_jax.planning.distances.product import (
     distance_table,
     product_distances,
@@ -24,9 +25,10 @@ from potlp_jax.planning.distances.product import (
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
+from potlp_jax.precision import whole_numbers
 from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import TaskArrays
-from potlp_jax.types import NO_STATE, Status, status_if
+from potlp_jax.types import NO_STATE, CellLike, StateLike, Status, status_if
 from potlp_jax.world.frontiers import FrontierConfig, Subgoals, find_subgoals
 from potlp_jax.world.grid import BeliefMap
 
@@ -58,6 +60,8 @@ class DecisionConfig:
     path_horizon: int | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.search, BestFirstConfig | UctConfig):
+            raise ValueError(f"search is {self.search!r}; give a BestFirstConfig or a UctConfig")
         require_fields(self, ("dead_end_factor",), POSITIVE, ValueError)
         require_fields(self, ("commitment",), NOT_NEGATIVE, ValueError)
         require_fields(self, ("least_chance",), SHARE, ValueError)
@@ -129,8 +133,8 @@ class Situation:
 
 def assess(
     belief: BeliefMap,
-    cell: Int32[Array, "2"],
-    state: Int32[Array, ""],
+    cell: CellLike,
+    state: StateLike,
     task: TaskArrays,
     config: FrontierConfig,
     irrevocable_last: bool = True,
@@ -150,7 +154,12 @@ def assess(
 
     Raises:
       PropositionsError: belief and task are not over the same propositions; while tracing, under jit.
+      ProblemError: cell or state are no whole numbers, or the task is not its arrays.
     """
+    if not isinstance(task, TaskArrays):
+        raise ProblemError(f"the task is a {type(task).__name__}; give its arrays, task.arrays")
+    cell, state = whole_numbers(cell, "cell", ProblemError), whole_numbers(state, "state", ProblemError)
+    belief = dataclasses.replace(belief, resolution=jnp.asarray(belief.resolution, jnp.float32))
     # Every decision, of every policy, begins here: what follows reads letters with the task's tables.
     require_same_propositions(task.propositions, belief.propositions, knower="the belief")
     # Nothing remains to be done after acceptance: without moves of their own, accepting states need no sweep.
@@ -174,7 +183,7 @@ def assess(
             finish_cost,
             belief.letters,
             belief.free,
-            jnp.asarray(belief.resolution),
+            belief.resolution,
             cell,
             state,
             task.irrevocable,

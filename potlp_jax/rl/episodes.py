@@ -271,7 +271,8 @@ class TaskEnv:
         target = jnp.where(goes, task.edges[edge, 0], nearest.target_state)
         target = jnp.where(finishes, situation.finish_state, target)
         kind = jnp.where(goes, MoveKind.ACTION, jnp.where(finishes, MoveKind.FINISH, nearest.kind))
-        allowed = self._action_mask(situation)[jnp.clip(action, 0, self.num_actions - 1)]
+        exists = (action >= 0) & (action < self.num_actions)
+        allowed = exists & self._action_mask(situation)[jnp.clip(action, 0, self.num_actions - 1)]
         # Not NONE, which ends the trial as infeasible: the robot stays where it is and may choose again.
         cell, target = jnp.where(allowed, cell, situation.cell), jnp.where(allowed, target, situation.state)
         return move_to(situation, self.config.decision, kind, cell, target, jnp.float32(0.0))

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
+from potlp_jax.errors import StoreError
 from potlp_jax.sweep.statistics import SATISFIED, UNRELIABLE, Comparison, TrialResult
 from potlp_jax.sweep.store import Row, Store
 
@@ -107,16 +108,41 @@ def world_of(pair: Pair) -> int:
 
 
 def pair_rows(rows: Sequence[Row], policies: Sequence[str]) -> list[Pair]:
-    """The worlds in which every policy has a row, by number. A pair is there for all policies or for none."""
+    """The worlds in which every policy has a row, by number. A pair is there for all policies or for none.
+
+    Raises:
+        StoreError: the policies of a pair were not in the same world.
+    """
     # Of an unfinished sweep some policies have no row yet in the last worlds; those worlds are not compared.
     by_world: dict[int, dict[str, Row]] = {}
     for row in rows:
         by_world.setdefault(row.item.world, {})[row.item.policy] = row
-    return [
+    pairs: list[Pair] = [
         {policy: found[policy] for policy in policies}
         for _, found in sorted(by_world.items())
         if all(policy in found for policy in policies)
     ]
+    for pair in pairs:
+        _require_one_world(pair)
+    return pairs
+
+
+def _require_one_world(pair: Pair) -> None:
+    # Savings over different worlds would be numbers like any others.
+    if len({row.world_digest for row in pair.values()}) > 1:
+        item = next(iter(pair.values())).item
+        raise StoreError(
+            f"{item.environment}: world {item.world} was not the same for all policies: worlds are made from their key "
+            "alone, without a random generator or a file that changes; mend that and begin in another folder"
+        )
+
+
+def remarks_on_worlds(pairs: Sequence[Pair]) -> list[str]:
+    """One line where worlds of different numbers are the same one, so that intervals say nothing."""
+    digests = {row.world_digest for pair in pairs for row in pair.values()}
+    if len(pairs) < 2 or len(digests) > 1:
+        return []
+    return [f"All {len(pairs)} worlds are the same one, as on a map with a fixed start: they count as one, many times."]
 
 
 def compare_pairs(

@@ -8,14 +8,18 @@ import dataclasses
 import itertools
 import logging
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+from potlp_jax import plugins
 from potlp_jax.engine.engine import Broken, Engine
 from potlp_jax.engine.opening import open_engine
 from potlp_jax.engine.writer import only_writer
 from potlp_jax.environments.splits import MAX_INDEX
 from potlp_jax.errors import StoreError, SweepError, WorldError
-from potlp_jax.learning.estimator import identity_of
+from potlp_jax.learning.estimator import identity_of, named_estimator
+from potlp_jax.planning.policies import named_policy
 from potlp_jax.sweep.ending import KEPT, ending_when_asked
 from potlp_jax.sweep.specification import Cell, Specification
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store
@@ -55,6 +59,8 @@ class Sweep:
         self._done = 0
         self.store = Store(folder / RESULTS, read_only)
         facts = {"specification": specification.to_dict(), "estimator": self._estimator_identity()}
+        if sources := self._sources():
+            facts["source"] = sources
         (self.store.compare if read_only else self.store.agree)(facts)
 
     @property
@@ -182,11 +188,29 @@ class Sweep:
         units = environments * len(specification.policies) * specification.worlds
         return max(1, min(BLOCK, units // (_UNITS_A_WORKER * max(workers, 1))))
 
+    def _sources(self) -> dict[str, str]:
+        """Digests of the files of what others wrote, by name: trials before and after a change are not of one sweep."""
+        specification = self.specification
+        names = dict.fromkeys(cell.environment for cell in specification.cells)
+        found: dict[str, Any] = {name: self.work.generator(name) for name in names}
+        found |= {name: named_policy(name) for name in specification.policies}
+        if specification.estimator is not None and plugins.is_known(specification.estimator, plugins.ESTIMATORS):
+            estimator = named_estimator(specification.estimator)
+            found[specification.estimator] = estimator.func if isinstance(estimator, partial) else estimator
+        own = {name: thing for name, thing in found.items() if not _is_ours(thing)}
+        digests = {name: plugins.source_digest(thing) for name, thing in own.items()}
+        return {name: digest for name, digest in digests.items() if digest is not None}
+
     def _estimator_identity(self) -> str | None:
         """Of all that policies ask, so that a store never mixes two. Raises EstimatorError where there is none."""
         environments = sorted({cell.environment for cell in self.specification.cells})
         asked = [self.work.asked(*pair) for pair in itertools.product(environments, self.specification.policies)]
         return ", ".join(dict.fromkeys(identity_of(estimator) for estimator in asked if estimator is not None)) or None
+
+
+def _is_ours(found: Any) -> bool:
+    """Whether a thing is of this package: rows have its commit and version."""
+    return plugins.reference_of(found).startswith("potlp_jax.")
 
 
 def _blocks(items: list[Item], size: int) -> Iterator[list[Item]]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 
+from potlp_jax.environments.base import Generator
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
 from potlp_jax.learning.domain import Domain
@@ -131,6 +132,10 @@ class Work:
             arrays=arrays,
             estimator=self.asked(item.environment, item.policy),
         )
+
+    def generator(self, environment: str) -> Generator:
+        """The family of worlds of a name."""
+        return self._generator(environment)
 
     def asked(self, environment: str, policy: str) -> TrainedEstimator | Estimator | None:
         """What a policy asks in the worlds of an environment; None where it asks nothing."""

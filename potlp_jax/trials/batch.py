@@ -246,8 +246,9 @@ def _check_start(start: Start, first: Start) -> None:
     for what, mine, other in (("world", start.world, first.world), ("task", start.arrays, first.arrays)):
         found, expected = ([leaf.shape for leaf in jax.tree.leaves(tree)] for tree in (mine, other))
         if found != expected:
+            mine, other = next(pair for pair in zip(found, expected, strict=True) if pair[0] != pair[1])
             raise BatchError(
-                f"trial {start.name!r}: its {what} has arrays of shapes {found}, the first of the batch {expected}; "
+                f"trial {start.name!r}: its {what} has an array of shape {mine}, that of the first of the batch is {other}; "
                 "pad worlds with pad_world and tasks with Task.padded, or run them apart"
             )
 

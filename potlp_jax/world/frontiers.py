@@ -77,8 +77,12 @@ class FrontierConfig:
     most_subgoals: int = 512
 
     def __post_init__(self) -> None:
-        if min(self.max_subgoals, self.min_size, self.most_subgoals) < 1:
-            raise ValueError(f"max_subgoals, min_size and most_subgoals must be at least 1, found {self}")
+        if not all(
+            isinstance(size, int) and size >= 1 for size in (self.max_subgoals, self.min_size, self.most_subgoals)
+        ):
+            raise ValueError(
+                f"max_subgoals, min_size and most_subgoals must be whole numbers of at least 1, found {self}"
+            )
 
     def grown(self) -> "FrontierConfig | None":
         """With an array of the next length, None where it is as long as it may become."""

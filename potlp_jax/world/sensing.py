@@ -28,9 +28,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, Int32, UInt8
 
+from potlp_jax.errors import WorldError
 from potlp_jax.native import by_platform, target
-from potlp_jax.precision import in_32_bits
+from potlp_jax.precision import in_32_bits, whole_numbers
 from potlp_jax.task.propositions import require_same_propositions
+from potlp_jax.types import CellLike
 from potlp_jax.world.grid import BeliefMap, World
 from potlp_jax.world.moves import dilate
 
@@ -83,7 +85,7 @@ class _Lines:
 
 
 @in_32_bits
-def observe(belief: BeliefMap, world: World, cell: Int32[Array, "2"], config: SensorConfig) -> BeliefMap:
+def observe(belief: BeliefMap, world: World, cell: CellLike, config: SensorConfig) -> BeliefMap:
     """The belief with all that is in line of sight added.
 
     Args:
@@ -97,11 +99,12 @@ def observe(belief: BeliefMap, world: World, cell: Int32[Array, "2"], config: Se
 
     Raises:
         PropositionsError: belief and world do not name the same propositions.
+        WorldError: the cell is no whole numbers.
     """
     require_same_propositions(
         belief.propositions, world.propositions, asker="the belief", remedy="begin with BeliefMap.unobserved(world)"
     )
-    seen = visible(world.occupied, cell, config)
+    seen = visible(world.occupied, whole_numbers(cell, "cell", WorldError), config)
     truth = jnp.where(world.occupied, jnp.int8(BeliefMap.OCCUPIED), jnp.int8(BeliefMap.FREE))
     return dataclasses.replace(
         belief, cells=jnp.where(seen, truth, belief.cells), letters=jnp.where(seen, world.letters, belief.letters)

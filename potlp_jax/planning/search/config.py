@@ -92,5 +92,5 @@ def _check_kind(config: BestFirstConfig | UctConfig, kind: str) -> None:
 def _check_at_least_one(config: BestFirstConfig | UctConfig, *names: str) -> None:
     for name in names:
         value = getattr(config, name)
-        if value is not None and value < 1:
-            raise ValueError(f"{type(config).__name__}.{name} is {value}, must be at least 1")
+        if value is not None and not (isinstance(value, int) and value >= 1):
+            raise ValueError(f"{type(config).__name__}.{name} is {value}, must be a whole number of at least 1")
