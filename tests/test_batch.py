@@ -143,7 +143,7 @@ def test_what_does_not_fit_is_named():
     first, second = _starts(2)
     height, width = second.world.shape
     large = dataclasses.replace(second, world=pad_world(second.world, height + 1, width), name="large")
-    with pytest.raises(BatchError, match=r"'large': its world has arrays of shapes .*pad worlds"):
+    with pytest.raises(BatchError, match=r"'large': its world has an array of shape .*pad worlds"):
         list(run_batch([first, large], Policy.BASELINE, CONFIG, slots=3))
     finer = dataclasses.replace(second.world, resolution=second.world.resolution / 2)
     with pytest.raises(BatchError, match=r"'finer': its world has the resolution 0.5, the first of the batch 1.0"):

@@ -150,6 +150,8 @@ def test_beliefs_from_host_arrays():
         belief_from_numpy(np.array([[2, 0]]), np.zeros((1, 2), int))
     with pytest.raises(WorldError, match="not observed"):
         belief_from_numpy(np.array([[-1, 0]]), np.array([[1, 0]]))
+    with pytest.raises(WorldError, match="resolution must be a positive number"):
+        belief_from_numpy(np.array([[-1, 0]]), np.array([[0, 0]]), resolution=-1.0)
 
 
 @settings(max_examples=20, deadline=None)

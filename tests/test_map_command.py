@@ -149,6 +149,11 @@ def test_passages_are_the_doors(halves, seed):
         assert any(abs(row - r) <= 2 and abs(col - c) <= 2 for width, r, c in doors if width == passage.width)
 
 
+def test_a_yaw_that_may_be_in_degrees_is_said(tmp_path):
+    file = write_map(tmp_path, p5(building()), origin="[0.0, 0.0, 30.0]")
+    assert "is the third number of origin in degrees?" in potlp("map", "inspect", file).stdout.replace("\n", " ")
+
+
 def test_narrowings_between_small_parts_are_no_passages(office):
     image_map = load_map(office)
     clean = clean_map(image_map)

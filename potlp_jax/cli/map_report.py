@@ -65,6 +65,9 @@ def map_lines(image_map: "OccupancyMap", survey: "MapSurvey") -> Iterator[tuple[
     metres = f"{frame.width * frame.resolution:.2f} x {frame.height * frame.resolution:.2f} m"
     drawn = f"{frame.width} x {frame.height} pixels of {frame.resolution:g} m: {metres}"
     origin = f"[{frame.x:g}, {frame.y:g}], turned by {frame.yaw:g} rad ({math.degrees(frame.yaw):.1f} degrees)"
+    # Robots' own maps are turned by less; degrees in their place would put every label elsewhere.
+    if abs(frame.yaw) > 2 * math.pi:
+        origin += ": more than a whole turn; is the third number of origin in degrees?"
     if image_map.kind == ROS_MAP:
         yield "image", f"{settings.image.name}, {drawn}"
         yield "origin", origin

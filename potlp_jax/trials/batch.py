@@ -248,8 +248,8 @@ def _check_start(start: Start, first: Start) -> None:
         if found != expected:
             mine, other = next(pair for pair in zip(found, expected, strict=True) if pair[0] != pair[1])
             raise BatchError(
-                f"trial {start.name!r}: its {what} has an array of shape {mine}, that of the first of the batch is {other}; "
-                "pad worlds with pad_world and tasks with Task.padded, or run them apart"
+                f"trial {start.name!r}: its {what} has an array of shape {mine}, and the first of the batch one of "
+                f"{other}; pad worlds with pad_world and tasks with Task.padded, or run them apart"
             )
 
 

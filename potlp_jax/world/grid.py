@@ -317,11 +317,12 @@ def belief_from_numpy(
         The belief as the planner takes it.
 
     Raises:
-        WorldError: where an entry of ``cells`` is none of the three, an unobserved cell has a letter, or a letter has
-            a bit without a name.
+        WorldError: where an entry of ``cells`` is none of the three, an unobserved cell has a letter, a letter has a
+            bit without a name, or the resolution is not positive.
         TaskError: where the propositions are no distinct names, or too many.
     """
     names = check_propositions(propositions)
+    _check_resolution(resolution)
     if not np.isin(cells, (BeliefMap.UNKNOWN, BeliefMap.FREE, BeliefMap.OCCUPIED)).all():
         raise WorldError(f"a belief's cells must be -1, 0 or 1, found {np.unique(cells).tolist()[:8]}")
     # Goals of which the robot is told beforehand would be letters of unobserved cells; the model has none.
@@ -421,6 +422,11 @@ def unpack_array(data: Mapping[str, Any]) -> Shaped[np.ndarray, "..."]:
     return np.frombuffer(raw, dtype=dtype).reshape(shape).copy()
 
 
+def _check_resolution(resolution: float) -> None:
+    if not (np.isfinite(resolution) and resolution > 0):
+        raise WorldError(f"the resolution must be a positive number, found {resolution}")
+
+
 def _check(
     occupied: np.ndarray,
     letters: np.ndarray,
@@ -440,8 +446,7 @@ def _check(
         raise WorldError(f"the start ({row}, {column}) lies outside of the {height}x{width} grid")
     if occupied[row, column]:
         raise WorldError(f"the start ({row}, {column}) is an obstacle; choose a free cell")
-    if not (np.isfinite(resolution) and resolution > 0):
-        raise WorldError(f"the resolution must be a positive number, found {resolution}")
+    _check_resolution(resolution)
     if appearance is not None:
         _check_appearance(appearance, occupied.shape)
 
