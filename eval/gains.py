@@ -3,13 +3,14 @@
     git show COMMIT:docs/results/table1/rows.csv.gz > out/before.csv.gz
     python -m eval.gains out/before.csv.gz docs/results/table1/rows.csv.gz
 
-Both are files of ``eval.compact_rows``. A share is of what known map saves over the baseline, as in the tables; its
-interval draws whole worlds.
+Both are files of ``eval.compact_rows``. A share is of what known map saves over the baseline, as in the tables, which
+must cost the same in both; its interval draws whole worlds.
 """
 
 import argparse
 import csv
 import gzip
+import itertools
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -46,8 +47,17 @@ def changes(before: Costs, after: Costs) -> Iterator[tuple[str, int, int, int]]:
 
 
 def gain(before: Costs, after: Costs, task: str, seed: int = 0) -> tuple[float, float, float]:
-    """How much PO-TLP's share of the attainable savings has risen in a task, and the 95 % interval; 1 is all of it."""
+    """How much PO-TLP's share of the attainable savings has risen in a task, and the 95 % interval; 1 is all of it.
+
+    Raises:
+        ValueError: known map or baseline cost otherwise, so that shares before and after are of different savings.
+    """
     worlds = sorted(name for name in before.keys() & after.keys() if name[0] == task)
+    for name, policy in itertools.product(worlds, (Policy.KNOWN_MAP, Policy.BASELINE)):
+        if abs(before[name][policy] - after[name][policy]) > SAME:
+            raise ValueError(
+                f"{policy} costs otherwise in world {name[1]} of task {task}: the shares are of other savings"
+            )
     saved = np.array([before[name][Policy.POTLP] - after[name][Policy.POTLP] for name in worlds])
     attainable = np.array([after[name][Policy.BASELINE] - after[name][Policy.KNOWN_MAP] for name in worlds])
     drawn = np.random.default_rng(seed).integers(0, len(worlds), (_DRAWS, len(worlds)))

@@ -39,3 +39,11 @@ def test_a_gain_is_of_what_can_be_saved(tables):
 def test_the_way_back_loses_what_was_gained(tables):
     before, after = tables
     assert gain(after, before, "F a")[0] == pytest.approx(-12 / 40)
+
+
+@pytest.mark.parametrize("policy", ["baseline", "known-map"])
+def test_shares_of_other_savings_are_not_compared(tables, policy):
+    before, after = tables
+    after["F a", 1][policy] += 1.0
+    with pytest.raises(ValueError, match=f"{policy} costs otherwise in world 1 of task F a"):
+        gain(before, after, "F a")
