@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from potlp_jax.errors import TrainingError
 from potlp_jax.learning.augmentation import Augmentation
 from potlp_jax.learning.batches import Batches
 from potlp_jax.learning.building_estimator import BuildingEstimator
@@ -181,6 +182,38 @@ def test_maps_are_painted_in_trials_as_in_the_training_data(samples, params, gla
     seen = estimator.remember(render(world, cell, CAMERA), belief, cell).memory
     assert bool(belief.free[4, 10])
     assert bool(jnp.isfinite(seen.distance[4, 10])) == glances
+
+
+def test_an_estimator_that_is_gone_on_from_has_the_camera_of_the_data(samples, params):
+    """By which its maps are painted in trials: another one would paint floors elsewhere, without a word."""
+    expected = SIZES.learner(samples).config
+    before = dataclasses.replace(expected, image_shape=(128, 512), horizon=48.0, far=49.0, fold=16.0)
+    begin = TrainedEstimator(params, before, samples.metadata.domain, {}, "before", "0")
+    learner, lines = learner_after(begin, samples, SIZES), []
+    assert learner.config == expected
+    _tell_of_changes(begin, learner, Display(say=lines.append))
+    assert {line.split()[0] for line in lines} == {"image_shape", "horizon", "far", "fold"}
+    # A log's data may not say how its camera sees the floor: then it stays what it was.
+    silent = dataclasses.replace(samples, metadata=dataclasses.replace(samples.metadata, camera={}))
+    assert learner_after(begin, silent, SIZES).config == before
+
+
+@pytest.mark.parametrize("what", ["unit", "camera"])
+def test_an_estimator_does_not_go_on_where_its_numbers_or_pictures_mean_something_else(samples, params, what):
+    domain = samples.metadata.domain
+    other = {
+        "unit": dataclasses.replace(domain, unit="metres"),
+        "camera": dataclasses.replace(domain, camera=dataclasses.replace(domain.camera, far=domain.camera.far + 1)),
+    }[what]
+    building = TrainedEstimator(params, SIZES.learner(samples).config, other, {}, "before", "0")
+    panorama = TrainedEstimator(params, PanoramaOptions().learner(samples).config, other, {}, "before", "0")
+    with pytest.raises(TrainingError, match="cannot go on with these data"):
+        learner_after(panorama, samples, PanoramaOptions())
+    if what == "unit":
+        with pytest.raises(TrainingError, match="it counts in metres"):
+            learner_after(building, samples, SIZES)
+    else:
+        assert learner_after(building, samples, SIZES).config == building.config
 
 
 @pytest.mark.parametrize("own_within", [0, 2])

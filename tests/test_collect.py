@@ -16,6 +16,7 @@ import pandas as pd
 import pytest
 from flax import struct
 
+from examples.own_environment import Corridor
 from potlp_jax.engine.engine import Broken, Here
 from potlp_jax.engine.opening import open_engine
 from potlp_jax.environments.firefighting import Firefighting
@@ -28,12 +29,13 @@ from potlp_jax.learning.dataset import decode, finished_shards, read_metadata, s
 from potlp_jax.learning.dataset_reading import read_dataset
 from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.scenes import survey
-from potlp_jax.recipes.collection import CollectConfig, collect, summary
+from potlp_jax.recipes.collection import CollectConfig, collect, collection_of, summary
 from potlp_jax.recipes.exploration import Explorer, ExplorerConfig
 from potlp_jax.task.task import Task
 from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.renderer import render
 from potlp_jax.world.sensing import SensorConfig
+from potlp_jax.world.settings import Settings
 from tests.reference.dijkstra import dijkstra, grid_moves
 from tests.reference.sensing import visible
 
@@ -214,6 +216,23 @@ def test_a_folder_with_other_settings_is_not_continued(dataset):
         collect(GENERATOR, "firefighting", Split.TRAINING, WORLDS, dataset, other)
     with pytest.raises(DatasetError, match=r'split was "training", is "validation"'):
         collect(GENERATOR, "firefighting", Split.VALIDATION, WORLDS, dataset, CONFIG)
+
+
+def test_an_environment_of_ones_own_is_collected(tmp_path):
+    """It has no configuration, and its trials have another camera: views are taken by that."""
+
+    class Dim(Corridor):
+        settings = Settings(
+            {"camera": {"height": 64, "width": 128, "far": 25.0}, "look_every": 3, "disturbance": {"noise": 2.0}}
+        )
+
+    config = dataclasses.replace(collection_of(Dim()), worlds_per_shard=1, views_per_world=2)
+    assert (config.camera.far, config.look_every, config.disturbance.noise) == (25.0, 3, 2.0)
+    collect(Dim(), "dim", Split.VALIDATION, 1, tmp_path, config)
+    metadata, samples = read_metadata(tmp_path), read_dataset(tmp_path)
+    assert metadata.generator == {}
+    assert metadata.camera["far"] == 25.0
+    assert decode(samples.images[0]).shape == (64, 128, 3)
 
 
 def test_worlds_fill_whole_shards(tmp_path):

@@ -110,6 +110,37 @@ addEventListener("load", () => setTimeout(() => {
 </script></body>"""
 
 
+AGAIN = """<script>
+const shown = [];
+const press = (key) => {
+  document.querySelector("input").dispatchEvent(new KeyboardEvent("keydown", {key, bubbles: true}));
+  shown.push(Number(/decision (\\d+)/.exec(document.querySelector(".where").textContent)[1]));
+};
+for (const key of [...Array(5).fill("PageDown"), ...Array(6).fill("PageUp"), "End", "Home"]) press(key);
+addEventListener("load", () => setTimeout(() => {
+  const result = document.createElement("pre");
+  result.id = "result";
+  result.textContent = JSON.stringify(shown);
+  document.body.append(result);
+}, 500));
+</script></body>"""
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed to look at the page with")
+def test_every_one_of_several_decisions_at_one_step_is_shown(trial, tmp_path):
+    """A robot that fails to move decides again where it is; those decisions say why."""
+    first, second, *_ = trial.decisions
+    steps = [0, 0, second.step, second.step, second.step]
+    decisions = [
+        dataclasses.replace(first if step == 0 else second, index=n, step=step) for n, step in enumerate(steps)
+    ]
+    page = tmp_path / "page.html"
+    text = replay_page(dataclasses.replace(trial, decisions=tuple(decisions)), Views())
+    page.write_text(text.replace("</body>", AGAIN), "utf-8")
+    # After the last decision there is the end, from which one comes back to it.
+    assert dump_page(page, tmp_path / "profile") == [1, 2, 3, 4, 4, 4, 3, 2, 1, 0, 0, 4, 0]
+
+
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed to look at the page with")
 def test_a_browser_shows_the_trial_and_keys_move_through_it(trial, views, tmp_path):
     page = tmp_path / "page.html"

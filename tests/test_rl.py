@@ -11,6 +11,7 @@ from potlp_jax.rl.episodes import OUTCOME_NAMES, StepType, TaskEnv
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.rules import trial_key
+from potlp_jax.world.grid import make_world
 
 STEPS = 12
 
@@ -120,6 +121,25 @@ def test_an_action_that_is_masked_makes_no_move_and_ends_stuck(env):
     assert float(time_step.extras["cost"]) == 0.0
     # The cost of a dead end: four times the seven rows and eleven columns.
     assert float(time_step.reward) == -4.0 * (7 + 11)
+
+
+def test_an_episode_that_cannot_be_won_pays_for_its_failure_once():
+    """The start violates the task: the first step is the last."""
+    world = make_world(
+        np.pad(np.zeros((3, 5), bool), 1, constant_values=True),
+        np.full((5, 7), 1),
+        (2, 2),
+        propositions=("goal", "hazard"),
+    )
+    env = TaskEnv([world], world.task("!goal U hazard"))
+    state, first = jax.jit(env.reset)(jax.random.key(0))
+    assert (float(first.reward), float(first.discount)) == (0.0, 0.0)
+    rewards = []
+    for _ in range(3):
+        state, time_step = jax.jit(env.step)(state, jnp.int32(0))
+        rewards.append(float(time_step.reward))
+    assert OUTCOME_NAMES[int(time_step.extras["outcome"])] == "infeasible"
+    assert rewards == [-4.0 * (5 + 7), 0.0, 0.0]
 
 
 @pytest.mark.parametrize("beyond", [-1, -2, 0, 1000])

@@ -2,7 +2,9 @@
 
 A data set whose labels are means over the buildings that a robot may be in (``potlp collect --set posterior=16``) says
 what an ideal observer answers. The Brier score of an estimator in these buildings is the observer's doubt, which nobody
-takes away, and its excess over that: its mean squared distance from the observer.
+takes away, and its excess over that: its mean squared distance from the observer. Means over n buildings that are drawn
+independently have noise of their own: where all that is asked for is drawn so, the doubt shown is too small by its
+``n - 1``-th part, and the excess too large by as much.
 
     potlp collect firefighting --split validation --worlds 40 --out data/means --set posterior=16 --set driver=potlp \
         --set estimator=firefighting --set drives=1 --set views_per_world=20 --set spacing=[4,40]

@@ -36,8 +36,8 @@ TITLES = {
 OBSERVERS = {
     "firefighting": (
         "the generator's exact one, given every mapped cell and letter, and the tiles and the smoke (above a density "
-        "of 0.01) of every floor cell that has been in line of sight at a decision, at any distance. It knows how "
-        "buildings are drawn; what it does not know, nobody can."
+        "of 0.01) of every floor cell that has been in line of sight from any cell that was entered, at any distance. "
+        "It knows how buildings are drawn; what it does not know, nobody can."
     )
 }
 PARTS = (Arm.TRUE_CHANCES, Arm.TRUE_COSTS)
@@ -45,8 +45,8 @@ PARTS = (Arm.TRUE_CHANCES, Arm.TRUE_COSTS)
 
 OTHER_OBSERVER = (
     "who may be where, given the floor plan, every mapped cell and letter, and whether a room is lit, of every room of "
-    "which a floor cell has been in line of sight at a decision. Having the plan, it bounds from above what can be "
-    "known of a floor that was never seen."
+    "which a floor cell has been in line of sight from any cell that was entered. Having the plan, it bounds from "
+    "above what can be known of a floor that was never seen."
 )
 """What an ideal observer knows, by environment; of floors with people or parcels."""
 

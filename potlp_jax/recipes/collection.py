@@ -124,11 +124,17 @@ class _Job:
 
 
 def collection_of(generator: Generator) -> CollectConfig:
-    """What to record in worlds of a family: subgoals as its trials have them, and never the formulas it holds out."""
-    # The estimator is asked about the subgoals of trials, so it must learn from the same ones.
-    frontiers = trial_config_for(generator).decision.frontiers
+    """What to record in worlds of a family: subgoals and panoramas as its trials have them, and never the formulas it
+    holds out.
+    """
+    # The estimator is asked about the subgoals of trials and looks through their camera, so it must learn from these.
+    trials = trial_config_for(generator)
+    frontiers = trials.decision.frontiers
     return CollectConfig(
         frontiers=frontiers,
+        camera=trials.camera,
+        disturbance=trials.disturbance,
+        look_every=trials.look_every,
         explorer=ExplorerConfig(frontiers=frontiers),
         # An estimator of one family serves all that look like it, so that it must not know their formulas either.
         held_out=HELD_OUT.get(generator.family or generator.name, ()),
@@ -233,7 +239,7 @@ def dataset_metadata(generator: Generator, environment: str, split: Split, confi
         propositions=generator.propositions,
         environment=environment,
         family=world.family,
-        generator=json_copy(dataclasses.asdict(generator.config)),
+        generator={} if generator.config is None else json_copy(dataclasses.asdict(generator.config)),
         split=split.value,
         unit=unit_of(resolution),
         resolution=resolution,

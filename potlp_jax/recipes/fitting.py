@@ -27,6 +27,7 @@ from potlp_jax.errors import TrainingError
 from potlp_jax.files import MOST_TEXT, read_json, reading
 from potlp_jax.learning.building_config import BuildingConfig
 from potlp_jax.learning.building_learner import BuildingOptions
+from potlp_jax.learning.data_figures import camera_geometry, image_shape
 from potlp_jax.learning.dataset import Samples
 from potlp_jax.learning.devices import agreed, is_first, mesh
 from potlp_jax.learning.estimator import TrainedEstimator, read_estimator
@@ -142,25 +143,42 @@ def _begin_journal(training: Samples, plan: TrainingConfig, out: Path, config: F
 
 
 def learner_after(begin: TrainedEstimator, training: Samples, network: BuildingOptions | PanoramaOptions) -> Learner:
-    """What is fitted where an estimator is gone on from."""
+    """What is fitted where an estimator is gone on from.
+
+    Raises:
+        PropositionsError: it was made for other propositions than those of the data.
+        TrainingError: its costs are in another unit, or, of a panorama network, its pictures are of another camera.
+    """
     known = begin.config
+    misfits = begin.domain.measure_misfits(training.metadata.domain)
+    # Whoever reads maps that are painted takes another painter; whoever reads pictures has to learn anew.
+    if misfits and (begin.domain.unit != training.metadata.unit or not isinstance(known, BuildingConfig)):
+        raise TrainingError(f"{begin.name} cannot go on with these data: {'; '.join(misfits)}. Train from nothing")
     require_propositions(known.propositions, training.metadata.propositions, begin.name, asker="the training data")
     # The scales of costs are the estimator's own: with others its parameters would mean other costs. Its maps are
-    # painted as those from which it learns now, and have their cells.
+    # painted as those from which it learns now, by the same camera, and have their cells.
     if isinstance(known, BuildingConfig):
         meant = training.metadata
-        known = dataclasses.replace(known, glances=meant.glances, step=float(meant.resolution))
+        known = dataclasses.replace(known, glances=meant.glances, step=float(meant.resolution), **_camera_of(training))
         # What paths are counts as a choice and not as learned: an estimator of before goes on with those of now.
         if isinstance(network, BuildingOptions):
             known = dataclasses.replace(known, own_within=network.own_within)
     return learner_of(known)
 
 
+def _camera_of(samples: Samples) -> dict[str, Any]:
+    """What a building network keeps of the camera by which its maps are painted; nothing where the data do not say."""
+    camera = samples.metadata.camera
+    if not {"horizon", "far", "fold"} <= camera.keys():
+        return {}
+    return {"image_shape": image_shape(samples), **camera_geometry(samples, "painting the map")}
+
+
 def _tell_of_changes(begin: TrainedEstimator | None, learner: Learner, display: Display) -> None:
     """Say where what is fitted is not what an estimator that is gone on from was."""
     if begin is None or not is_first():
         return
-    for name in ("own_within", "glances", "step"):
+    for name in ("own_within", "glances", "step", "image_shape", "horizon", "far", "fold"):
         before, now = (getattr(config, name, None) for config in (begin.config, learner.config))
         if before != now:
             display.say(f"{name} is {now}; {begin.name} has {before}")

@@ -110,11 +110,14 @@ class TimeStep:
 
 @struct.dataclass(kw_only=True)
 class EnvState:
-    """The hidden state: the true world and the task, the trial's progress, and known space as it was assessed."""
+    """The hidden state: the true world and the task, the trial's progress, known space as it was assessed, and whether
+    a failure has been paid for.
+    """
 
     scene: Scene
     progress: Progress
     situation: Situation
+    paid: Bool[Array, "*batch"]
 
 
 class TaskEnv:
@@ -199,7 +202,7 @@ class TaskEnv:
         """Begin an episode in this world. Its shape must be that of the others, for one compilation to serve all."""
         # A trial draws for its planner and its camera alone, and an episode has neither.
         scene, progress = begin(world, self.task.arrays, jax.random.key(0), None, setup=self._setup)
-        state = self._assessed(scene, progress)
+        state = self._assessed(scene, progress, paid=jnp.bool_(False))
         # Even an episode that cannot be won has a first step, as dm_env has it.
         return state, self._time_step(state, jnp.int8(StepType.FIRST), jnp.float32(0.0))
 
@@ -216,17 +219,19 @@ class TaskEnv:
         """
         before = state.progress
         progress = advance(self._setup, before, state.scene, self._move(state.situation, action))
-        after = self._assessed(state.scene, progress)
+        after = self._assessed(state.scene, progress, state.paid)
         resolution = state.scene.world.resolution
         # From counts of moves, so that the sum over an episode does not depend on how it was cut into legs.
         reward = -(after.progress.tally.travelled - before.tally.travelled) * resolution
         tally = after.progress.tally
-        failed = before.tally.running & ~tally.running & (tally.outcome != _SATISFIED)
-        reward = reward - jnp.where(failed, _cost_of_failure(state.scene.world), 0.0)
+        # Paid once, by the first step after the end: an episode may have ended before its first.
+        failed = ~tally.running & (tally.outcome != _SATISFIED)
+        reward = reward - jnp.where(failed & ~state.paid, _cost_of_failure(state.scene.world), 0.0)
+        after = dataclasses.replace(after, paid=state.paid | failed)
         kind = jnp.where(tally.running, StepType.MID, StepType.LAST).astype(jnp.int8)
         return after, self._time_step(after, kind, reward)
 
-    def _assessed(self, scene: Scene, progress: Progress) -> EnvState:
+    def _assessed(self, scene: Scene, progress: Progress, paid: Bool[Array, ""]) -> EnvState:
         """The state with known space assessed; where no action is left the task is infeasible."""
         decision = self.config.decision
         situation = assess(
@@ -241,7 +246,8 @@ class TaskEnv:
         nowhere = progress.tally.running & ~jnp.any(self._action_mask(situation))
         outcome = jnp.where(nowhere, jnp.int8(_INFEASIBLE), progress.tally.outcome)
         tally = dataclasses.replace(progress.tally, outcome=outcome)
-        return EnvState(scene=scene, progress=dataclasses.replace(progress, tally=tally), situation=situation)
+        progress = dataclasses.replace(progress, tally=tally)
+        return EnvState(scene=scene, progress=progress, situation=situation, paid=paid)
 
     def _distances(self, situation: Situation) -> Float32[Array, "S Z"]:
         """To each subgoal in each state, inf where there is no way; padded subgoals included."""

@@ -16,7 +16,8 @@ function mountReplay(root, data) {
   const lane = keepRight(data.path, 0.24);
   const last = data.path.length - 1;
   const choices = overlayChoices(), pictures = new Map();
-  let step = 0, choice = choices[0];
+  // Several decisions may be taken at one step, where the robot failed to move: each is a place of its own.
+  let step = 0, number = firstDecision(), choice = choices[0];
 
   root.classList.add("replay");
   root.innerHTML = `
@@ -329,10 +330,21 @@ function mountReplay(root, data) {
     context.stroke();
   }
 
-  function decisionNumber() {
-    let number = -1;
-    data.decisions.forEach((decision, index) => { if (decision.step <= step) number = index; });
-    return number;
+  function firstDecision() {
+    return data.decisions.length && data.decisions[0].step === 0 ? 0 : -1;
+  }
+
+  // The decision that is carried out at a step: the last one taken there or before.
+  function decisionAt(there) {
+    let found = -1;
+    data.decisions.forEach((decision, index) => { if (decision.step <= there) found = index; });
+    return found;
+  }
+
+  function moveTo(there, decision = decisionAt(there)) {
+    step = there;
+    number = decision;
+    show();
   }
 
   function showActions(decision) {
@@ -391,7 +403,7 @@ function mountReplay(root, data) {
 
   function show() {
     slider.value = step;
-    const number = decisionNumber(), decision = data.decisions[number], context = canvas.getContext("2d");
+    const decision = data.decisions[number], context = canvas.getContext("2d");
     drawCells(context);
     drawOverlay(context, decision);
     drawNames(context);
@@ -411,21 +423,23 @@ function mountReplay(root, data) {
   }
 
   function go(where) {
-    const number = decisionNumber(), steps = data.decisions.map((decision) => decision.step);
-    if (where === "step-back") step = Math.max(0, step - 1);
-    if (where === "step-on") step = Math.min(last, step + 1);
-    if (where === "decision-on") step = steps[number + 1] ?? last;
-    if (where === "decision-back") step = (steps[number] < step ? steps[number] : steps[number - 1]) ?? 0;
-    if (where === "start") step = 0;
-    if (where === "end") step = last;
-    show();
+    const steps = data.decisions.map((decision) => decision.step);
+    if (where === "step-back") moveTo(Math.max(0, step - 1));
+    if (where === "step-on") moveTo(Math.min(last, step + 1));
+    if (where === "decision-on") number + 1 < steps.length ? moveTo(steps[number + 1], number + 1) : moveTo(last);
+    if (where === "decision-back") {
+      const back = number >= 0 && steps[number] < step ? number : number - 1;
+      back >= 0 ? moveTo(steps[back], back) : moveTo(0, firstDecision());
+    }
+    if (where === "start") moveTo(0, firstDecision());
+    if (where === "end") moveTo(last);
   }
 
   root.addEventListener("click", (event) => {
     const button = event.target.closest("button[data-go]");
     if (button) go(button.dataset.go);
   });
-  slider.addEventListener("input", () => { step = Number(slider.value); show(); });
+  slider.addEventListener("input", () => moveTo(Number(slider.value)));
   part("select").addEventListener("change", (event) => {
     choice = choices[event.target.selectedIndex];
     showScale();
@@ -434,9 +448,9 @@ function mountReplay(root, data) {
   canvas.addEventListener("pointermove", (event) => {
     const box = canvas.getBoundingClientRect();
     const cell = [((event.clientY - box.top) / box.height) * rows, ((event.clientX - box.left) / box.width) * columns].map(Math.floor);
-    if (cell[0] >= 0 && cell[0] < rows && cell[1] >= 0 && cell[1] < columns) showReading(data.decisions[decisionNumber()], cell);
+    if (cell[0] >= 0 && cell[0] < rows && cell[1] >= 0 && cell[1] < columns) showReading(data.decisions[number], cell);
   });
-  canvas.addEventListener("pointerleave", () => showReading(data.decisions[decisionNumber()]));
+  canvas.addEventListener("pointerleave", () => showReading(data.decisions[number]));
   const keys = { ArrowLeft: "step-back", ArrowRight: "step-on", PageUp: "decision-back", PageDown: "decision-on", Home: "start", End: "end" };
   root.tabIndex = -1;
   root.addEventListener("keydown", (event) => {
