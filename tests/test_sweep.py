@@ -776,6 +776,7 @@ def test_parquet_without_its_library_fails_with_what_to_install(finished, tmp_pa
 def test_export_names_status_bits(tmp_path):
     store = Store(tmp_path / RESULTS)
     flagged = Status.SUBGOAL_OVERFLOW | Status.FALLBACK
+    store.agree({"specification": _specification().to_dict()})
     store.finish([dataclasses.replace(_row(ITEMS[0]), status=int(flagged)), _row(ITEMS[1])])
     store.close()
     assert _potlp("sweep", "export", tmp_path, "--out", tmp_path / "a.csv").exit_code == 0
