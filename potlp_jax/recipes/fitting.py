@@ -159,19 +159,12 @@ def learner_after(begin: TrainedEstimator, training: Samples, network: BuildingO
     # painted as those from which it learns now, by the same camera, and have their cells.
     if isinstance(known, BuildingConfig):
         meant = training.metadata
-        known = dataclasses.replace(known, glances=meant.glances, step=float(meant.resolution), **_camera_of(training))
+        camera = {"image_shape": image_shape(training), **camera_geometry(training, "painting the map")}
+        known = dataclasses.replace(known, glances=meant.glances, step=float(meant.resolution), **camera)
         # What paths are counts as a choice and not as learned: an estimator of before goes on with those of now.
         if isinstance(network, BuildingOptions):
             known = dataclasses.replace(known, own_within=network.own_within)
     return learner_of(known)
-
-
-def _camera_of(samples: Samples) -> dict[str, Any]:
-    """What a building network keeps of the camera by which its maps are painted; nothing where the data do not say."""
-    camera = samples.metadata.camera
-    if not {"horizon", "far", "fold"} <= camera.keys():
-        return {}
-    return {"image_shape": image_shape(samples), **camera_geometry(samples, "painting the map")}
 
 
 def _tell_of_changes(begin: TrainedEstimator | None, learner: Learner, display: Display) -> None:
