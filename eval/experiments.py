@@ -150,16 +150,6 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="python -m eval.limit.worst {all}/delivery/generated --out {out} --trials 10 --buildings 8 "
         "--report docs/results/delivery/worst",
     ),
-    "worst-office": Experiment(
-        page="delivery",
-        command="python -m eval.limit.worst {all}/delivery/office --out {out} --trials 10 --buildings 8 "
-        "--report docs/results/delivery/worst_office",
-    ),
-    "worst-school": Experiment(
-        page="delivery",
-        command="python -m eval.limit.worst {all}/delivery/school --out {out} --trials 10 --buildings 8 "
-        "--report docs/results/delivery/worst_school",
-    ),
     "real-maps": Experiment(
         page="delivery",
         command="python -m eval.real_maps --out {out} --maps {data}/maps --worlds 50 --processes {processes} "

@@ -146,16 +146,22 @@ def main() -> None:
     parser.add_argument("--plans", type=Path, help="folder with folders of floor plans")
     parser.add_argument("--out", type=Path, required=True, help="folder of the fit and of the sweeps")
     parser.add_argument("--worlds", type=int, default=60, help="test worlds of each group")
+    parser.add_argument("--only", nargs="+", metavar="GROUP", help="of generated floors, plans by folder and campus")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--report", type=Path, metavar="NAME", help="without suffix: where the results go")
     options = parser.parse_args()
     campus = options.recipe / "round-0" / ESTIMATOR
     if not campus.is_file():
         parser.error(f"{campus} is missing: name the folder that `potlp fit --recipe delivery --out` wrote")
-    estimators = {CAMPUS: campus, SMALL: fit_small(options.out, options.processes)}
     beside = {one.environment: one.environment for one in read_recipe(RECIPE).beside}
+    every = {**groups(options.plans), **beside}
+    if unknown := set(options.only or ()) - every.keys():
+        parser.error(f"there is no group {', '.join(sorted(unknown))}; there are {', '.join(every)}")
+    estimators = {CAMPUS: campus, SMALL: fit_small(options.out, options.processes)}
     found = {}
-    for name, environment in {**groups(options.plans), **beside}.items():
+    for name, environment in every.items():
+        if options.only and name not in options.only:
+            continue
         arms = {
             arm: run_arm(options.out / arm / name, environment, file, options.worlds, options.processes)
             for arm, file in estimators.items()

@@ -50,6 +50,14 @@ MUTANTS = (
     ),
     Mutant(
         PART,
+        "where the horizon cuts a path there is taken to be a frontier",
+        _RULES,
+        "is_frontier &= jnp.all(move.path.cells[move.path.length] == move.target_cell)",
+        "is_frontier &= True",
+        ("tests/test_rules.py",),
+    ),
+    Mutant(
+        PART,
         "visits are not counted anew on another map",
         _RULES,
         "jnp.where(known == tally.known, tally.visits, 0)",
