@@ -150,6 +150,16 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="python -m eval.limit.worst {all}/delivery/generated --out {out} --trials 10 --buildings 8 "
         "--report docs/results/delivery/worst",
     ),
+    "worst-office": Experiment(
+        page="delivery",
+        command="python -m eval.limit.worst {all}/delivery/office --out {out} --trials 10 --buildings 8 "
+        "--report docs/results/delivery/worst_office",
+    ),
+    "worst-school": Experiment(
+        page="delivery",
+        command="python -m eval.limit.worst {all}/delivery/school --out {out} --trials 10 --buildings 8 "
+        "--report docs/results/delivery/worst_school",
+    ),
     "real-maps": Experiment(
         page="delivery",
         command="python -m eval.real_maps --out {out} --maps {data}/maps --worlds 50 --processes {processes} "
@@ -159,6 +169,21 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="delivery",
         command="python -m eval.limit.worst {all}/real-maps/gdc_floor2 --out {out} --trials 10 "
         "--report docs/results/real_maps/floor2_worst",
+    ),
+    "worst-gdc": Experiment(
+        page="delivery",
+        command="python -m eval.limit.worst {all}/real-maps/gdc_3ne --out {out} --trials 10 "
+        "--report docs/results/real_maps/gdc_worst",
+    ),
+    "worst-uma": Experiment(
+        page="delivery",
+        command="python -m eval.limit.worst {all}/real-maps/uma_rooms --out {out} --trials 10 "
+        "--report docs/results/real_maps/uma_worst",
+    ),
+    "worst-intel": Experiment(
+        page="delivery",
+        command="python -m eval.limit.worst {all}/real-maps/intel_lab --out {out} --trials 10 "
+        "--report docs/results/real_maps/intel_worst",
     ),
     # Each shipped recipe from nothing, and what its stages keep: how long one has to train.
     "recipe-firefighting": Experiment(

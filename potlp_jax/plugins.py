@@ -47,6 +47,11 @@ def reference_of(found: Any) -> str:
     return f"{named.__module__}:{named.__qualname__}"
 
 
+def is_ours(found: Any) -> bool:
+    """Whether a function, a class or the class of anything else is of this package, and known by its commit."""
+    return reference_of(found).startswith("potlp_jax.")
+
+
 def source_digest(found: Any) -> str | None:
     """Twelve hexadecimal digits of the file that defines a function or class, or the class of anything else.
 

@@ -192,15 +192,15 @@ def test_a_killed_collection_continues_and_nothing_is_there_twice(dataset, tmp_p
 
 
 def test_several_processes_take_whole_shards(tmp_path):
-    # Worlds without views cost nothing: what counts is that the shards that are missing come from other processes.
-    config = dataclasses.replace(CONFIG, views_per_world=0)
+    # What counts is that the shards that are missing come from other processes.
+    config = dataclasses.replace(CONFIG, views_per_world=1)
     collect(GENERATOR, "firefighting", Split.TRAINING, 2, tmp_path, config)
     first = samples_file(tmp_path, 0).stat().st_mtime_ns
     with open_engine(2) as engine:
         collect(GENERATOR, "firefighting", Split.TRAINING, WORLDS, tmp_path, config, engine)
     assert finished_shards(tmp_path) == set(range(WORLDS // config.worlds_per_shard))
     assert samples_file(tmp_path, 0).stat().st_mtime_ns == first
-    assert len(read_dataset(tmp_path).images) == 0
+    assert len(read_dataset(tmp_path).images) == WORLDS
 
 
 def _assert_same_picture(found, expected):
@@ -230,9 +230,27 @@ def test_an_environment_of_ones_own_is_collected(tmp_path):
     assert (config.camera.far, config.look_every, config.disturbance.noise) == (25.0, 3, 2.0)
     collect(Dim(), "dim", Split.VALIDATION, 1, tmp_path, config)
     metadata, samples = read_metadata(tmp_path), read_dataset(tmp_path)
-    assert metadata.generator == {}
+    assert set(metadata.generator) == {"source"}
     assert metadata.camera["far"] == 25.0
     assert decode(samples.images[0]).shape == (64, 128, 3)
+
+
+def test_a_collection_does_not_go_on_after_its_environment_has_changed(tmp_path, monkeypatch):
+    class Mine(Corridor):
+        pass
+
+    config = dataclasses.replace(collection_of(Mine()), worlds_per_shard=1, views_per_world=2)
+    collect(Mine(), "mine", Split.VALIDATION, 1, tmp_path, config)
+    monkeypatch.setattr("potlp_jax.plugins.source_digest", lambda found: "another")
+    with pytest.raises(DatasetError, match=r"collected otherwise .*source"):
+        collect(Mine(), "mine", Split.VALIDATION, 2, tmp_path, config)
+
+
+def test_fewer_worlds_than_there_are_is_said(tmp_path):
+    config = dataclasses.replace(collection_of(make("toy")), worlds_per_shard=1, views_per_world=2)
+    collect(make("toy"), "toy", Split.VALIDATION, 2, tmp_path, config)
+    with pytest.raises(DatasetError, match="holds 2 worlds, more than the 1 that are asked for"):
+        collect(make("toy"), "toy", Split.VALIDATION, 1, tmp_path, config)
 
 
 def test_worlds_fill_whole_shards(tmp_path):
@@ -306,6 +324,9 @@ def test_the_explorer_sees_much_of_the_building_and_walks_through_known_cells(co
         ({"pursued": 0}, "pursued is 0; give at least 1"),
         ({"drives": 0}, "drives is 0"),
         ({"first_world": -4}, "numbered from 0"),
+        ({"views_per_world": 0}, "views_per_world is 0; give at least 1"),
+        ({"spacing": (9.0, 2.0)}, "give the least and the most"),
+        ({"seed": -1}, "seed is -1"),
         ({"estimator": "firefighting"}, "the driver explorer asks no estimator"),
     ],
 )

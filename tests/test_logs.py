@@ -386,6 +386,16 @@ def test_a_trial_is_written_replayed_and_viewed(trial, tmp_path):
     labels, out = tmp_path / "drive.labels.yaml", tmp_path / "replay"
     text = labels.read_text()
     labels.write_text(f"# mine\n{text}")
+    # Nor over the labels of another bag, or those that were written by hand.
+    mine = tmp_path / "office.labels.yaml"
+    mine.write_text("mine")
+    refused = _potlp("log", "write", tmp_path, "--out", tmp_path / "office.bag")
+    assert (refused.exit_code, mine.read_text()) == (2, "mine")
+    assert not (tmp_path / "office.bag").exists()
+    twice = _potlp("log", "to-dataset", tmp_path / "drive", tmp_path / "drive", "-l", labels, "-o", tmp_path / "data")
+    assert (twice.exit_code, "given twice" in twice.stderr) == (2, True)
+    with pytest.raises(LogError, match="the camera's yaw must be a number"):
+        LogConfig(camera_yaw=math.nan)
     again = _potlp("log", "write", tmp_path, "--out", tmp_path / "drive", "--format", "mcap")
     assert again.exit_code == 2
     assert "exists already" in again.stderr

@@ -13,7 +13,7 @@ from potlp_jax.cli import app
 from potlp_jax.codec import json_copy, shipped_settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
-from potlp_jax.errors import ConfigurationError
+from potlp_jax.errors import ConfigurationError, PotlpError
 from potlp_jax.learning.architectures import architecture_of
 from potlp_jax.learning.dataset import read_metadata
 from potlp_jax.learning.dataset_reading import read_dataset
@@ -352,6 +352,23 @@ def test_what_is_wrong_with_a_recipe_is_named(tmp_path, changes, message):
     (tmp_path / "small.yaml").write_text(json.dumps({**SMALL, **changes}))
     with pytest.raises(ConfigurationError, match=message):
         read_recipe(tmp_path / "small.yaml")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"worlds": 3}, "3 worlds are no whole shards of 2"),
+        ({"drives": 0}, "drives is 0"),
+        ({"epochs": 0}, "epochs is 0"),
+    ],
+)
+def test_what_is_wrong_with_a_round_is_said_before_anything_is_collected(tmp_path, changes, message):
+    given = {"worlds": 2, "validation_worlds": 2, "drives": 1, "epochs": 1, **changes}
+    collect = {**SMALL["collect"], "worlds_per_shard": 2}
+    (tmp_path / "small.yaml").write_text(json.dumps({**SMALL, "collect": collect, "rounds": [given]}))
+    with pytest.raises(PotlpError, match=message):
+        follow(read_recipe(tmp_path / "small.yaml"), tmp_path / "out")
+    assert not list(tmp_path.glob("out/**/*.parquet"))
 
 
 def test_a_recipe_that_is_not_there_is_named_beside_those_that_are(tmp_path):

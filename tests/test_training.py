@@ -35,6 +35,8 @@ from potlp_jax.learning.serialization import load_estimator, save_estimator
 from potlp_jax.learning.training import batches_of, check_data, train
 from potlp_jax.learning.training_options import TrainingConfig
 from potlp_jax.learning.training_steps import initial_state, learning_rate_schedule, make_train_step, shared_sums
+from potlp_jax.recipes.fitting import _tell_of_what_is_shared
+from potlp_jax.recipes.journal import Display
 from potlp_jax.world.camera import CameraConfig
 from tests.reference import data_sets as blank
 from tests.reference.data_sets import blank_columns, blank_fields, world_columns
@@ -351,10 +353,37 @@ def test_a_time_budget_ends_training_with_an_evaluation():
     samples = synthetic(4, 4, 9)
     seen = []
     done = train(_learner(samples, TINY), samples, samples, _config(2), budget_seconds=0.001, on_evaluation=seen.append)
-    # The budget is over before the first step: nothing is trained, or one step and its evaluation.
-    assert done.reason == "time"
-    assert [progress.step for progress in seen] == list(range(1, done.steps + 1))
-    assert done.steps < 2
+    # The budget is over before the first step, which is made all the same: what learned nothing is no estimator.
+    assert (done.reason, done.steps) == ("time", 1)
+    assert [progress.step for progress in seen] == [1]
+    assert np.isfinite(done.best_loss)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"learning_rate": -1e-3},
+        {"clip_norm": 0.0},
+        {"cost_share": -5.0},
+        {"patience": -1},
+        {"seed": -1},
+        {"weight_decay": -1.0},
+    ],
+)
+def test_options_that_make_no_sense_are_named(changes):
+    (name,) = changes
+    with pytest.raises(TrainingError, match=f"{name} is "):
+        _config(1, **changes)
+    with pytest.raises(TrainingError, match="brightness is "):
+        Augmentation(brightness=-0.1)
+
+
+def test_validation_data_that_are_learned_from_are_said():
+    samples, others, lines = synthetic(4, 4, 9), synthetic(4, 4, 10), []
+    _tell_of_what_is_shared(samples, others, Display(say=lines.append))
+    assert not lines
+    _tell_of_what_is_shared(joined([samples, others]), others, Display(say=lines.append))
+    assert "the validation data are among the training data" in lines[0]
 
 
 def _trial(folder: str) -> None:

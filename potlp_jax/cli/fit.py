@@ -57,7 +57,7 @@ def fit(
     minutes: Annotated[
         float | None, typer.Option("--minutes", help="Plan as many steps as fit into this time.")
     ] = None,
-    seed: Annotated[int | None, typer.Option("--seed", help="Of parameters, order and augmentation.")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", min=0, help="Of parameters, order and augmentation.")] = None,
     initial: Annotated[
         Path | None,
         typer.Option(

@@ -159,6 +159,8 @@ def logs_to_dataset(
     from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
     from potlp_jax.logs.working_grid import GridConfig
 
+    if len({bag.resolve() for bag in bags}) < len(bags):
+        fail("a log is given twice: its views would count twice")
     # `office.places.yaml` are the places of office.
     name = labels.name.split(".")[0] if environment is None else environment
     collecting = LogCollectConfig(views_per_world=views, seed=seed, held_out=HELD_OUT.get(name, ()))
@@ -307,7 +309,8 @@ def write_log(
     if (chosen is BagFormat.ROS1) != (out.suffix == ".bag"):
         fail(f"--out {out}: a ROS 1 bag is a file that ends in .bag, and a ROS 2 bag a folder that does not")
     # A bag has no propositions; without the labels beside it, it could not be read back as the same trial.
-    labels = out.with_suffix(".labels.yaml")
+    # A folder's name may have dots that end nothing.
+    labels = out.with_suffix(".labels.yaml") if chosen is BagFormat.ROS1 else out.with_name(f"{out.name}.labels.yaml")
     count = write_trial(load_trial(record_file(trial)), out, chosen, labels, height)
     console().print(f"wrote {out}: {count} messages")
     console().print(f"wrote {labels}")

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float32, PRNGKeyArray
 
-from potlp_jax.checks import SHARE, require_fields
+from potlp_jax.checks import NOT_NEGATIVE, SHARE, require_fields
 from potlp_jax.errors import TrainingError
 
 
@@ -29,6 +29,7 @@ class Augmentation:
 
     def __post_init__(self) -> None:
         require_fields(self, ("mirror_rows", "mirror_columns"), SHARE, TrainingError)
+        require_fields(self, ("brightness", "colour"), NOT_NEGATIVE, TrainingError)
 
 
 def draw_mirrors(key: PRNGKeyArray, views: int, amount: Augmentation) -> tuple[Bool[Array, " G"], Bool[Array, " G"]]:

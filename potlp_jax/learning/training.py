@@ -346,6 +346,9 @@ class _Loop:
         """Why training is over, or None."""
         if self.steps_done >= self._config.steps:
             return "planned"
+        # However short the time, parameters that learned nothing are no estimator.
+        if self.steps_done == 0:
+            return None
         # After the plan, which is the usual end: its name says that the schedule was completed.
         if self._config.patience and int(self._state.evaluations_since_best) >= self._config.patience:
             return "patience"

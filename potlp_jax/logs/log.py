@@ -5,6 +5,7 @@ there may be gigabytes of them.
 """
 
 import contextlib
+import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -74,6 +75,8 @@ class LogConfig:
             raise LogError(
                 f"thresholds are percent with 0 <= free < occupied <= 100, found {self.free} and {self.occupied}"
             )
+        if self.camera_yaw is not None and not math.isfinite(self.camera_yaw):
+            raise LogError(f"the camera's yaw must be a number of degrees, found {self.camera_yaw}")
         if self.vertical_field is not None and not 0 < self.vertical_field <= 180:
             raise LogError(f"the vertical field must lie between 0 and 180 degrees, found {self.vertical_field}")
 

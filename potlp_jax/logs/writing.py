@@ -67,7 +67,7 @@ def write_trial(trial: Trial, out: Path, kind: BagFormat, labels: Path, height: 
         The number of messages.
 
     Raises:
-        LogError: there is something at ``out`` already, or the world has no place for a proposition.
+        LogError: there is something at ``out`` or ``labels`` already, or the world has no place for a proposition.
     """
     config = config_from_dict(TrialConfig, trial.config, "trial record")
 
@@ -75,9 +75,11 @@ def write_trial(trial: Trial, out: Path, kind: BagFormat, labels: Path, height: 
         cell = jax.numpy.asarray(trial.path[step], jax.numpy.int32)
         return np.asarray(photograph(trial.world, cell, jax.random.key(step), config.camera, config.disturbance))
 
+    # They may be of another bag, or have been written by hand.
+    if labels.exists():
+        raise LogError(f"{labels} exists already: choose another name for the bag")
     text = labels_text(trial.world)
     count = write_drive(out, kind, trial.world, trial.path, trial.first_seen, panorama, config.camera, height)
-    # After the bag: where one is there already, its labels are kept, too.
     labels.write_text(text, "utf-8")
     return count
 

@@ -11,13 +11,14 @@ the split, the index of the world and the driver alone.
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import numpy as np
 from jaxtyping import UInt8
 
-from potlp_jax.checks import AT_LEAST_ONE, require_fields
+from potlp_jax import plugins
+from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, require_fields
 from potlp_jax.codec import json_copy
 from potlp_jax.engine.engine import Broken, Engine, Here
 from potlp_jax.engine.writer import only_writer
@@ -89,8 +90,11 @@ class CollectConfig(RecordingConfig):
     posterior: int = 0
 
     def __post_init__(self) -> None:
-        names = ("drives", "pursued", "tasks_per_world", "worlds_per_shard")
+        names = ("views_per_world", "classes", "drives", "pursued", "tasks_per_world", "worlds_per_shard")
         require_fields(self, names, AT_LEAST_ONE, DatasetError)
+        require_fields(self, ("seed", "look_every"), NOT_NEGATIVE, DatasetError)
+        if not 0 <= self.spacing[0] <= self.spacing[1]:
+            raise DatasetError(f"spacing is {self.spacing}: give the least and the most, in cells")
         if self.posterior < 0:
             raise DatasetError(
                 f"posterior is {self.posterior}: give a number of buildings, or 0 for the labels of the robot's own"
@@ -168,7 +172,7 @@ def collect(
             does not fill whole shards.
         WorldError: ``config.posterior`` is asked of a family that does not say what its worlds can be.
     """
-    shards = _whole_shards(worlds, config.worlds_per_shard)
+    shards = whole_shards(worlds, config.worlds_per_shard)
     # Before anything is made: a collection with other settings must not mix with what is there.
     metadata = dataset_metadata(generator, environment, split, config)
     estimator = named_estimator(config.estimator) if config.estimator else None
@@ -188,6 +192,11 @@ def _collect_missing(job: _Job, shards: int, folder: Path, engine: Engine, tell:
             f"{folder} holds a dataset that was collected otherwise ({'; '.join(differences)}): continue with the same "
             "settings, or choose an empty folder"
         )
+    if more := [shard for shard in finished if shard >= shards]:
+        raise DatasetError(
+            f"{folder} holds {(max(more) + 1) * size} worlds, more than the {shards * size} that are asked for: "
+            "ask for as many, or choose an empty folder"
+        )
     # Nobody else writes to the folder now, so temporary files are of processes that were killed.
     remove_unfinished_files(folder)
     # What is finished stays as it is; a larger number of worlds adds shards.
@@ -204,7 +213,8 @@ def _collect_missing(job: _Job, shards: int, folder: Path, engine: Engine, tell:
         tell(Collected(done, worlds, views))
 
 
-def _whole_shards(worlds: int, size: int) -> int:
+def whole_shards(worlds: int, size: int) -> int:
+    """How many shards so many worlds fill. Raises DatasetError where a rest is left."""
     shards, rest = divmod(worlds, size)
     if rest or shards < 1:
         raise DatasetError(
@@ -239,11 +249,18 @@ def dataset_metadata(generator: Generator, environment: str, split: Split, confi
         propositions=generator.propositions,
         environment=environment,
         family=world.family,
-        generator={} if generator.config is None else json_copy(dataclasses.asdict(generator.config)),
+        generator=_described(generator),
         split=split.value,
         unit=unit_of(resolution),
         resolution=resolution,
     )
+
+
+def _described(generator: Generator) -> dict[str, Any]:
+    """What makes the worlds what they are: the configuration, and of a family of one's own the file that defines it."""
+    config = {} if generator.config is None else json_copy(dataclasses.asdict(generator.config))
+    source = None if plugins.is_ours(generator) else plugins.source_digest(generator)
+    return config if source is None else {**config, "source": source}
 
 
 def _recorded(job: _Job, shard: int) -> Iterator[Recorder]:

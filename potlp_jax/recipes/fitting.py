@@ -102,6 +102,7 @@ def fit(
     begin = None if initial is None else read_estimator(initial)
     learner = config.network.learner(training) if begin is None else learner_after(begin, training, config.network)
     _tell_of_changes(begin, learner, display)
+    _tell_of_what_is_shared(training, validation, display)
     # Measuring counts: the time asked for is that of the whole command.
     began = time.perf_counter()
     plan = _plan(learner, training, out, config)
@@ -175,6 +176,15 @@ def _tell_of_changes(begin: TrainedEstimator | None, learner: Learner, display: 
         before, now = (getattr(config, name, None) for config in (begin.config, learner.config))
         if before != now:
             display.say(f"{name} is {now}; {begin.name} has {before}")
+
+
+def _tell_of_what_is_shared(training: Samples, validation: Samples, display: Display) -> None:
+    """Say where the data that choose the parameters are among those that are learned from."""
+    if is_first() and set(training.sources) & set(validation.sources):
+        display.say(
+            "the validation data are among the training data: they choose the parameters by what was learned, and say "
+            "nothing about other worlds"
+        )
 
 
 def _plan(learner: Learner, training: Samples, out: Path, config: FitConfig) -> TrainingConfig:

@@ -29,7 +29,7 @@ from potlp_jax.learning.dataset import Samples
 from potlp_jax.learning.dataset_reading import joined, read_dataset
 from potlp_jax.learning.training import Trained
 from potlp_jax.planning.policies import Policy
-from potlp_jax.recipes.collection import CollectConfig, Collected, collect, collection_of
+from potlp_jax.recipes.collection import CollectConfig, Collected, collect, collection_of, whole_shards
 from potlp_jax.recipes.fitting import ESTIMATOR, FitConfig, fit
 from potlp_jax.recipes.journal import Display
 from potlp_jax.recipes.times import TIMES, Times
@@ -212,7 +212,9 @@ def follow(
     records: list[Samples] = []
     times = Times(out / TIMES)
     trained = None
-    for number, (folder, stage) in enumerate(zip(folders, _stages(recipe, folders), strict=True)):
+    # All of them before anything is collected: what is wrong with a round is said at once, and not hours later.
+    stages = list(_stages(recipe, folders))
+    for number, (folder, stage) in enumerate(zip(folders, stages, strict=True)):
         # Let go of before the fit, which wants all cores and their memory.
         with open_engine(processes, cluster) as engine:
             for part in stage.parts:
@@ -277,6 +279,7 @@ class _Parts:
     def _part(self, name: str, environment: str, split: Split, worlds: int, config: CollectConfig) -> _Part:
         first = self._recipe.collect.first_world + self._taken[environment, split]
         self._taken[environment, split] += worlds
+        whole_shards(worlds, config.worlds_per_shard)
         return _Part(name, environment, split, first, worlds, config)
 
 

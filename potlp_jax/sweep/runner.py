@@ -197,7 +197,7 @@ class Sweep:
         if specification.estimator is not None and plugins.is_known(specification.estimator, plugins.ESTIMATORS):
             estimator = named_estimator(specification.estimator)
             found[specification.estimator] = estimator.func if isinstance(estimator, partial) else estimator
-        own = {name: thing for name, thing in found.items() if not _is_ours(thing)}
+        own = {name: thing for name, thing in found.items() if not plugins.is_ours(thing)}
         digests = {name: plugins.source_digest(thing) for name, thing in own.items()}
         return {name: digest for name, digest in digests.items() if digest is not None}
 
@@ -206,11 +206,6 @@ class Sweep:
         environments = sorted({cell.environment for cell in self.specification.cells})
         asked = [self.work.asked(*pair) for pair in itertools.product(environments, self.specification.policies)]
         return ", ".join(dict.fromkeys(identity_of(estimator) for estimator in asked if estimator is not None)) or None
-
-
-def _is_ours(found: Any) -> bool:
-    """Whether a thing is of this package: rows have its commit and version."""
-    return plugins.reference_of(found).startswith("potlp_jax.")
 
 
 def _blocks(items: list[Item], size: int) -> Iterator[list[Item]]:
