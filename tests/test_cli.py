@@ -13,14 +13,16 @@ from pathlib import Path
 import jax
 import pytest
 from PIL import Image
+from typer import Exit
 from typer.testing import CliRunner
 
 from potlp_jax.cli import app, completion
+from potlp_jax.cli.output import clear_errors
 from potlp_jax.environments.families import FAMILIES, NAMED
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.environments.toy import Toy
-from potlp_jax.errors import PotlpError, WorldError
+from potlp_jax.errors import PotlpError, PotlpWarning, WorldError
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
 from potlp_jax.task.task import Task
@@ -53,6 +55,14 @@ def recorded(tmp_path_factory) -> Path:
     result = _potlp("run", "toy", "-t", "2", "--policy", "oracle", "--world", "3", "--out", folder, *FAST)
     assert result.exit_code == 0, result.output
     return folder
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="the system has no file that is always full")
+def test_a_full_disk_is_said_in_one_line(capfd):
+    with pytest.raises(Exit) as ended, clear_errors():
+        Path("/dev/full").write_text("rows")
+    assert ended.value.exit_code == 1
+    assert "No space left on device: what was finished is kept; make room" in capfd.readouterr().err
 
 
 def test_help_leads_a_newcomer_to_the_commands():
@@ -469,6 +479,12 @@ def test_the_demo_quotes_the_results():
     less, same = sum(cost > 1e-3 for cost in saved), sum(abs(cost) <= 1e-3 for cost in saved)
     claim = f"Over {len(saved)} worlds PO-TLP costs less than the baseline in {100 * less / len(saved):.1f} %"
     assert claim + f" and the same in {100 * same / len(saved):.1f} %" in (ROOT / "Makefile").read_text()
+
+
+def test_from_python_too_it_is_said_why_the_policy_is_the_baseline():
+    with pytest.warns(PotlpWarning, match="no estimator is shipped .*the policy is baseline; give policy="):
+        trial = run("toy", 2, world=4)
+    assert trial.policy == "baseline"
 
 
 def test_impossible_worlds_are_redrawn(monkeypatch):

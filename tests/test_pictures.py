@@ -2,10 +2,13 @@
 
 import hashlib
 import json
+from pathlib import Path
 
 import pytest
 
 from eval.pictures import FACTS, FOLDER, MAX_BYTES, PICTURES, picture_trial, trial_digest
+
+ROOT = Path(__file__).parents[1]
 
 MADE_BY_HAND = {"map.png"}
 """Needs a map that does not ship (docs/maps.md)."""
@@ -30,8 +33,11 @@ def test_a_picture_is_as_it_was_made_and_not_too_large(name, facts):
     assert len(content) <= MAX_BYTES
 
 
-@pytest.mark.parametrize("policy", ["baseline", "potlp"])
-def test_trials_of_the_pictures_go_the_same_way_today(policy, facts):
-    digest = trial_digest(picture_trial(policy))
+@pytest.mark.parametrize(("policy", "words"), [("baseline", "the baseline's path costs"), ("potlp", "PO-TLP's")])
+def test_trials_of_the_pictures_go_the_same_way_today(policy, words, facts):
+    trial = picture_trial(policy)
+    for page in (ROOT / "README.md", ROOT / "docs" / "index.md"):
+        assert f"{words} {trial.cost:.0f}" in page.read_text(), page
+    digest = trial_digest(trial)
     for name, fact in facts.items():
         assert fact["trials"].get(policy, digest) == digest, f"{name} shows another path than today's; {REMEDY} {name}"

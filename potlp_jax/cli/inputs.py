@@ -14,8 +14,7 @@ from potlp_jax.cli.output import fail
 from potlp_jax.codec import with_settings
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split, default_split, world_key
-from potlp_jax.learning.domain import Domain
-from potlp_jax.learning.estimator import TrainedEstimator, named_estimator, why_none_is_shipped
+from potlp_jax.learning.estimator import TrainedEstimator, named_estimator
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.runner import RESULTS
@@ -47,7 +46,7 @@ def default_policy_with_note(
     """PO-TLP where an estimator is given or shipped for such worlds, otherwise the baseline, with a note."""
     policy = run.default_policy(world, config, given)
     if policy is not Policy.POTLP:
-        reason = why_none_is_shipped(world.propositions, Domain.of_world(world, config.camera))
+        reason = run.reason_for_baseline(world, config)
         logger.warning(f"{reason}: the policy is {policy}; choose another with --policy, or an --estimator")
     return policy
 

@@ -3,6 +3,7 @@
 What only some commands need is imported where it is used: help and completion load this file too.
 """
 
+import errno
 import json
 import logging
 import warnings
@@ -24,6 +25,9 @@ logger = logging.getLogger(__name__)
 # Exit codes, as the help of `potlp` lists them. 130 is what the shell reports after an interrupt.
 FAILED = 1
 BAD_INPUT = 2
+
+# Systems do not say which file they could not write on.
+_OF_DISKS = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 
 PIPE_COLUMNS: int = 160
 """Width of what is printed where stdout is no terminal: the widest table of the commands fits."""
@@ -123,10 +127,12 @@ def clear_errors() -> Iterator[None]:
     except PotlpError as error:
         fail(str(error))
     except OSError as error:
-        # An error of the system that is about no file is such a fault too.
-        if error.filename is None:
-            raise
-        fail(f"{error.filename}: {error.strerror}", FAILED)
+        if error.filename is not None:
+            fail(f"{error.filename}: {error.strerror}", FAILED)
+        if error.errno in _OF_DISKS:
+            fail(f"{error.strerror}: what was finished is kept; make room, and give the same command again", FAILED)
+        # Any other error of the system that is about no file is such a fault too.
+        raise
 
 
 def _show_warning(

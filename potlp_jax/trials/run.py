@@ -1,10 +1,13 @@
 """A trial by the names that the command line uses."""
 
+import warnings
+
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, default_split
+from potlp_jax.errors import PotlpWarning
 from potlp_jax.learning.domain import Domain
-from potlp_jax.learning.estimator import TrainedEstimator, named_estimator, shipped_estimator
+from potlp_jax.learning.estimator import TrainedEstimator, named_estimator, shipped_estimator, why_none_is_shipped
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy, PolicyFunction
 from potlp_jax.task.task import Task
@@ -32,7 +35,7 @@ def run(
         environment: a name that ``make`` knows, or a generator.
         task: number of one of the environment's tasks, a formula over its propositions, or a task.
         policy: a name or a function (``planning.policies.named_policy``); default: ``potlp`` where an estimator is
-            given, or shipped for such worlds, otherwise ``baseline``.
+            given, or shipped for such worlds, otherwise ``baseline``, with a ``PotlpWarning`` that says why.
         world: number of the world in the split.
         split: default: that of the command line, ``validation`` (``test`` for real buildings).
         config: default: what the environment calls for.
@@ -57,13 +60,33 @@ def run(
     return run_trial(
         made,
         task if isinstance(task, Task) else generator.task(task),
-        default_policy(made, config, asked) if policy is None else policy,
+        _policy_with_warning(made, config, asked) if policy is None else policy,
         trial_key(world, seed),
         config,
         environment=f"{environment if isinstance(environment, str) else generator.name}/{chosen}",
         world_number=world,
         estimator=asked,
     )
+
+
+def _policy_with_warning(
+    world: World, config: TrialConfig | None, given: TrainedEstimator | Estimator | None
+) -> Policy:
+    """The default policy; that it is not PO-TLP is a warning that says why."""
+    policy = default_policy(world, config, given)
+    if policy is not Policy.POTLP:
+        warnings.warn(
+            f"{reason_for_baseline(world, config)}: the policy is {policy}; give policy=, or estimator=",
+            PotlpWarning,
+            stacklevel=3,
+        )
+    return policy
+
+
+def reason_for_baseline(world: World, config: TrialConfig | None = None) -> str:
+    """Why no estimator is shipped for such a world and camera, in words."""
+    config = trial_config_for(world) if config is None else config
+    return why_none_is_shipped(world.propositions, Domain.of_world(world, config.camera))
 
 
 def default_policy(
