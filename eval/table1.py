@@ -101,7 +101,7 @@ def _count(folder: Path) -> int:
 def results(folder: Path) -> dict[str, Any]:
     """Table, audit and times of what is finished."""
     store = Store(folder / RESULTS)
-    specification, rows = store.facts()["specification"], store.rows()
+    specification, rows = store.specification(), store.rows()
     facts = store.facts()
     store.close()
     split = Split(specification["split"])

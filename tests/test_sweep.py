@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -25,15 +26,15 @@ from eval.real_maps.__main__ import exchange
 from eval.savings import decisions_of
 from potlp_jax.cli import app
 from potlp_jax.cli.report import _notable, page_title
-from potlp_jax.cli.sweep import forget_broken
 from potlp_jax.codec import shipped_settings
 from potlp_jax.engine.engine import Broken, Here
 from potlp_jax.engine.writer import only_writer
 from potlp_jax.environments.registry import make
-from potlp_jax.environments.splits import Split, world_key
-from potlp_jax.errors import ConfigurationError, EngineError, StoreError, SweepError
+from potlp_jax.environments.splits import MAX_INDEX, Split, world_key
+from potlp_jax.environments.toy import Toy
+from potlp_jax.errors import ConfigurationError, EngineError, EstimatorError, StoreError, SweepError, WorldError
 from potlp_jax.planning.policies import Policy
-from potlp_jax.sweep.results import charged_cost, pair_rows, remarks_on_worlds
+from potlp_jax.sweep.results import charged_cost, pair_rows, read_results, remarks_on_worlds, world_of
 from potlp_jax.sweep.rows import path_text, read_path
 from potlp_jax.sweep.runner import RESULTS, Sweep, run_sweep
 from potlp_jax.sweep.specification import (
@@ -44,6 +45,7 @@ from potlp_jax.sweep.specification import (
     specification_from_store,
 )
 from potlp_jax.sweep.store import Item, Row, Store
+from potlp_jax.sweep.work import Examined, Work
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
@@ -229,6 +231,87 @@ def test_a_store_of_another_sweep_is_refused_by_name(tmp_path):
         Sweep(_specification(worlds=2), tmp_path)
 
 
+@pytest.mark.parametrize("pragma", [None, "PRAGMA journal_mode=WAL", "PRAGMA user_version=0"])
+def test_a_store_that_never_got_its_tables_goes_on(pragma, tmp_path):
+    """A full disk, or a kill at the start, leaves it so."""
+    if pragma is None:
+        (tmp_path / RESULTS).touch()
+    else:
+        with contextlib.closing(sqlite3.connect(tmp_path / RESULTS)) as begun:
+            begun.execute(pragma)
+    for command in ("status", "show"):
+        told = _potlp("sweep", command, tmp_path)
+        assert (told.exit_code, "holds nothing yet: give the sweep's command again" in told.stderr) == (2, True)
+    run_sweep(_specification(worlds=1), tmp_path)
+    assert Sweep(_specification(worlds=1), tmp_path, read_only=True).finished()
+
+
+def test_of_a_specification_that_cannot_be_run_no_store_is_begun(tmp_path):
+    with pytest.raises(EstimatorError):
+        run_sweep(_specification(policies=["potlp"]), tmp_path)
+    assert not (tmp_path / RESULTS).exists()
+    Store(tmp_path / RESULTS).close()
+    for command in ("status", "show"):
+        told = _potlp("sweep", command, tmp_path)
+        assert (told.exit_code, "holds nothing yet" in told.stderr) == (2, True)
+
+
+def test_rows_of_a_world_that_has_changed_are_not_gone_on_with_nor_shown(finished, tmp_path, monkeypatch):
+    folder = tmp_path / "sweep"
+    shutil.copytree(finished, folder)
+    plain = Toy.draw
+    # As where a wall was drawn into the picture of a map.
+    monkeypatch.setattr(Toy, "draw", lambda self, key: plain(self, jax.random.fold_in(key, 1)))
+    with pytest.raises(StoreError, match="toy: world 5 is not that of the rows that are there"):
+        run_sweep(_specification(worlds=4), folder)
+    told = _potlp("report", folder, "--out", tmp_path / "report.html")
+    assert (told.exit_code, "is not that of the rows that are there" in told.stderr) == (2, True)
+    assert _potlp("report", folder, "--out", tmp_path / "report.html", "--replays", 0).exit_code == 0
+
+
+def test_a_world_whose_way_is_longer_than_the_budget_is_possible(tmp_path):
+    run_sweep(_specification(settings={"budget_factor": 0.01}, policies=["baseline"]), tmp_path)
+    with contextlib.closing(Store(tmp_path / RESULTS, read_only=True)) as store:
+        assert {row.outcome for row in store.rows()} == {"budget"}
+        (cell,) = read_results(store).cells
+    assert [world_of(pair) for pair in cell.pairs] == [5, 6, 7]
+    assert cell.redrawn == 0
+    assert cell.comparison.charged.pairs == 3
+
+
+def test_what_was_given_up_is_told_everywhere_and_forgotten_by_its_own_sweep_alone(finished, tmp_path):
+    folder = tmp_path / "sweep"
+    shutil.copytree(finished, folder)
+    store = Store(folder / RESULTS)
+    store.set_broken(dataclasses.replace(ITEMS[5], policy="optimistic"), "it died")
+    store.close()
+    shown = json.loads(_potlp("sweep", "show", folder, "--json").stdout)["given_up"]
+    assert [(entry["world"], entry["error"]) for entry in shown] == [(5, "it died")]
+    assert "given up: optimistic in world 5" in _potlp("sweep", "show", folder).stdout
+    assert _potlp("report", folder, "--replays", 0).exit_code == 0
+    assert "given up: optimistic in world 5" in (folder / "report.html").read_text("utf-8")
+    with pytest.raises(StoreError, match="another specification"):
+        run_sweep(_specification(tasks=[1]), folder, retry_broken=True)
+    assert Store(folder / RESULTS, read_only=True).broken()
+    run_sweep(_specification(), folder, retry_broken=True)
+    assert not Store(folder / RESULTS, read_only=True).broken()
+
+
+def test_worlds_end_at_the_last_number(tmp_path, monkeypatch):
+    with pytest.raises(ConfigurationError, match="worlds: 3 from number 268435454 on, and the last is 268435455"):
+        _specification(first_world=MAX_INDEX - 1)
+    monkeypatch.setattr(Work, "examined", lambda self, items: [Examined(item, False) for item in items])
+    with pytest.raises(WorldError, match=r"is possible in 0 worlds .* and world 268435455 is the last"):
+        run_sweep(_specification(first_world=MAX_INDEX - 1, worlds=2), tmp_path)
+
+
+def test_a_sweep_with_an_estimators_file_is_the_same_from_any_folder(tmp_path, monkeypatch):
+    (tmp_path / "mine.npz").touch()
+    there = specification_from_dict({**SMALL, "estimator": "mine.npz"}, "here", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert specification_from_dict({**SMALL, "estimator": "mine.npz"}, "here") == there
+
+
 def test_other_files_are_no_store(tmp_path):
     (tmp_path / "a").write_text("something else, and long enough to be looked at as a header of a file" * 20)
     with pytest.raises(StoreError, match="not a store"):
@@ -304,7 +387,7 @@ def do(self, unit):
         else:
             yield Row(item, "satisfied", item.world / 7, 9.0, 1, 1, 0, 0, (1, 2), "p", "c", {}, "", 0.0, "d")
 
-Work.do = do
+Work.do, Work.is_of = do, lambda self, row: True
 specification = Specification(
     cells=(Cell("toy", "F goal"), Cell("toy", "F hazard")),
     policies=(Policy.KNOWN_MAP, Policy.BASELINE, Policy.ORACLE),
@@ -744,8 +827,9 @@ def test_a_second_command_on_the_folder_is_refused_while_readers_are_free(finish
         longer = _specification(worlds=4)
         with pytest.raises(StoreError, match="another command works on it"):
             run_sweep(longer, folder)
+        # Nor does it forget what was given up.
         with pytest.raises(StoreError, match="another command works on it"):
-            forget_broken(folder)
+            run_sweep(longer, folder, retry_broken=True)
         told = json.loads(_potlp("sweep", "status", folder, "--json").stdout)
         assert (told["done"], told["broken"]) == (told["total"], 0)
         assert sum(told["of_policies"].values()) == told["total"]

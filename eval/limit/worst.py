@@ -153,7 +153,7 @@ def experiment_of(sweep: Path, buildings: int) -> Experiment:
         ValueError: the sweep has several environments, or a seed of its own, which an experiment has not.
     """
     store = Store(sweep / RESULTS, read_only=True)
-    specification = specification_from_store(store.facts()["specification"])
+    specification = specification_from_store(store.specification())
     store.close()
     environments = sorted({cell.environment for cell in specification.cells})
     if len(environments) != 1:

@@ -54,7 +54,7 @@ def _sweep(folder: Path) -> tuple[int, list[tuple[str, str]]]:
     from potlp_jax.sweep.specification import specification_from_store
 
     with open_store(folder) as store:
-        specification, rows = specification_from_store(store.facts()["specification"]), store.rows()
+        specification, rows = specification_from_store(store.specification()), store.rows()
 
     def judged() -> Iterator[tuple[str, str]]:
         judgements = audit_rows(rows, specification.split, specification.seed, automata=dict(specification.automata))

@@ -119,6 +119,8 @@ def compare_policies(
         return
     (cell,) = results.cells
     print_cell(console(), cell, specification.split)
+    for line in results.remarks():
+        console().print(line)
     if out is not None:
         console().print(f"wrote {', '.join(file.name for file in files)} in {out}")
         console().print(f"next: potlp report {out}", style="dim")
@@ -155,6 +157,7 @@ def _write(results: "Results", folder: Path) -> list[Path]:
     # As wide as the widest table: a file has no terminal to ask.
     with table.open("w", encoding="utf-8") as file:
         print_cell(file_console(file, width=150), cell, split)
+        file.writelines(f"{line}\n" for line in results.remarks())
     _write_csv(cell, trials)
     title = f"{cell.environment}/{split}, task {cell.task}: {len(cell.pairs)} worlds"
     save_figure(draw_scatter(cell.pairs, policies, title), scatter)

@@ -7,7 +7,7 @@ import numpy as np
 
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.registry import make
-from potlp_jax.environments.splits import Split, default_split, world_key
+from potlp_jax.environments.splits import MAX_INDEX, Split, default_split, world_key
 from potlp_jax.sweep.specification import Specification
 from potlp_jax.task.doubts import NOTHING_TO_DO, Surroundings, find_doubts
 from potlp_jax.task.task import Task
@@ -28,13 +28,13 @@ def surroundings_of(generator: Generator, split: Split | None = None, first: int
         first: number of the first world.
 
     Returns:
-        The letters of ``WORLDS_LOOKED_AT`` worlds and their starts.
+        The letters of ``WORLDS_LOOKED_AT`` worlds, of fewer where there are no more, and their starts.
 
     Raises:
         WorldError: one cannot be made.
     """
     chosen = default_split(generator.name) if split is None else split
-    numbers = range(first, first + WORLDS_LOOKED_AT)
+    numbers = range(first, min(first + WORLDS_LOOKED_AT, MAX_INDEX + 1))
     worlds = [generator.generate(world_key(chosen, number, generator.name)) for number in numbers]
     return of_worlds(f"worlds {first} to {numbers[-1]} of {generator.name}/{chosen}", worlds)
 

@@ -41,19 +41,19 @@ def write_report(
 ) -> None:
     """Write a sweep as one page: tables, plots, and the worst and best trials as replays."""
     from potlp_jax.cli.inputs import open_store
-    from potlp_jax.sweep.results import pair_rows
+    from potlp_jax.sweep.results import pair_rows, read_results
     from potlp_jax.sweep.runner import Sweep
     from potlp_jax.sweep.specification import specification_from_store
     from potlp_jax.view.report_page import Cell, report_page
 
     with open_store(folder) as store:
-        facts = store.facts()
+        specification, facts, given_up = store.specification(), store.facts(), read_results(store).remarks()
     # A browser goes by the ending of a file's name.
     page = out or folder / PAGE
     if page.suffix != ".html":
         fail(f"--out {page}: give a name that ends in .html")
     # The sweep of the store itself, whatever the file that began it says by now.
-    sweep = Sweep(specification_from_store(facts["specification"]), folder, read_only=True)
+    sweep = Sweep(specification_from_store(specification), folder, read_only=True)
     policies = list(sweep.specification.policies)
     cells: list[Cell] = []
     rows: list[Row] = []
@@ -69,7 +69,7 @@ def write_report(
                 progress.update(bar, description=f"running world {row.item.world} again")
                 shown.append(_shown(sweep, reason, row, baseline))
             cells.append(Cell(cell.environment, cell.task, pairs, shown))
-    page.write_text(report_page(page_title(folder), _facts(facts, rows), policies, cells), "utf-8")
+    page.write_text(report_page(page_title(folder), _facts(facts, rows, given_up), policies, cells), "utf-8")
     console().print(f"wrote {page}")
 
 
@@ -114,6 +114,8 @@ def _shown(sweep: "Sweep", reason: str, row: "Row", baseline: "Row") -> "Shown":
     from potlp_jax.view.replay_page import replay_data
     from potlp_jax.view.report_page import Shown
 
+    # Costs beside the replay of another building would be believed.
+    sweep.require_same_world(row)
     trial = sweep.trial(row.item)
     return Shown(
         reason=reason,
@@ -126,7 +128,7 @@ def _shown(sweep: "Sweep", reason: str, row: "Row", baseline: "Row") -> "Shown":
     )
 
 
-def _facts(facts: dict[str, Any], rows: "Sequence[Row]") -> list[tuple[str, str]]:
+def _facts(facts: dict[str, Any], rows: "Sequence[Row]", given_up: Sequence[str]) -> list[tuple[str, str]]:
     """What was run, and with what; where rows differ, all that there is."""
 
     # A store that several versions have written names them all: figures are then not of one.
@@ -145,6 +147,7 @@ def _facts(facts: dict[str, Any], rows: "Sequence[Row]") -> list[tuple[str, str]
         ),
         ("policies", ", ".join(specification["policies"])),
         ("trials", f"{len(rows)}, {sum(row.seconds for row in rows) / 3600:.2f} hours of one core"),
+        *(("trial", line) for line in given_up),
         ("estimator", facts["estimator"] or "-"),
         ("settings", all_of([row.configuration for row in rows])),
         *((f"settings of {policy}", told) for policy, told in own_settings(specification).items()),

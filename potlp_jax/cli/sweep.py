@@ -91,9 +91,7 @@ def run(
     if specification.split is Split.TEST:
         warn_of_test_worlds()
     warn_of_sweep(specification)
-    if retry_broken:
-        forget_broken(out)
-    run_reported(specification, make_folder(out), processes, cluster)
+    run_reported(specification, make_folder(out), processes, cluster, retry_broken)
     # From the store, so that a sweep shows the same tables whether it has just ended or is shown again.
     show(out, json)
 
@@ -106,7 +104,7 @@ def show(folder: SweepFolder, json: Json = False) -> None:
     from potlp_jax.sweep.specification import own_settings
 
     with open_store(folder) as store:
-        results, broken = read_results(store), store.broken()
+        results = read_results(store)
     if json:
         print_json(results.to_dict())
         return
@@ -114,8 +112,8 @@ def show(folder: SweepFolder, json: Json = False) -> None:
         print_cell(console(), cell, results.specification["split"])
     for policy, told in own_settings(results.specification).items():
         console().print(f"settings of {policy}: {told}")
-    for item, error in sorted(broken.items()):
-        console().print(f"given up: {item.policy} in world {item.world} of {item.environment}, {item.task}: {error}")
+    for line in results.remarks():
+        console().print(line)
 
 
 @app.command("status", cls=Command)
@@ -135,22 +133,12 @@ def status(folder: SweepFolder, json: Json = False) -> None:
         console().print(f"{policy}: {done} of {found.total // len(found.of_policies)}")
 
 
-def forget_broken(folder: Path) -> None:
-    """Make the trials of a sweep that were given up missing ones."""
-    from potlp_jax.engine.writer import only_writer
-    from potlp_jax.errors import StoreError
-    from potlp_jax.sweep.runner import RESULTS
-    from potlp_jax.sweep.store import Store
-
-    if (folder / RESULTS).is_file():
-        with only_writer(folder, StoreError):
-            store = Store(folder / RESULTS)
-            store.forget_broken()
-            store.close()
-
-
 def run_reported(
-    specification: "Specification", folder: Path, processes: int | None, cluster: str | None = None
+    specification: "Specification",
+    folder: Path,
+    processes: int | None,
+    cluster: str | None = None,
+    retry_broken: bool = False,
 ) -> None:
     """Run what is missing of a sweep, with progress on stderr.
 
@@ -158,12 +146,13 @@ def run_reported(
         specification: what to run.
         folder: of the store.
         processes, cluster: where (``engine.opening.open_engine``).
+        retry_broken: begin again the trials that were given up.
     """
     from potlp_jax.sweep.runner import run_sweep
 
     reporter = _Reporter()
     try:
-        run_sweep(specification, folder, processes, reporter.report, cluster, reporter.begun)
+        run_sweep(specification, folder, processes, reporter.report, cluster, reporter.begun, retry_broken)
     finally:
         reporter.close()
 
@@ -245,7 +234,7 @@ def export(
     from potlp_jax.cli.inputs import open_store
 
     with open_store(folder) as store:
-        specification = store.facts()["specification"]
+        specification = store.specification()
         rows = [_flat(row) | {name: specification[name] for name in ("split", "seed")} for row in store.rows()]
     if out.suffix == ".csv":
         _write_csv(rows, out)

@@ -151,7 +151,7 @@ def _options(cluster: str, text: str) -> dict[str, str]:
 
 
 def _whole_number(text: str, what: str) -> int:
-    if not text.isdigit() or int(text) < 1:
+    if not text.isdecimal() or int(text) < 1:
         raise EngineError(f"{what}: give a whole number of at least 1, found {text}")
     return int(text)
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from potlp_jax.errors import StoreError
 from potlp_jax.sweep.statistics import SATISFIED, UNRELIABLE, Comparison, TrialResult
-from potlp_jax.sweep.store import Row, Store
+from potlp_jax.sweep.store import Item, Row, Store
 
 Pair = Mapping[str, Row]
 """The rows of one world by policy."""
@@ -42,14 +42,32 @@ class CellResults:
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """What is finished of a sweep, with its specification as ``Specification.to_dict`` wrote it."""
+    """What is finished of a sweep.
+
+    Attributes:
+        specification: as ``Specification.to_dict`` wrote it.
+        cells: of each environment and task.
+        given_up: trials that were given up, each with its error.
+    """
 
     specification: Mapping[str, Any]
     cells: tuple[CellResults, ...]
+    given_up: Mapping[Item, str]
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able values."""
-        return {"specification": self.specification, "cells": [cell.to_dict() for cell in self.cells]}
+        return {
+            "specification": self.specification,
+            "cells": [cell.to_dict() for cell in self.cells],
+            "given_up": [{**dataclasses.asdict(item), "error": error} for item, error in sorted(self.given_up.items())],
+        }
+
+    def remarks(self) -> list[str]:
+        """A line for each trial that was given up."""
+        return [
+            f"given up: {item.policy} in world {item.world} of {item.environment}, {item.task}: {error}"
+            for item, error in sorted(self.given_up.items())
+        ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +88,7 @@ class SweepStatus:
 
 def read_status(store: Store) -> SweepStatus:
     """How far a sweep is; reads no row."""
-    specification, done = store.facts()["specification"], store.counts()
+    specification, done = store.specification(), store.counts()
     policies = specification["policies"]
     return SweepStatus(
         done=sum(done.values()),
@@ -82,7 +100,7 @@ def read_status(store: Store) -> SweepStatus:
 
 def read_results(store: Store) -> Results:
     """The results of a sweep, finished or not."""
-    specification = store.facts()["specification"]
+    specification = store.specification()
     policies, cells = specification["policies"], []
     for cell in specification["cells"]:
         pairs = pair_rows(store.rows(cell["environment"], cell["task"]), policies)
@@ -98,7 +116,7 @@ def read_results(store: Store) -> Results:
                 comparison=compare_pairs(pairs, policies),
             )
         )
-    return Results(specification, tuple(cells))
+    return Results(specification, tuple(cells), store.broken())
 
 
 def world_of(pair: Pair) -> int:

@@ -84,7 +84,7 @@ def read_path(text: str) -> Int32[np.ndarray, "steps 2"]:
 
 @lru_cache(maxsize=1)
 def source_commit() -> str:
-    """The commit that the package was run from, with ``+`` where files were changed; empty outside of a repository."""
+    """The commit that the package was run from, with ``+`` where files were changed; empty where git holds no such."""
     folder = Path(__file__).parents[1]
 
     # Once a process: a worker that runs for hours writes the commit it was started from.
@@ -93,6 +93,8 @@ def source_commit() -> str:
         return done.stdout.strip()
 
     try:
+        # An installed package may lie in the folder of a repository that is of something else.
+        git("ls-files", "--error-unmatch", str(Path(__file__)))
         return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--", str(folder)) else "")
     except (OSError, subprocess.CalledProcessError):
         return ""

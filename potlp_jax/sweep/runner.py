@@ -22,7 +22,7 @@ from potlp_jax.learning.estimator import identity_of, named_estimator
 from potlp_jax.planning.policies import named_policy
 from potlp_jax.sweep.ending import KEPT, ending_when_asked
 from potlp_jax.sweep.specification import Cell, Specification
-from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store
+from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store, has_tables
 from potlp_jax.sweep.work import Examined, Unit, Work, do
 from potlp_jax.trials.record import Trial
 
@@ -57,10 +57,11 @@ class Sweep:
         self.specification = specification
         self.work = Work(specification)
         self._done = 0
-        self.store = Store(folder / RESULTS, read_only)
+        # Before the store: of a specification that cannot be run none is begun.
         facts = {"specification": specification.to_dict(), "estimator": self._estimator_identity()}
         if sources := self._sources():
             facts["source"] = sources
+        self.store = Store(folder / RESULTS, read_only)
         (self.store.compare if read_only else self.store.agree)(facts)
 
     @property
@@ -82,12 +83,28 @@ class Sweep:
 
         Raises:
             WorldError: a task is impossible in too many worlds in a row.
+            StoreError: worlds are not those of the rows that are there.
         """
+        self._require_same_worlds()
         self._done = self.store.count()
         report(self._progress(engine))
         while units := self._worlds_to_examine():
             self._do(engine, units, report)
         self._do(engine, self._missing_trials(engine.workers), report)
+
+    def require_same_world(self, row: Row) -> None:
+        """Raises StoreError where a row's world is made otherwise today: a file or a generator has changed."""
+        if not self.work.is_of(row):
+            raise StoreError(
+                f"{self.store.file}: {row.item.environment}: world {row.item.world} is not that of the rows that are "
+                "there: its file, or what makes it, has changed; begin in another folder"
+            )
+
+    def _require_same_worlds(self) -> None:
+        # The first and the last stand for all: to make every world again would take too long.
+        for environment in dict.fromkeys(cell.environment for cell in self.specification.cells):
+            for row in self.store.outer_rows(environment):
+                self.require_same_world(row)
 
     def _progress(self, engine: Engine) -> Progress:
         # Not counted anew: a large store would be read for every row.
@@ -147,6 +164,11 @@ class Sweep:
             raise WorldError(
                 f"{cell.environment}: the task {cell.task!r} is impossible in {IMPOSSIBLE_IN_A_ROW} worlds in a row, "
                 f"up to number {last}; check it"
+            )
+        if last == MAX_INDEX:
+            raise WorldError(
+                f"{cell.environment}: the task {cell.task!r} is possible in {found} worlds from number "
+                f"{self.specification.first_world} on, and world {last} is the last: begin earlier, or ask for fewer"
             )
         # No more at once than would show that the task is impossible everywhere.
         end = min(last + missing, last + IMPOSSIBLE_IN_A_ROW, MAX_INDEX)
@@ -220,6 +242,7 @@ def run_sweep(
     report: Callable[[Progress], None] = lambda progress: None,
     cluster: str | None = None,
     begun: Callable[[Engine], None] = lambda engine: None,
+    retry_broken: bool = False,
 ) -> None:
     """Run what is missing of a sweep; returns when every trial has a row, or was given up.
 
@@ -229,6 +252,7 @@ def run_sweep(
         processes, cluster: where the work is done (``engine.opening.open_engine``).
         report: is called now and then with the progress.
         begun: is called once with the engine, if there is anything to do.
+        retry_broken: begin again the trials that were given up.
 
     Raises:
         StoreError: the folder holds another sweep, cannot be written, or another command works on it; of a sweep that
@@ -237,10 +261,12 @@ def run_sweep(
         SystemExit: the process was asked to end (SIGTERM); it and its workers do within two seconds.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    if _is_finished(specification, folder):
+    if _is_finished(specification, folder, retry_broken):
         return
     with ending_when_asked(), only_writer(folder, StoreError):
         sweep = Sweep(specification, folder)
+        if retry_broken:
+            sweep.store.forget_broken()
         try:
             with open_engine(processes, cluster) as engine:
                 begun(engine)
@@ -249,12 +275,12 @@ def run_sweep(
             sweep.store.close()
 
 
-def _is_finished(specification: Specification, folder: Path) -> bool:
-    """Whether every trial has a row already: asked without writing, for the folder may be on a full or locked disk."""
-    if not (folder / RESULTS).is_file():
+def _is_finished(specification: Specification, folder: Path, retry_broken: bool) -> bool:
+    """Whether nothing is left to do: asked without writing, for the folder may be on a full or locked disk."""
+    if not has_tables(folder / RESULTS):
         return False
     sweep = Sweep(specification, folder, read_only=True)
     try:
-        return sweep.finished()
+        return sweep.finished() and not (retry_broken and sweep.store.broken())
     finally:
         sweep.store.close()

@@ -194,6 +194,9 @@ def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = 
     for cell in cells:
         if cells.count(cell) > 1:
             raise SpecificationError(f"{where}: {cell.environment} with {cell.task!r} is there twice")
+    first_world, worlds = _number(data, "first_world", 0, where, default=0), _number(data, "worlds", 1, where)
+    if first_world + worlds > MAX_INDEX + 1:
+        raise SpecificationError(f"{where}: worlds: {worlds} from number {first_world} on, and the last is {MAX_INDEX}")
     config = with_settings(_common_config(environments, where), data.get("settings", {}), f"{where}: settings")
     estimator = data.get("estimator")
     if estimator is not None and not isinstance(estimator, str):
@@ -201,9 +204,9 @@ def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = 
     return Specification(
         cells=tuple(cells),
         policies=policies,
-        worlds=_number(data, "worlds", 1, where),
+        worlds=worlds,
         split=split,
-        first_world=_number(data, "first_world", 0, where, default=0),
+        first_world=first_world,
         estimator=None if estimator is None else _estimator(estimator, folder),
         config=config,
         seed=_number(data, "seed", 0, where, default=0),
@@ -268,7 +271,10 @@ def _estimator(name: str, folder: Path) -> str:
     """A file beside the specification, or a name as it stands."""
     beside = folder / name
     is_name = name in shipped_files() or plugins.is_known(name, plugins.ESTIMATORS)
-    return name if is_name and not beside.is_file() else str(beside)
+    if beside.is_file():
+        # Wherever the command is given from, it is the same sweep.
+        return str(beside.resolve())
+    return name if is_name else str(beside)
 
 
 def _split(name: Any, environments: Sequence[str], where: str) -> Split:

@@ -163,7 +163,8 @@ class Store:
         """Turn whatever SQLite and the system raise into one error with what to do."""
         try:
             yield
-        except (sqlite3.Error, OSError, OverflowError, MemoryError) as error:
+        # A text of the schema itself may be damaged: what it should say is then no text.
+        except (sqlite3.Error, OSError, OverflowError, MemoryError, UnicodeDecodeError) as error:
             raise StoreError(f"{self.file}: {_explained(error)}") from error
 
     def _execute(self, statement: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
@@ -182,6 +183,8 @@ class Store:
         problems = [text for (text,) in self._execute("PRAGMA quick_check") if text != "ok"]
         if problems:
             raise StoreError(f"{self.file}: {_DAMAGED.format(one_line(problems[0]))}")
+        if not has_tables(self.file):
+            raise StoreError(f"{self.file}: {_NOTHING_YET}")
         if not self._execute("SELECT 1 FROM sqlite_master WHERE name = 'facts'"):
             raise StoreError(f"{self.file}: not a store of results; choose another folder")
         found = [value for (value,) in self._execute("SELECT value FROM facts WHERE name = 'format'")]
@@ -246,6 +249,13 @@ class Store:
         for name, value, checksum in rows:
             self._check(checksum, f"the fact {name!r}", name, value)
         return {name: json.loads(value) for name, value, _ in rows}
+
+    def specification(self) -> dict[str, Any]:
+        """What the sweep is, as ``Specification.to_dict`` wrote it. Raises StoreError where nothing is written yet."""
+        try:
+            return self.facts()["specification"]
+        except KeyError:
+            raise StoreError(f"{self.file}: {_NOTHING_YET}") from None
 
     def _check(self, checksum: Any, what: str, *values: Any) -> None:
         """Raises StoreError where values are not those that were written."""
@@ -337,6 +347,16 @@ class Store:
             self._check(checksum, f"the row of {policy} in world {world}", *values)
         return [_row(entry[:-1]) for entry in found]
 
+    def outer_rows(self, environment: str) -> list[Row]:
+        """A row of the first and a row of the last world that have any."""
+        return [
+            _row(entry)
+            for order in ("ASC", "DESC")
+            for entry in self._execute(
+                f"SELECT {_COLUMNS} FROM trials WHERE environment = ? ORDER BY world {order} LIMIT 1", (environment,)
+            )
+        ]
+
     def count(self) -> int:
         """Finished trials."""
         return sum(self.counts().values())
@@ -369,6 +389,18 @@ def _checksum(*values: Any) -> str:
     return hashlib.sha256(repr(values).encode("utf-8", "surrogatepass")).hexdigest()[:16]
 
 
+def has_tables(file: Path) -> bool:
+    """Whether anything was ever written to a store: a full disk, or a kill, may leave a file without content."""
+    if not file.is_file():
+        return False
+    try:
+        with contextlib.closing(sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True)) as connection:
+            return bool(connection.execute("SELECT 1 FROM sqlite_master LIMIT 1").fetchall())
+    # What is wrong is said where it is opened.
+    except (sqlite3.Error, UnicodeDecodeError):
+        return True
+
+
 def _has_content(file: Path) -> bool:
     try:
         return file.stat().st_size > 0
@@ -376,6 +408,7 @@ def _has_content(file: Path) -> bool:
         return False
 
 
+_NOTHING_YET = "was begun, and holds nothing yet: give the sweep's command again"
 _DAMAGED = "is damaged, or not a store of results ({}): put back a copy of it, or choose another folder"
 
 

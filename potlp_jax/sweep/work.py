@@ -27,7 +27,7 @@ from potlp_jax.trials.batch import Finished, Start, run_batch
 from potlp_jax.trials.loop import run_trial, versions
 from potlp_jax.trials.record import Outcome, Trial
 from potlp_jax.trials.rules import estimator_of, trial_key
-from potlp_jax.world.grid import World
+from potlp_jax.world.grid import World, world_digest
 
 # All policies visit the worlds of a unit soon after each other, and making one may take a second.
 _WORLDS_KEPT = 32
@@ -84,10 +84,11 @@ class Work:
             yield from self.rows(unit.items, environment, policy)
 
     def examined(self, items: Iterable[Item]) -> Iterator[Examined]:
-        """Whether the planner that knows the map succeeds; the items are of one environment."""
+        """Whether the planner that knows the map finds a way; the items are of one environment."""
         items = list(items)
         for item, trial in self._trials(items, items[0].environment, Policy.KNOWN_MAP):
-            yield Examined(item, trial.outcome is Outcome.SATISFIED)
+            # One whose known path is longer than the budget is possible all the same, and is charged as any other.
+            yield Examined(item, trial.outcome is not Outcome.INFEASIBLE)
 
     def rows(self, items: Iterable[Item], environment: str, policy: str) -> Iterator[Row]:
         """The rows of trials of one environment and policy, as they end.
@@ -132,6 +133,10 @@ class Work:
             arrays=arrays,
             estimator=self.asked(item.environment, item.policy),
         )
+
+    def is_of(self, row: Row) -> bool:
+        """Whether a row's world is the one that its number means today."""
+        return row.world_digest == world_digest(self._world(row.item.environment, row.item.world))
 
     def generator(self, environment: str) -> Generator:
         """The family of worlds of a name."""
