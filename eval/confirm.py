@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from eval.limit.rows import append_row, read_rows
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.sweep.rows import provenance, source_commit
 from potlp_jax.sweep.runner import RESULTS
@@ -91,12 +92,9 @@ def confirm(folder: Path, trials: int, kept: Path) -> dict[str, Any]:
     store.close()
     found = _read(kept)
     missing = [row for row in rows if _key(row) not in found]
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    with kept.open("a") as file:
-        for before, now in run_again(specification_from_store(facts["specification"]), missing):
-            found[_key(before)] = differences(before, now)
-            line = {"commit": source_commit(), "row": _key(before), "differs": found[_key(before)]}
-            print(json.dumps(line), file=file, flush=True)
+    for before, now in run_again(specification_from_store(facts["specification"]), missing):
+        found[_key(before)] = differences(before, now)
+        append_row(kept, {"commit": source_commit(), "row": _key(before), "differs": found[_key(before)]})
     different = [{**dataclasses.asdict(row.item), "differs": found[_key(row)]} for row in rows if found[_key(row)]]
     return {
         "trials": len(rows),
@@ -117,8 +115,7 @@ def _read(kept: Path) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     if source_commit().endswith("+"):
         return found
-    for line in kept.read_text().splitlines() if kept.is_file() else []:
-        entry = json.loads(line)
+    for entry in read_rows(kept):
         if entry["commit"] == source_commit():
             found[entry["row"]] = entry["differs"]
     return found

@@ -18,22 +18,27 @@ from pathlib import Path
 import numpy as np
 
 from potlp_jax.planning.policies import Policy
+from potlp_jax.sweep.statistics import UNRELIABLE
+from potlp_jax.trials.record import Outcome
+from potlp_jax.types import status_of
 
 SAME = 1e-3
 """Costs that differ by less are the same: what a row holds is rounded."""
 
 _DRAWS = 2000
+_NEEDED = {Policy.KNOWN_MAP.value, Policy.BASELINE.value, Policy.POTLP.value}
 
 Costs = dict[tuple[str, int], dict[str, float]]
 """Of each policy, by task and world."""
 
 
 def costs_of(file: Path) -> Costs:
-    """The costs in a file of rows."""
+    """The costs in a file of rows, of the trials that ended satisfied and reliably."""
     found: Costs = defaultdict(dict)
     with gzip.open(file, "rt", newline="") as lines:
         for row in csv.DictReader(lines):
-            found[row["task"], int(row["world"])][row["policy"]] = float(row["cost"])
+            if row["outcome"] == Outcome.SATISFIED and not status_of(row["status"].split()) & UNRELIABLE:
+                found[row["task"], int(row["world"])][row["policy"]] = float(row["cost"])
     return dict(found)
 
 
@@ -46,13 +51,21 @@ def changes(before: Costs, after: Costs) -> Iterator[tuple[str, int, int, int]]:
         yield policy, len(differences), cheaper, dearer
 
 
+def worlds_of_both(before: Costs, after: Costs, task: str) -> list[tuple[str, int]]:
+    """The task's worlds in which both files have known map, baseline and PO-TLP."""
+    shared = {name: before[name].keys() & after[name].keys() for name in before.keys() & after.keys()}
+    return sorted(name for name, policies in shared.items() if name[0] == task and policies >= _NEEDED)
+
+
 def gain(before: Costs, after: Costs, task: str, seed: int = 0) -> tuple[float, float, float]:
     """How much PO-TLP's share of the attainable savings has risen in a task, and the 95 % interval; 1 is all of it.
+
+    There must be a world to compare (``worlds_of_both``).
 
     Raises:
         ValueError: known map or baseline cost otherwise, so that shares before and after are of different savings.
     """
-    worlds = sorted(name for name in before.keys() & after.keys() if name[0] == task)
+    worlds = worlds_of_both(before, after, task)
     for name, policy in itertools.product(worlds, (Policy.KNOWN_MAP, Policy.BASELINE)):
         if abs(before[name][policy] - after[name][policy]) > SAME:
             raise ValueError(
@@ -75,7 +88,10 @@ def main() -> None:
     for row in changes(before, after):
         print("| " + " | ".join(map(str, row)) + " |")
     print("\n| task | points of the share gained (95 %) |\n|---|---|")
-    for task in sorted({task for task, _ in after}):
+    for task in sorted({task for task, _ in before.keys() | after.keys()}):
+        if not worlds_of_both(before, after, task):
+            print(f"| `{task}` | no world of both has known map, baseline and PO-TLP |")
+            continue
         found, low, high = (100 * value for value in gain(before, after, task))
         print(f"| `{task}` | {found:.1f} ({low:.1f} to {high:.1f}) |")
 

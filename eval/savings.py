@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,11 @@ from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import Split
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.audit import audit_rows
-from potlp_jax.sweep.results import compare_pairs, pair_rows, reliable_pairs
+from potlp_jax.sweep.results import Pair, compare_pairs, pair_rows, reliable_pairs, world_of
 from potlp_jax.sweep.runner import RESULTS
-from potlp_jax.sweep.statistics import PolicyRow
+from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, PolicyRow
 from potlp_jax.sweep.store import Row, Store
+from potlp_jax.trials.loop import versions as library_versions
 from potlp_jax.trials.record import Outcome
 from potlp_jax.types import Status
 
@@ -50,7 +51,7 @@ def sweep(folder: Path, specification: Mapping[str, Any], processes: int) -> Non
 
 def read_rows(folder: Path) -> list[Row]:
     """All rows of a sweep."""
-    store = Store(folder / RESULTS)
+    store = Store(folder / RESULTS, read_only=True)
     rows = store.rows()
     store.close()
     return rows
@@ -63,22 +64,29 @@ def compare_first(
     worlds: int,
     building: Callable[[int], Hashable] | None = None,
 ) -> dict[str, Any]:
-    """The comparison of the first worlds of a task, clustered by ``building(world)``; ``buildings`` counts them.
+    """The comparison of the first worlds of a task, clustered by ``building(world)``.
 
-    Without it all worlds are of one building, and the figures are of that one.
+    ``buildings`` counts those of the worlds in which every policy ended satisfied and reliably. Without ``building``
+    all worlds are of one, and the figures are of that one.
     """
     pairs = pair_rows([row for row in rows if row.item.task == task], policies)[:worlds]
-    clusters = None if building is None else [building(pair[Policy.BASELINE].item.world) for pair in pairs]
+    clusters = None if building is None else [building(world_of(pair)) for pair in pairs]
     comparison = compare_pairs(pairs, policies, clusters)
-    return {"task": task, "buildings": 1 if clusters is None else len(set(clusters)), **comparison.to_dict()}
+    told = {building(world_of(pair)) for pair in pairs if is_satisfied(pair)} if building is not None else {0}
+    return {"task": task, "buildings": len(told), **comparison.to_dict()}
+
+
+def is_satisfied(pair: Pair) -> bool:
+    """Whether every policy ended satisfied and reliably."""
+    return bool(reliable_pairs([pair])) and all(row.outcome == Outcome.SATISFIED for row in pair.values())
 
 
 def pairs_of(rows: Sequence[Row], policies: Sequence[str]) -> dict[int, dict[str, float]]:
     """Costs by world and policy, of one task, in the worlds in which every policy ended satisfied and reliably."""
     found: dict[int, dict[str, float]] = {}
-    for pair in reliable_pairs(pair_rows(rows, policies)):
-        if all(row.outcome == Outcome.SATISFIED for row in pair.values()):
-            found[pair[policies[0]].item.world] = {policy: row.cost for policy, row in pair.items()}
+    for pair in pair_rows(rows, policies):
+        if is_satisfied(pair):
+            found[world_of(pair)] = {policy: row.cost for policy, row in pair.items()}
     return found
 
 
@@ -88,7 +96,7 @@ def audit(rows: Sequence[Row], generator: Generator, split: Split) -> list[str]:
 
 
 def table_lines(table: Mapping[str, Any], policies: Sequence[str]) -> list[str]:
-    """Rows of a Markdown table below ``TABLE_HEAD``."""
+    """Rows of a Markdown table below ``TABLE_HEAD``; the last says which worlds are not in the others."""
     found = {entry["policy"]: entry for entry in table["satisfied"]["rows"]}
     task, lines = table["task"].replace("|", "\\|"), []
     for policy in policies:
@@ -96,7 +104,32 @@ def table_lines(table: Mapping[str, Any], policies: Sequence[str]) -> list[str]:
         buildings = table["buildings"]
         worlds = f"{table['satisfied']['pairs']} in {buildings} building{'s' if buildings > 1 else ''}"
         lines.append(f"| `{task}` | {policy} | {worlds} | {row.mean_cost:.1f} | {figures(row)} |")
+    if left_out := worlds_left_out(table):
+        lines.append(f"| `{task}` | {left_out} | | | | | |")
     return lines
+
+
+def worlds_left_out(table: Mapping[str, Any]) -> str:
+    """What a table of ``Comparison.to_dict`` does not hold, in words; empty where it holds all."""
+    counts = {
+        "not satisfied": table["satisfied"]["dropped"] - table["charged"]["dropped"],
+        "cut short": table["charged"]["dropped"],
+    }
+    told = [f"{count} {why}" for why, count in counts.items() if count]
+    if not told:
+        return ""
+    rows = [policy_row(entry) for entry in table["charged"]["rows"] if entry["policy"] not in (KNOWN_MAP, BASELINE)]
+    shares = "; ".join(f"{row.policy} {_share(row)}" for row in rows)
+    return f"worlds left out: {', '.join(told)}; shares with unsatisfied trials charged their budgets: {shares}"
+
+
+def versions_of(rows: Iterable[Mapping[str, str]]) -> dict[str, str]:
+    """By library, the versions that made the rows."""
+    found: dict[str, set[str]] = {name: set() for name in library_versions()}
+    for versions in rows:
+        for name in found.keys() & versions.keys():
+            found[name].add(versions[name])
+    return {name: " and ".join(sorted(known)) for name, known in found.items() if known}
 
 
 def policy_row(entry: Mapping[str, Any]) -> PolicyRow:
@@ -109,11 +142,15 @@ def figures(row: PolicyRow) -> str:
     """Share, net and per-trial savings, as cells of a table; the baseline has none."""
     if row.policy == Policy.BASELINE:
         return "| |"
-    share = f"{100 * row.attainable_share:.1f} % ({100 * row.attainable_low:.0f} to {100 * row.attainable_high:.0f})"
-    return (
-        f"{share} | {100 * row.net_savings:.1f} % | "
-        f"{100 * row.trial_savings:.1f} ± {100 * row.trial_savings_error:.1f} %"
-    )
+    # One building has none.
+    error = "no error" if np.isnan(row.trial_savings_error) else f"± {100 * row.trial_savings_error:.1f}"
+    return f"{_share(row)} | {100 * row.net_savings:.1f} % | {100 * row.trial_savings:.1f} {error} %"
+
+
+def _share(row: PolicyRow) -> str:
+    if np.isnan(row.attainable_low):
+        return f"{100 * row.attainable_share:.1f} % (no interval)"
+    return f"{100 * row.attainable_share:.1f} % ({100 * row.attainable_low:.0f} to {100 * row.attainable_high:.0f})"
 
 
 def decisions_of(rows: Sequence[Row], policies: Sequence[str]) -> dict[str, dict[str, Any]]:

@@ -13,6 +13,8 @@ checked.
 """
 
 import argparse
+import contextlib
+import dataclasses
 import json
 import os
 import signal
@@ -25,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from eval.savings import SWEEP_COMMAND, audit, figures, policy_row, write_specification
+from eval.savings import SWEEP_COMMAND, audit, figures, policy_row, versions_of, worlds_left_out, write_specification
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
 from potlp_jax.planning.policies import Policy
@@ -33,7 +35,7 @@ from potlp_jax.sweep.results import compare_pairs, pair_rows
 from potlp_jax.sweep.rows import provenance
 from potlp_jax.sweep.runner import RESULTS
 from potlp_jax.sweep.statistics import PolicyRow
-from potlp_jax.sweep.store import Row, Store
+from potlp_jax.sweep.store import Row, Store, has_tables
 from potlp_jax.view.comparisons import scatter_costs
 from potlp_jax.view.style import new_figure, save_figure
 
@@ -63,7 +65,7 @@ def run(folder: Path, split: Split, worlds: int, first_world: int, processes: in
     file = write_specification(folder, specification)
     command = [*SWEEP_COMMAND, str(file), "--out", str(folder), "--processes", str(processes)]
     kill_at = len(PAPER) * len(POLICIES) * worlds // 3
-    while _count(folder) < len(PAPER) * len(POLICIES) * worlds:
+    while not _is_done(folder, len(PAPER) * len(POLICIES) * worlds):
         _run_once(command, folder, kill_at if not _spans(folder) else None)
 
 
@@ -89,21 +91,26 @@ def _spans(folder: Path) -> list[dict[str, Any]]:
     return json.loads(file.read_text()) if file.exists() else []
 
 
+def _is_done(folder: Path, trials: int) -> bool:
+    """Whether so many trials have rows, or were given up."""
+    if not has_tables(folder / RESULTS):
+        return False
+    with contextlib.closing(Store(folder / RESULTS, read_only=True)) as store:
+        return store.count() + len(store.broken()) >= trials
+
+
 def _count(folder: Path) -> int:
-    if not (folder / RESULTS).exists():
+    if not has_tables(folder / RESULTS):
         return 0
-    store = Store(folder / RESULTS)
-    count = store.count()
-    store.close()
-    return count
+    with contextlib.closing(Store(folder / RESULTS, read_only=True)) as store:
+        return store.count()
 
 
 def results(folder: Path) -> dict[str, Any]:
     """Table, audit and times of what is finished."""
-    store = Store(folder / RESULTS)
-    specification, rows = store.specification(), store.rows()
-    facts = store.facts()
-    store.close()
+    with contextlib.closing(Store(folder / RESULTS, read_only=True)) as store:
+        specification, rows = store.specification(), store.rows()
+        facts, given_up = store.facts(), store.broken()
     split = Split(specification["split"])
     tasks = make(ENVIRONMENT).tasks
     tables = {}
@@ -115,7 +122,8 @@ def results(folder: Path) -> dict[str, Any]:
     return {
         "specification": specification,
         "estimator": facts["estimator"],
-        "provenance": provenance(),
+        "provenance": provenance() | {"versions": versions_of(row.versions for row in rows)},
+        "given_up": [{**dataclasses.asdict(item), "error": error} for item, error in sorted(given_up.items())],
         "commits": sorted({row.commit for row in rows}),
         "tables": tables,
         "audited": len(rows),
@@ -149,6 +157,8 @@ def markdown(found: dict[str, Any]) -> str:
         for entry in table["satisfied"]["rows"]:
             row = policy_row(entry)
             lines.append(f"| {number} | {row.policy} | {row.mean_cost:.1f} | {figures(row)} | {_paper(number, row)} |")
+        if left_out := worlds_left_out(table):
+            lines.append(f"| {number} | {left_out} | | | | | |")
     spans = ", ".join(
         f"{span['rows']} rows in {span['seconds'] / 60:.1f} min{' (killed)' if span['killed'] else ''}"
         for span in found["spans"]
@@ -157,6 +167,8 @@ def markdown(found: dict[str, Any]) -> str:
         "",
         f"{found['audited']} trials audited: {len(found['problems'])} problems, {found['violations']} violations.",
     ]
+    if found["given_up"]:
+        lines.append(f"{len(found['given_up'])} trials were given up.")
     lines += [f"Runs: {spans}.", "", "| policy | trials | seconds a trial | decisions a trial |", "|---|---|---|---|"]
     for policy, times in found["times"].items():
         lines.append(
@@ -174,7 +186,7 @@ def _paper(number: str, row: PolicyRow) -> str:
 
 def draw(folder: Path, file: Path) -> None:
     """PO-TLP's cost over the baseline's in every world, a panel for each task, as in the paper."""
-    store = Store(folder / RESULTS)
+    store = Store(folder / RESULTS, read_only=True)
     figure = new_figure(11.0, 11.6)
     for index, (number, formula) in enumerate(make(ENVIRONMENT).tasks.items()):
         pairs = pair_rows(store.rows(ENVIRONMENT, formula), POLICIES)

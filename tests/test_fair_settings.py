@@ -14,10 +14,12 @@ from eval.fair_settings.settings import changes_of, grid, setting_of
 from potlp_jax.codec import with_settings
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import world_key
+from potlp_jax.errors import ConfigurationError
 from potlp_jax.sweep.specification import specification_from_dict
 from potlp_jax.trials.config import TrialConfig, trial_config_for
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.rules import trial_key
+from potlp_jax.types import Status
 
 
 def test_the_grid_has_every_combination_once_and_the_default_first():
@@ -37,7 +39,7 @@ def test_the_grid_has_every_combination_once_and_the_default_first():
 
 
 def _row(setting, world, cost, task="1", outcome="satisfied"):
-    known = {"is_default": setting == (2, 4.0, 0.15), "budget": 100.0}
+    known = {"is_default": setting == (2, 4.0, 0.15), "budget": 100.0, "status": 0, "estimator": None}
     return {"setting": list(setting), "task": task, "world": world, "cost": cost, "outcome": outcome, **known}
 
 
@@ -72,6 +74,18 @@ def test_the_best_is_chosen_where_other_worlds_confirm_it():
         # What chose it is what it was.
         assert found["settings"][0]["difference"] == pytest.approx(-2.0)
         assert found["trials"] == found["worlds"] == 40
+
+
+def test_trials_that_were_cut_short_choose_nothing_and_estimators_are_not_mixed():
+    default, other = (2, 4.0, 0.15), (1, 4.0, 0.15)
+    possible = {("1", world) for world in range(9)}
+    rows = [_row(default, world, 20.0) for world in range(9)]
+    cut_short = [_row(other, world, 1.0) | {"status": int(Status.TREE_OVERFLOW)} for world in range(9)]
+    assert compare([*rows, *cut_short], possible)["best"] == list(default)
+    of_another = [_row(other, 0, 1.0) | {"estimator": "b"}]
+    named = [row | {"policy": "potlp", "environment": "toy"} for row in (*rows, *of_another)]
+    with pytest.raises(ConfigurationError, match="potlp in toy was run with several estimators, None, b"):
+        compare(named, possible)
 
 
 def test_only_pairs_count_and_a_trial_without_success_costs_its_budget():

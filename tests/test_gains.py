@@ -5,18 +5,18 @@ import gzip
 
 import pytest
 
-from eval.gains import changes, costs_of, gain
+from eval.gains import changes, costs_of, gain, worlds_of_both
 
 
-def _table(file, potlp):
+def _table(file, potlp, outcome="satisfied", status=""):
     """Two worlds of a task: known map 10, baseline 30, and PO-TLP as given; one more world of another task."""
     with gzip.open(file, "wt", newline="") as lines:
         writer = csv.writer(lines)
-        writer.writerow(["task", "policy", "world", "cost"])
+        writer.writerow(["task", "policy", "world", "outcome", "cost", "status"])
         for world, cost in enumerate(potlp):
             for policy, value in (("known-map", 10), ("baseline", 30), ("potlp", cost)):
-                writer.writerow(["F a", policy, world, value])
-        writer.writerow(["F b", "baseline", 0, 7])
+                writer.writerow(["F a", policy, world, outcome if world == 0 else "satisfied", value, status])
+        writer.writerow(["F b", "baseline", 0, "satisfied", 7, ""])
     return costs_of(file)
 
 
@@ -34,6 +34,15 @@ def test_a_gain_is_of_what_can_be_saved(tables):
     found, low, high = gain(*tables, "F a")
     assert found == pytest.approx(12 / 40)
     assert (low, high) == pytest.approx((-2 / 20, 14 / 20))
+
+
+def test_trials_without_success_and_those_that_were_cut_short_are_in_no_gain(tmp_path, tables):
+    stuck = _table(tmp_path / "stuck.csv.gz", (1, 16), outcome="stuck")
+    assert worlds_of_both(tables[0], stuck, "F a") == [("F a", 1)]
+    assert gain(tables[0], stuck, "F a")[0] == pytest.approx(14 / 20)
+    cut_short = _table(tmp_path / "cut.csv.gz", (1, 16), status="tree_overflow")
+    assert worlds_of_both(tables[0], cut_short, "F a") == worlds_of_both(*tables, "F b") == []
+    assert worlds_of_both(tables[0], _table(tmp_path / "grew.csv.gz", (1, 16), status="dead_end fallback"), "F a")
 
 
 def test_the_way_back_loses_what_was_gained(tables):

@@ -9,18 +9,20 @@ import numpy as np
 import pytest
 from flax import struct
 
-from eval.limit.arms import Arm, key_of, missing_rows
+from eval.limit.arms import Arm, Experiment, key_of, missing_rows
 from eval.limit.mixed import mixed
 from eval.limit.report import markdown, page, results_of
 from eval.limit.rows import read_rows
 from eval.limit.running import run
 from eval.limit.worst import Loss, cause_of, worst_of
+from eval.limit.worst import results_of as worst_results
 from eval.provenance import lines_of
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.firefighting_layout import (
     FirefightingConfig,
 )
-from potlp_jax.environments.splits import world_key
+from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.environments.toy import Toy
 from potlp_jax.learning.observing import observe_panorama
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.policies import Policy, direct_move
@@ -29,6 +31,7 @@ from potlp_jax.sweep.store import Item, Row
 from potlp_jax.trials.batch import Start, run_batch
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import Outcome
+from potlp_jax.types import Status
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import BeliefMap
 from potlp_jax.world.sensing import SensorConfig, observe
@@ -141,11 +144,11 @@ class Worlds:
         self.identity, self.ran = identity, []
 
     def key(self, task, number, arm):
-        return ("toy", "test", task, number, arm.value, self.identity if arm.asks_trained else "")
+        return ("toy", "test", task, number, arm.value, self.identity if arm.asks_trained else "", f"digest {number}")
 
     def row(self, task, number, arm):
         self.ran.append((task, number, arm))
-        names = ("environment", "split", "task", "world", "arm", "identity")
+        names = ("environment", "split", "task", "world", "arm", "identity", "world_digest")
         possible = number % 2 == 0
         outcome = Outcome.SATISFIED if possible else Outcome.INFEASIBLE
         return dict(zip(names, self.key(task, number, arm), strict=True)) | {"outcome": outcome.value, "cost": 1.0}
@@ -263,10 +266,53 @@ def test_the_worst_trials_are_those_that_lose_most():
         for task, world, costs in (("F a", 0, (10, 30, 12)), ("F a", 1, (10, 30, 25)), ("F b", 0, (5, 45, 15)))
         for policy, cost in zip(("known-map", "baseline", "potlp"), costs, strict=True)
     ]
+    # One that gave up early was not cheap.
+    stuck = [
+        dataclasses.replace(row("F c", 0, policy, cost), outcome=outcome)
+        for policy, cost, outcome in (
+            ("known-map", 10, "satisfied"),
+            ("baseline", 30, "satisfied"),
+            ("potlp", 3, "stuck"),
+        )
+    ]
+    (loss,) = worst_of(stuck, {"3": "F c"}, 5)
+    assert (loss.potlp, loss.lost) == (99.0, 89.0)
     found = worst_of(rows, {"1": "F a", "2": "F b"}, 2)
     assert [(loss.task, loss.world, loss.lost) for loss in found] == [("1", 1, 15), ("2", 0, 10)]
     # Of all that is to be saved in the task, 40 cells in either.
     assert [round(loss.points, 6) for loss in found] == [37.5, 25.0]
+
+
+def test_a_trial_with_other_answers_that_gives_up_cures_nothing():
+    loss = Loss(task="1", world=0, known_map=10.0, baseline=300.0, potlp=200.0, points=1.0)
+    stuck = _row(Arm.TRUE_CHANCES, 0, 40.0, outcome="stuck", world_digest="a")
+    costs = _row(Arm.TRUE_COSTS, 0, 12.0, world_digest="a")
+    (trial,) = worst_results([loss], [stuck, costs], "cells")["trials"]
+    assert (trial["costs"]["true-chances"], trial["cause"]) == (1000.0, "R_S and R_F")
+    cut_short = {**costs, "status": int(Status.TREE_OVERFLOW)}
+    (trial,) = worst_results([loss], [stuck, cut_short], "cells")["trials"]
+    assert (list(trial["costs"]), trial["cause"]) == (["true-chances"], "more than one answer")
+
+
+def test_where_nothing_can_be_compared_the_page_says_so(tmp_path):
+    rows = [_row(arm, 0, 100.0) for arm in COSTS]
+    results = results_of(rows, {"1": "F a", "2": "F b"})
+    (tmp_path / "limit.json").write_text(json.dumps(results))
+    text = page(results, tmp_path / "limit.json")
+    assert "Task 1: no world to compare, or nothing to be saved." in text
+    assert "Task 2: no world to compare, or nothing to be saved." in text
+
+
+def test_trials_in_other_worlds_of_one_name_are_other_trials():
+    def key(seed):
+        class Other(Toy):
+            def draw(self, key):
+                return super().draw(jax.random.fold_in(key, seed))
+
+        return Experiment(Other(), Split.TEST, ("1",), None, 8).key("1", 0, Arm.BASELINE)
+
+    assert key(0)[:-1] == key(1)[:-1]
+    assert key(0) != key(1)
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,14 @@
 import pytest
 
 from eval.limit.beside import compare, markdown, observed_costs
+from potlp_jax.types import Status
 
 TASK = "F a"
 
 
 def row(world, arm, cost, **other):
-    return {"task": "1", "world": world, "arm": arm, "cost": cost, "outcome": "satisfied", "problems": [], **other}
+    known = {"outcome": "satisfied", "status": 0, "problems": []}
+    return {"task": "1", "world": world, "arm": arm, "cost": cost, **known, **other}
 
 
 def rows_of(world, known, observer, baseline):
@@ -49,11 +51,21 @@ def test_a_world_without_success_or_with_an_arm_missing_is_left_out():
         *rows_of(1, 5.0, 6.0, 9.0)[1:],
     ]
     assert observed_costs(rows, {"1": TASK}) == {}
+    cut_short = [row | {"status": int(Status.TREE_OVERFLOW)} for row in rows_of(0, 50.0, 60.0, 100.0)]
+    assert observed_costs(cut_short, {"1": TASK}) == {}
+
+
+def test_potlp_is_the_tables_own():
+    others = [row(0, "potlp", 51.0), row(0, "oracle", 99.0)]
+    found, alone = (compare(TABLE, observed_costs(rows, {"1": TASK}), TASK) for rows in ([*ROWS, *others], ROWS))
+    assert found == alone
 
 
 def test_what_does_not_belong_together_is_refused():
     with pytest.raises(SystemExit, match=r"baseline costs 100\.0 in the table, and 99\.0 beside"):
         compare(TABLE, observed_costs(rows_of(0, 50.0, 60.0, 99.0), {"1": TASK}), TASK)
+    with pytest.raises(SystemExit, match="no world is in both"):
+        compare(TABLE, observed_costs(ROWS[6:], {"1": TASK}), TASK)
     with pytest.raises(SystemExit, match="two rows with other costs"):
         observed_costs([*ROWS, row(0, "ideal-observer", 61.0)], {"1": TASK})
     with pytest.raises(SystemExit, match="an illegal move"):

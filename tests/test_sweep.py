@@ -23,7 +23,7 @@ from eval.faults.kills import process_start, workers_of
 from eval.limit.arms import Arm
 from eval.limit.worst import experiment_of
 from eval.real_maps.__main__ import exchange
-from eval.savings import decisions_of
+from eval.savings import compare_first, decisions_of, table_lines
 from potlp_jax.cli import app
 from potlp_jax.cli.report import _notable, page_title
 from potlp_jax.codec import shipped_settings
@@ -889,6 +889,29 @@ def test_an_experiment_counts_the_decisions_and_flagged_trials_of_a_policy():
     assert (found["trials"], found["number"], found["seconds"]) == (2, 8, 0.5)
     flagged = {name for name, count in found["flagged"].items() if count}
     assert flagged == {"SUBGOAL_OVERFLOW", "DEPTH_OVERFLOW"}
+
+
+def test_a_table_says_which_worlds_it_does_not_hold():
+    def pair(world, outcome="satisfied", status=0):
+        rows = {policy: _row(Item("toy", "F goal", policy, world), cost=100.0) for policy in ("known-map", "baseline")}
+        rows |= {"potlp": _row(Item("toy", "F goal", "potlp", world), cost=150.0)}
+        rows["baseline"] = dataclasses.replace(rows["baseline"], cost=200.0)
+        rows["potlp"] = dataclasses.replace(rows["potlp"], outcome=outcome, status=status, budget=500.0)
+        return rows.values()
+
+    policies = ["known-map", "baseline", "potlp"]
+    whole = [row for world in range(4) for row in pair(world)]
+    table = compare_first(whole, "F goal", policies, 9, lambda world: world // 2)
+    assert table["buildings"] == 2
+    assert len(table_lines(table, policies)) == 3
+    # The other building is in no figure.
+    short = [*whole[:6], *pair(2, "stuck"), *pair(3, status=int(Status.TREE_OVERFLOW))]
+    table = compare_first(short, "F goal", policies, 9, lambda world: world // 2)
+    assert table["buildings"] == 1
+    *lines, last = table_lines(table, policies)
+    assert "| 2 in 1 building | 150.0 | 50.0 % (no interval) | 25.0 % | 25.0 no error % |" in lines[-1]
+    assert "worlds left out: 1 not satisfied, 1 cut short; shares with unsatisfied trials charged their budgets" in last
+    assert "potlp -66.7 % " in last
 
 
 def test_real_maps_compare_potlp_with_another_baseline_on_the_same_worlds():

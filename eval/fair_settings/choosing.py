@@ -10,17 +10,15 @@ from jaxtyping import Float64
 
 from eval.fair_settings.running import CONFIRMING, Row, read_rows
 from eval.fair_settings.settings import Setting, changes_of
+from eval.limit.rows import charged
 from potlp_jax.environments.splits import Split
+from potlp_jax.errors import ConfigurationError
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.rows import provenance
+from potlp_jax.sweep.statistics import UNRELIABLE
 from potlp_jax.trials.record import Outcome
 
 RESAMPLES: int = 10_000
-
-
-def charged(row: Row) -> float:
-    """The cost of a trial; its budget where the task was not satisfied."""
-    return row["cost"] if row["outcome"] == Outcome.SATISFIED else row["budget"]
 
 
 def compare(rows: Sequence[Row], possible: set[tuple[str, int]]) -> dict[str, Any]:
@@ -35,6 +33,11 @@ def compare(rows: Sequence[Row], possible: set[tuple[str, int]]) -> dict[str, An
         what the default has; ``confirmed``: its figures in the worlds that did not choose it, None where it has not run
         there; the one that is ``chosen``; the default's ``trials`` and ``worlds``.
     """
+    if len(estimators := {row["estimator"] for row in rows}) > 1:
+        raise ConfigurationError(
+            f"{rows[0]['policy']} in {rows[0]['environment']} was run with several estimators, "
+            f"{', '.join(sorted(map(str, estimators)))}: give each a folder of its own"
+        )
     found = _by_setting([row for row in rows if row["world"] < CONFIRMING], possible)
     others = _by_setting([row for row in rows if row["world"] >= CONFIRMING], possible)
     default = next(_setting(row) for row in rows if row["is_default"])
@@ -61,7 +64,8 @@ def compare(rows: Sequence[Row], possible: set[tuple[str, int]]) -> dict[str, An
 def _by_setting(rows: Sequence[Row], possible: set[tuple[str, int]]) -> dict[Setting, dict[tuple[str, int], Row]]:
     found: dict[Setting, dict[tuple[str, int], Row]] = {}
     for row in rows:
-        if (row["task"], row["world"]) in possible:
+        # Of a trial that was cut short nobody knows what it would have cost.
+        if (row["task"], row["world"]) in possible and not row["status"] & UNRELIABLE:
             found.setdefault(_setting(row), {})[row["task"], row["world"]] = row
     return found
 

@@ -57,7 +57,10 @@ def main() -> None:
     if not options.as_it_is:
         run(file, experiment, arms, options.worlds)
     formulas = {name: experiment.padded[name][0].text for name in experiment.tasks}
-    results = results_of(own_rows(file, experiment, arms), formulas)
+    rows = own_rows(file, experiment, arms)
+    if not rows:
+        raise SystemExit(f"{options.out}: nothing is finished yet")
+    results = results_of(rows, formulas)
     print(markdown(results))
     print("\n".join(results["problems"]))
     if options.report is not None:

@@ -24,7 +24,7 @@ from potlp_jax.trials.loop import run_trial, versions
 from potlp_jax.trials.record import Outcome, Trial
 from potlp_jax.trials.rules import first_estimator, trial_key
 from potlp_jax.verify.audit import problems_of
-from potlp_jax.world.grid import World
+from potlp_jax.world.grid import World, world_digest
 
 
 class Arm(enum.StrEnum):
@@ -49,6 +49,8 @@ class Arm(enum.StrEnum):
         """Whether the trained estimator has a part in it."""
         return self in (Arm.TRUE_CHANCES, Arm.TRUE_COSTS, Arm.POTLP)
 
+
+_KEY = ("environment", "split", "task", "world", "arm", "identity", "world_digest")
 
 REFERENCES = (Arm.KNOWN_MAP, Arm.BASELINE)
 """What shares of the attainable savings are measured from."""
@@ -112,15 +114,16 @@ class Experiment:
 
     def key(self, task: str, number: int, arm: Arm) -> tuple[Any, ...]:
         """What tells a row from others (``key_of``)."""
-        return (self.generator.name, self.split.value, task, number, arm.value, self.identity(arm))
+        # Two maps may have one name.
+        digest = world_digest(self.world(number))
+        return (self.generator.name, self.split.value, task, number, arm.value, self.identity(arm), digest)
 
     def row(self, task: str, number: int, arm: Arm) -> dict[str, Any]:
         """Run a trial, audit it, and say how it went."""
         began = time.perf_counter()
         trial = self.run(task, number, arm)
         seconds = time.perf_counter() - began
-        names = ("environment", "split", "task", "world", "arm", "identity")
-        return dict(zip(names, self.key(task, number, arm), strict=True)) | {
+        return dict(zip(_KEY, self.key(task, number, arm), strict=True)) | {
             "outcome": trial.outcome.value,
             "cost": trial.cost,
             "budget": trial_budget(self.world(number), self.config.budget_factor),
@@ -173,7 +176,7 @@ def _world(generator: base.Generator, split: Split, number: int) -> World:
 
 def key_of(row: dict[str, Any]) -> tuple[Any, ...]:
     """As ``Experiment.key``, of a row that was written."""
-    return tuple(row[name] for name in ("environment", "split", "task", "world", "arm", "identity"))
+    return tuple(row.get(name) for name in _KEY)
 
 
 def missing_rows(

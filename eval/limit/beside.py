@@ -21,16 +21,17 @@ import numpy as np
 from eval.gains import SAME, Costs, costs_of
 from eval.limit.arms import REFERENCES, Arm
 from eval.limit.rows import ROWS, read_rows
+from eval.savings import versions_of
 from potlp_jax.environments.registry import make
 from potlp_jax.sweep.rows import provenance
-from potlp_jax.sweep.statistics import attainable_interval, attainable_share
+from potlp_jax.sweep.statistics import UNRELIABLE, attainable_interval, attainable_share
 from potlp_jax.trials.record import Outcome
 
 COMPARED: tuple[Arm, ...] = (Arm.ORACLE, Arm.IDEAL_OBSERVER, Arm.POTLP)
 
 
 def observed_costs(rows: Sequence[Mapping[str, Any]], formulas: Mapping[str, str]) -> Costs:
-    """Costs by task's formula and world, of the worlds in which every arm ended satisfied.
+    """Costs by task's formula and world, of the worlds in which observer and references ended satisfied and reliably.
 
     Args:
         rows: of ``eval.limit``, of one environment and split.
@@ -46,7 +47,9 @@ def observed_costs(rows: Sequence[Mapping[str, Any]], formulas: Mapping[str, str
     for row in rows:
         if row["problems"]:
             raise SystemExit(f"task {row['task']} world {row['world']} {row['arm']}: {row['problems'][0]}")
-        if row["outcome"] == Outcome.SATISFIED.value:
+        # The others stand in the table.
+        is_asked = row["arm"] in (*REFERENCES, Arm.IDEAL_OBSERVER)
+        if is_asked and row["outcome"] == Outcome.SATISFIED.value and not row["status"] & UNRELIABLE:
             costs = found[formulas[row["task"]], row["world"]]
             if abs(costs.setdefault(row["arm"], row["cost"]) - row["cost"]) > SAME:
                 raise SystemExit(f"task {row['task']} world {row['world']} {row['arm']}: two rows with other costs")
@@ -66,9 +69,12 @@ def compare(table: Costs, observed: Costs, task: str) -> dict[str, Any]:
         paired; shares and gains with the ends of their 95 % intervals.
 
     Raises:
-        SystemExit: baseline or known map do not cost the same in both.
+        SystemExit: there is no such world, or baseline or known map do not cost the same in both.
     """
-    worlds = sorted(name for name in table.keys() & observed.keys() if name[0] == task)
+    asked = {*REFERENCES, Arm.ORACLE, Arm.POTLP}
+    worlds = sorted(name for name in table.keys() & observed.keys() if name[0] == task and asked <= table[name].keys())
+    if not worlds:
+        raise SystemExit(f"{task}: no world is in both")
     for name in worlds:
         for arm in REFERENCES:
             if abs(table[name][arm] - observed[name][arm]) > SAME:
@@ -128,7 +134,7 @@ def main() -> None:
     table, observed = costs_of(options.table), observed_costs(rows, formulas)
     tasks = {name: compare(table, observed, formula) for name, formula in formulas.items()}
     found = {
-        "provenance": provenance(),
+        "provenance": provenance() | {"versions": versions_of(row["versions"] for row in rows)},
         "commits": sorted({row["commit"] for row in rows}),
         "audited": len(rows),
         "outcomes": Counter(row["outcome"] for row in rows),

@@ -10,7 +10,7 @@ import numpy as np
 
 from eval.limit.arms import Arm
 from eval.provenance import lines_of
-from eval.savings import policy_row
+from eval.savings import policy_row, versions_of
 from potlp_jax.codec import finite_or_null
 from potlp_jax.sweep.rows import provenance
 from potlp_jax.sweep.statistics import (
@@ -74,7 +74,7 @@ def results_of(rows: Sequence[Mapping[str, Any]], formulas: Mapping[str, str]) -
         "audited": len(rows),
         "problems": [f"{row['task']} {row['world']} {row['arm']}: {text}" for row in rows for text in row["problems"]],
         "commits": sorted({row["commit"] for row in rows}),
-        "provenance": provenance(),
+        "provenance": provenance() | {"versions": versions_of(row["versions"] for row in rows)},
     }
 
 
@@ -161,6 +161,9 @@ def _answer(results: Mapping[str, Any]) -> str:
     sentences = []
     for name, table in results["tables"].items():
         shares = {entry["policy"]: entry["attainable_share"] for entry in table["satisfied"]["rows"]}
+        if shares[Arm.POTLP] is None:
+            sentences.append(f"Task {name}: no world to compare, or nothing to be saved.")
+            continue
         ideal = shares.get(Arm.IDEAL_OBSERVER)
         limit = "" if ideal is None else f"the ideal observer reaches {100 * ideal:.0f} %, "
         gains = {arm: table["gains"][arm]["gain"] for arm in PARTS if arm in table["gains"]}

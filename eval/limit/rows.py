@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from potlp_jax.trials.record import Outcome
+
 ROWS = "trials.jsonl"
 
 
@@ -21,6 +23,11 @@ def read_rows(file: Path) -> list[dict[str, Any]]:
         except json.JSONDecodeError:
             continue
     return rows
+
+
+def charged(row: Mapping[str, Any]) -> float:
+    """What a trial counts for: its cost, or its budget where it did not end satisfied."""
+    return row["cost"] if row["outcome"] == Outcome.SATISFIED else row["budget"]
 
 
 def append_row(file: Path, row: Mapping[str, Any]) -> None:

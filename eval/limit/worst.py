@@ -19,17 +19,19 @@ from pathlib import Path
 from typing import Any
 
 from eval.limit.arms import Arm, Experiment, key_of
-from eval.limit.rows import ROWS, append_row, read_rows
+from eval.limit.rows import ROWS, append_row, charged, read_rows
 from eval.savings import read_rows as rows_of_sweep
+from eval.savings import versions_of
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.registry import make
 from potlp_jax.learning.domain import unit_of
 from potlp_jax.learning.estimator import named_estimator
 from potlp_jax.planning.policies import Policy
-from potlp_jax.sweep.results import pair_rows, reliable_pairs
+from potlp_jax.sweep.results import charged_cost, pair_rows, reliable_pairs
 from potlp_jax.sweep.rows import provenance
 from potlp_jax.sweep.runner import RESULTS
 from potlp_jax.sweep.specification import specification_from_store
+from potlp_jax.sweep.statistics import UNRELIABLE
 from potlp_jax.sweep.store import Row, Store
 from potlp_jax.trials.config import trial_config_for
 
@@ -68,7 +70,7 @@ class Loss:
 
 
 def worst_of(rows: Sequence[Row], tasks: Mapping[str, str], number: int) -> list[Loss]:
-    """The trials that lose most, worst first.
+    """The trials that lose most, worst first; one that is not satisfied is charged its budget.
 
     Args:
         rows: of the sweep, one environment.
@@ -79,9 +81,9 @@ def worst_of(rows: Sequence[Row], tasks: Mapping[str, str], number: int) -> list
     found = []
     for task, formula in tasks.items():
         pairs = reliable_pairs(pair_rows([row for row in rows if row.item.task == formula], names))
-        attainable = sum(pair[names[1]].cost - pair[names[0]].cost for pair in pairs)
+        attainable = sum(charged_cost(pair[names[1]]) - charged_cost(pair[names[0]]) for pair in pairs)
         for pair in pairs:
-            known, baseline, potlp = (pair[name].cost for name in names)
+            known, baseline, potlp = (charged_cost(pair[name]) for name in names)
             points = 100 * (potlp - known) / attainable if attainable else 0.0
             found.append(Loss(task, pair[names[0]].item.world, known, baseline, potlp, points))
     return sorted(found, key=lambda loss: -loss.lost)[:number]
@@ -113,7 +115,8 @@ def results_of(losses: Sequence[Loss], rows: Sequence[Mapping[str, Any]], unit: 
     """JSON-able: every trial with its costs by arm and its cause, and what each cause costs over all, in ``unit``."""
     costs: dict[tuple[str, int], dict[Arm, float]] = defaultdict(dict)
     for row in rows:
-        costs[row["task"], row["world"]][Arm(row["arm"])] = row["cost"]
+        if not row["status"] & UNRELIABLE:
+            costs[row["task"], row["world"]][Arm(row["arm"])] = charged(row)
     causes = [cause_of(loss, costs[loss.task, loss.world]) for loss in losses]
     total: dict[str, float] = defaultdict(float)
     for loss, cause in zip(losses, causes, strict=True):
@@ -128,7 +131,7 @@ def results_of(losses: Sequence[Loss], rows: Sequence[Mapping[str, Any]], unit: 
         "lost_by_cause": dict(sorted(total.items(), key=lambda item: -item[1])),
         "problems": [text for row in rows for text in row["problems"]],
         "commits": sorted({row["commit"] for row in rows}),
-        "provenance": provenance(),
+        "provenance": provenance() | {"versions": versions_of(row["versions"] for row in rows)},
     }
 
 
