@@ -209,6 +209,7 @@ def test_a_cluster_without_workers_is_waited_for_with_a_note(tmp_path, caplog, m
         ("slurm:partition", "'partition' is no OPTION=VALUE"),
         ("slurm:workers=0", "workers: give a whole number of at least 1, found 0"),
         ("slurm:workers=many", "workers: give a whole number of at least 1, found many"),
+        ("slurm:workers=²", "workers: give a whole number of at least 1, found ²"),
         ("slurm:workers=1,colour=red", "workers cannot be begun as jobs of slurm"),
         ("ssh:", "name the machines"),
     ],

@@ -35,7 +35,7 @@ from potlp_jax.environments.toy import Toy
 from potlp_jax.errors import ConfigurationError, EngineError, EstimatorError, StoreError, SweepError, WorldError
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.results import charged_cost, pair_rows, read_results, remarks_on_worlds, world_of
-from potlp_jax.sweep.rows import path_text, read_path
+from potlp_jax.sweep.rows import path_text, read_path, source_commit
 from potlp_jax.sweep.runner import RESULTS, Sweep, run_sweep
 from potlp_jax.sweep.specification import (
     configuration_hash,
@@ -889,6 +889,37 @@ def test_an_experiment_counts_the_decisions_and_flagged_trials_of_a_policy():
     assert (found["trials"], found["number"], found["seconds"]) == (2, 8, 0.5)
     flagged = {name for name, count in found["flagged"].items() if count}
     assert flagged == {"SUBGOAL_OVERFLOW", "DEPTH_OVERFLOW"}
+
+
+def test_the_commit_is_the_packages_own_and_not_that_of_a_repository_around_it(tmp_path, monkeypatch):
+    def git(*arguments):
+        subprocess.run(["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a", *arguments], check=True)
+
+    installed = tmp_path / "environment" / "potlp_jax" / "sweep" / "rows.py"
+    installed.parent.mkdir(parents=True)
+    installed.touch()
+    (tmp_path / ".gitignore").write_text("environment\n")
+    git("init", "--quiet")
+    git("add", ".")
+    git("commit", "--quiet", "--message", "a project that uses the package")
+    monkeypatch.setattr("potlp_jax.sweep.rows.__file__", str(installed))
+    try:
+        source_commit.cache_clear()
+        assert source_commit() == ""
+        git("add", "--force", "environment")
+        git("commit", "--quiet", "--message", "the package itself")
+        source_commit.cache_clear()
+        assert len(source_commit()) == 40
+    finally:
+        source_commit.cache_clear()
+
+
+def test_a_schema_that_is_no_text_is_damage(tmp_path):
+    Store(tmp_path / "whole").close()
+    whole = (tmp_path / "whole").read_bytes()
+    (tmp_path / "damaged").write_bytes(whole.replace(b"CREATE TABLE facts", b"CREATE TABLE f\xe9cts"))
+    with pytest.raises(StoreError, match="damaged"):
+        Store(tmp_path / "damaged", read_only=True)
 
 
 def test_a_table_says_which_worlds_it_does_not_hold():
