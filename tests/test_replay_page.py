@@ -18,7 +18,8 @@ from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.replay import Views
-from potlp_jax.view.replay_page import replay_data, replay_page
+from potlp_jax.view.replay_page import page_style, replay_data, replay_page
+from potlp_jax.view.style import rgb
 from potlp_jax.world.sensing import SensorConfig
 from tests.reference.browser import BROWSER, dump_page
 
@@ -77,6 +78,21 @@ def test_the_page_needs_nothing_from_elsewhere(trial, views):
     page = replay_page(trial, views)
     assert not re.findall(r"""(?:src|href)\s*=\s*["'](?!data:)""", page)
     assert "http" not in page
+
+
+def _contrast(*colours):
+    """Of two colours, by the Web Content Accessibility Guidelines."""
+    shares = np.array([rgb(colour) for colour in colours]) / 255
+    linear = np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
+    dark, light = sorted(linear @ [0.2126, 0.7152, 0.0722])
+    return (light + 0.05) / (dark + 0.05)
+
+
+def test_lines_can_be_seen_on_dark_screens():
+    dark = dict(re.findall(r"--([a-z-]+): (#[0-9a-f]{6})", page_style().partition("(prefers-color-scheme: dark)")[2]))
+    # What is planned goes through what is known and what is not; states are dark, and have a rim there.
+    for first, second in (("planned", "free"), ("planned", "unseen"), ("stroke-rim", "paper")):
+        assert _contrast(dark[first], dark[second]) >= 3.0, (first, second)
 
 
 def test_view_writes_the_page_beside_the_record(trial, tmp_path):
@@ -156,6 +172,8 @@ const at = ([row, column]) => pixels((column + 0.5) * scale, (row + 0.5) * scale
 const whole = () => pixels(0, 0, canvas.width, canvas.height).join();
 const where = () => document.querySelector(".where").textContent.trim();
 const result = {note: document.querySelector(".note").textContent, target: at(decision.target), where: where()};
+result.robot = at(DATA.path[0]);
+result.beside = at(DATA.path[0].map((place) => place + 0.3));
 result.others = decision.subgoals.filter((cell) => cell.join() !== decision.target.join()).map(at);
 const press = ([target, key, held]) => {
   const event = new KeyboardEvent("keydown", {key, bubbles: true, cancelable: true, ...held});
@@ -189,6 +207,8 @@ def test_a_browser_shows_where_a_policy_goes_that_does_not_search(trial, tmp_pat
     assert result["target"] == "196,0,106"
     assert set(result["others"]) <= {"255,255,255"}
     assert len(result["others"]) == sum(cell != first.target for cell in first.subgoals)
+    # The robot covers no more than its cell.
+    assert result["robot"] == "255,212,0" != result["beside"]
     # From a name to its area there is a line.
     assert result["joined"]
     # Keys of the browser, and of a list, move nothing and are not kept from them.
