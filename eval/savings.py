@@ -1,5 +1,6 @@
 """What experiments on savings share: a sweep by its command, its tables clustered by building, its audit."""
 
+import html
 import json
 import subprocess
 import sys
@@ -98,15 +99,20 @@ def audit(rows: Sequence[Row], generator: Generator, split: Split) -> list[str]:
 def table_lines(table: Mapping[str, Any], policies: Sequence[str]) -> list[str]:
     """Rows of a Markdown table below ``TABLE_HEAD``; the last says which worlds are not in the others."""
     found = {entry["policy"]: entry for entry in table["satisfied"]["rows"]}
-    task, lines = table["task"].replace("|", "\\|"), []
+    task, lines = _code(table["task"]), []
     for policy in policies:
         row = policy_row(found[policy])
         buildings = table["buildings"]
         worlds = f"{table['satisfied']['pairs']} in {buildings} building{'s' if buildings > 1 else ''}"
-        lines.append(f"| `{task}` | {policy} | {worlds} | {row.mean_cost:.1f} | {figures(row)} |")
+        lines.append(f"| {task} | {policy} | {worlds} | {row.mean_cost:.1f} | {figures(row)} |")
     if left_out := worlds_left_out(table):
-        lines.append(f"| `{task}` | {left_out} | | | | | |")
+        lines.append(f"| {task} | {left_out} | | | | | |")
     return lines
+
+
+def _code(formula: str) -> str:
+    # A bar would end the cell, and the site would show the backslash before one.
+    return f"<code>{html.escape(formula).replace('|', '&#124;')}</code>" if "|" in formula else f"`{formula}`"
 
 
 def worlds_left_out(table: Mapping[str, Any]) -> str:

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import gzip
 import json
+import os
 import re
 import subprocess
 import sys
@@ -78,6 +79,15 @@ def test_help_leads_a_newcomer_to_the_commands():
         assert "--json" in shown.stdout
 
 
+def test_paragraphs_of_help_break_where_the_terminal_does(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    told = _potlp("compare", "--help").stdout
+    (line,) = (line for line in told.splitlines() if "known-map (the least possible cost)" in line)
+    assert line.strip().endswith("potlp report makes a page of it.")
+    # Examples stay on lines of their own.
+    assert sum(line.strip().startswith("potlp compare") for line in told.splitlines()) == 2
+
+
 def test_the_first_tour_shows_what_it_says(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shown = _potlp("--help").stdout
@@ -142,6 +152,13 @@ def test_task_as_text_and_picture(tmp_path):
         assert part in result.stdout
     texts = ["".join(node.itertext()) for node in ElementTree.parse(svg).iter("{http://www.w3.org/2000/svg}text")]
     assert "!goal & !hazard" in texts
+
+
+def test_a_dollar_in_a_formula_is_drawn(tmp_path):
+    svg = tmp_path / "task.svg"
+    result = _potlp("task", 'F "cost$a" & F "cost$b"', "--out", svg)
+    assert result.exit_code == 0, result.output
+    assert "cost$a" in "".join(ElementTree.parse(svg).getroot().itertext())
 
 
 def test_task_from_a_hoa_file(tmp_path):
@@ -277,12 +294,26 @@ def test_a_trial_has_the_key_of_its_world_in_a_sweep(monkeypatch):
     assert (keys[0] == jax.random.fold_in(jax.random.key(0), 3)).all()
 
 
-def test_nothing_of_an_earlier_trial_stays_beside_a_record(tmp_path):
+def test_nothing_of_an_earlier_trial_stays_beside_a_record(tmp_path, monkeypatch):
     out = ("--out", str(tmp_path))
     assert _potlp("run", "toy", "--policy", "baseline", *out).exit_code == 0
     (tmp_path / "replay.html").write_text("of the first trial")
     assert _potlp("run", "toy", "--policy", "baseline", "--world", "1", "--no-animation", *out).exit_code == 0
     assert sorted(file.name for file in tmp_path.iterdir()) == ["trial.json", "trial.png"]
+
+    def draw_trial(trial):
+        raise PotlpError("no picture")
+
+    monkeypatch.setattr("potlp_jax.view.maps.draw_trial", draw_trial)
+    assert "no picture" in _potlp("run", "toy", "--policy", "baseline", "--world", "2", *out).stderr
+    assert [file.name for file in tmp_path.iterdir()] == ["trial.json"]
+
+
+def test_a_trial_without_decisions_is_not_to_be_explained(tmp_path):
+    formula = "F (goal | !goal)"
+    result = _potlp("run", "toy", "--task", formula, "--policy", "baseline", "--out", tmp_path, "--no-animation")
+    assert not load_trial(tmp_path / "trial.json").decisions
+    assert f"next: potlp view {tmp_path}" in " ".join(result.stdout.split("\n"))
 
 
 def test_run_as_json_is_the_summary(recorded, tmp_path):
@@ -461,12 +492,19 @@ def test_a_comparison_is_a_sweep_that_the_other_commands_show(tmp_path):
 
 
 def test_the_trials_in_one_world_are_drawn_side_by_side(tmp_path):
-    command = ("compare", "toy", "-t", "2", "--policies", "optimistic", "--trials", "2", "--json")
-    _json(_potlp(*command, "--out", tmp_path, "--picture", "1"))
+    command = ("compare", "toy", "-t", "2", "--policies", "optimistic", "--trials", "2")
+    _json(_potlp(*command, "--json", "--out", tmp_path, "--picture", "1"))
     with Image.open(tmp_path / "world-1.png") as picture:
         assert picture.size[0] > 400
-    assert "the worlds compared are 0, 1" in _potlp(*command, "--out", tmp_path, "--picture", "9").stderr
+    late = _potlp(*command, "--out", tmp_path, "--picture", "9")
+    assert late.exit_code == 2
+    assert "the worlds compared are 2 of 0 to 1" in late.stderr
+    # The table of trials that took minutes is not lost with the picture.
+    assert "optimistic" in late.stdout
     assert "--picture needs --out" in _potlp(*command, "--picture", "1").stderr
+    early = _potlp(*command, "--world", "4", "--out", tmp_path / "other", "--picture", "3")
+    assert "the worlds compared begin with 4" in early.stderr
+    assert not (tmp_path / "other").exists()
 
 
 def test_the_demo_quotes_the_results():
@@ -525,6 +563,18 @@ def test_exit_codes_of_the_process():
     assert bad.returncode == 2
     assert bad.stdout == ""
     assert bad.stderr.startswith("potlp: ")
+
+
+def test_a_terminal_that_lacks_a_letter_shows_the_rest(recorded):
+    done = subprocess.run(
+        [Path(sys.executable).with_name("potlp"), "explain", f"{recorded}:0"],
+        capture_output=True,
+        env={**os.environ, "PYTHONIOENCODING": "latin-1"},
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.search(rb"\b0\?1\b", done.stdout)
 
 
 def test_interrupt_has_exit_code_130():

@@ -170,6 +170,13 @@ def test_links_resolve(page):
             assert anchor in _anchors(file), f"{target}: {_name(file)} has {sorted(_anchors(file))}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_no_formula_in_a_table_has_a_backslash(page):
+    """The site would show it; ``<code>`` with ``&#124;`` is read alike there and in the repository."""
+    for line in page.read_text("utf-8").splitlines():
+        assert not (line.startswith("|") and re.search(r"`[^`|]*\\\|[^`]*`", line)), line
+
+
 def test_the_navigation_has_every_page():
     listed = set(re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text())) - {"contributing.md", "changes.md"}
     assert listed == {str(page.relative_to(ROOT / "docs")) for page in PAGES if page.is_relative_to(ROOT / "docs")}

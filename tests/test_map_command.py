@@ -419,6 +419,8 @@ def test_preview_writes_pictures(office, tmp_path):
     def words(file):
         return ["".join(node.itertext()) for node in ElementTree.parse(file).iter("{http://www.w3.org/2000/svg}text")]
 
+    # With a rim of white: beneath the area of the part there are walls.
+    assert "stroke: #ffffff; stroke-width: 2.5" in (tmp_path / "plain.svg").read_text("utf-8")
     for part in ("x (m)", "y (m)", "2 m", "reachable", "cut off, 10 m² in all"):
         assert part in words(tmp_path / "plain.svg")
     assert "kitchen" in words(tmp_path / "labelled.svg")

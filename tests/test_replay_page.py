@@ -18,7 +18,8 @@ from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.replay import Views
-from potlp_jax.view.replay_page import replay_data, replay_page
+from potlp_jax.view.replay_page import page_style, replay_data, replay_page
+from potlp_jax.view.style import rgb
 from potlp_jax.world.sensing import SensorConfig
 from tests.reference.browser import BROWSER, dump_page
 
@@ -58,6 +59,13 @@ def test_the_data_hold_the_whole_trial(trial, views):
     assert len(data["state_names"]) == len(data["state_colours"]) > max(trial.states)
 
 
+def test_a_policy_that_does_not_search_expects_nothing(trial, views):
+    data = replay_data(trial, views)
+    assert not any(decision.actions for decision in trial.decisions)
+    assert {entry["value"] for entry in data["decisions"]} == {None}
+    assert [tuple(entry["target"]) for entry in data["decisions"]] == [decision.target for decision in trial.decisions]
+
+
 def test_no_text_ends_the_script(trial, views):
     hostile = dataclasses.replace(trial, environment="</script><script>alert(1)</script>", task_text="a < b & </h1>")
     page = replay_page(hostile, views)
@@ -70,6 +78,21 @@ def test_the_page_needs_nothing_from_elsewhere(trial, views):
     page = replay_page(trial, views)
     assert not re.findall(r"""(?:src|href)\s*=\s*["'](?!data:)""", page)
     assert "http" not in page
+
+
+def _contrast(*colours):
+    """Of two colours, by the Web Content Accessibility Guidelines."""
+    shares = np.array([rgb(colour) for colour in colours]) / 255
+    linear = np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
+    dark, light = sorted(linear @ [0.2126, 0.7152, 0.0722])
+    return (light + 0.05) / (dark + 0.05)
+
+
+def test_lines_can_be_seen_on_dark_screens():
+    dark = dict(re.findall(r"--([a-z-]+): (#[0-9a-f]{6})", page_style().partition("(prefers-color-scheme: dark)")[2]))
+    # What is planned goes through what is known and what is not; states are dark, and have a rim there.
+    for first, second in (("planned", "free"), ("planned", "unseen"), ("stroke-rim", "paper")):
+        assert _contrast(dark[first], dark[second]) >= 3.0, (first, second)
 
 
 def test_view_writes_the_page_beside_the_record(trial, tmp_path):
@@ -139,6 +162,71 @@ def test_every_one_of_several_decisions_at_one_step_is_shown(trial, tmp_path):
     page.write_text(text.replace("</body>", AGAIN), "utf-8")
     # After the last decision there is the end, from which one comes back to it.
     assert dump_page(page, tmp_path / "profile") == [1, 2, 3, 4, 4, 4, 3, 2, 1, 0, 0, 4, 0]
+
+
+LOOK = """<script>
+const canvas = document.querySelector("canvas"), context = canvas.getContext("2d");
+const slider = document.querySelector("input"), scale = DATA.cell_pixels, decision = DATA.decisions[0];
+const pixels = (...box) => context.getImageData(...box).data;
+const at = ([row, column]) => pixels((column + 0.5) * scale, (row + 0.5) * scale, 1, 1).slice(0, 3).join();
+const whole = () => pixels(0, 0, canvas.width, canvas.height).join();
+const where = () => document.querySelector(".where").textContent.trim();
+const result = {note: document.querySelector(".note").textContent, target: at(decision.target), where: where()};
+result.robot = at(DATA.path[0]);
+result.beside = at(DATA.path[0].map((place) => place + 0.3));
+result.others = decision.subgoals.filter((cell) => cell.join() !== decision.target.join()).map(at);
+const press = ([target, key, held]) => {
+  const event = new KeyboardEvent("keydown", {key, bubbles: true, cancelable: true, ...held});
+  return [document.querySelector(target).dispatchEvent(event), where()];
+};
+const held = [["input", "ArrowRight", {altKey: true}], ["input", "End", {ctrlKey: true}]];
+result.keys = [["select", "End"], ...held].map(press);
+const joined = whole();
+for (const label of DATA.labels) label.anchor = label.centre;
+slider.dispatchEvent(new Event("input"));
+result.joined = joined !== whole();
+const scroll = document.querySelector(".scroll");
+result.shares = [];
+for (const width of ["200px", "2000px"]) {
+  document.body.style.width = width;
+  result.shares.push([canvas.clientWidth / canvas.width, scroll.scrollWidth > scroll.clientWidth]);
+}
+document.body.append(Object.assign(document.createElement("pre"), {id: "result", textContent: JSON.stringify(result)}));
+</script></body>"""
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed to look at the page with")
+def test_a_browser_shows_where_a_policy_goes_that_does_not_search(trial, tmp_path):
+    first = trial.decisions[0]
+    page = tmp_path / "page.html"
+    text = replay_page(trial, Views()).replace("JSON.parse(", "window.DATA = JSON.parse(")
+    page.write_text(text.replace("</body>", LOOK.replace("DATA", "window.DATA")), "utf-8")
+    result = dump_page(page, tmp_path / "profile")
+    assert "expected cost" not in result["note"]
+    # The colour of what is chosen, on a light screen, and that of paper.
+    assert result["target"] == "196,0,106"
+    assert set(result["others"]) <= {"255,255,255"}
+    assert len(result["others"]) == sum(cell != first.target for cell in first.subgoals)
+    # The robot covers no more than its cell.
+    assert result["robot"] == "255,212,0" != result["beside"]
+    # From a name to its area there is a line.
+    assert result["joined"]
+    # Keys of the browser, and of a list, move nothing and are not kept from them.
+    assert result["keys"] == [[True, result["where"]]] * 3
+    narrow, wide = result["shares"]
+    assert 0.7 < narrow[0] <= 0.75
+    assert narrow[1]
+    assert wide == [1, False]
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed to look at the page with")
+def test_a_browser_says_that_a_trial_has_no_decisions(trial, tmp_path):
+    still = dataclasses.replace(trial, decisions=(), path=trial.path[:1], states=trial.states[:1], word=trial.word[:1])
+    page = tmp_path / "page.html"
+    tell = """<script>document.body.append(Object.assign(document.createElement("pre"), {id: "result",
+      textContent: JSON.stringify(document.querySelector(".where").textContent)}));</script></body>"""
+    page.write_text(replay_page(still, Views()).replace("</body>", tell), "utf-8")
+    assert dump_page(page, tmp_path / "profile") == "step 0 of 0, no decisions"
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed to look at the page with")

@@ -26,6 +26,7 @@ from eval.real_maps.__main__ import exchange
 from eval.savings import compare_first, decisions_of, table_lines
 from potlp_jax.cli import app
 from potlp_jax.cli.report import _notable, page_title
+from potlp_jax.cli.sweep import _Reporter
 from potlp_jax.codec import shipped_settings
 from potlp_jax.engine.engine import Broken, Here
 from potlp_jax.engine.writer import only_writer
@@ -36,7 +37,7 @@ from potlp_jax.errors import ConfigurationError, EngineError, EstimatorError, St
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.results import charged_cost, pair_rows, read_results, remarks_on_worlds, world_of
 from potlp_jax.sweep.rows import path_text, read_path, source_commit
-from potlp_jax.sweep.runner import RESULTS, Sweep, run_sweep
+from potlp_jax.sweep.runner import RESULTS, Progress, Sweep, run_sweep
 from potlp_jax.sweep.specification import (
     configuration_hash,
     own_settings,
@@ -785,6 +786,29 @@ def test_a_report_without_replays_runs_nothing_again(finished, tmp_path, monkeyp
     told = _potlp("report", finished, "--out", tmp_path / "report.html", "--replays", 0)
     assert told.exit_code == 0, told.stderr
     assert 'id="replay-' not in (tmp_path / "report.html").read_text("utf-8")
+
+
+def test_of_a_world_or_two_a_report_promises_no_interval():
+    costs = {"known-map": 10.0, "baseline": 30.0, "oracle": 10.0, "potlp": 17.0}
+    rows = {policy: dataclasses.replace(_row(Item("toy", "F goal", policy, 0)), cost=c) for policy, c in costs.items()}
+    page = report_page("a", [], list(costs), [Cell("toy", "F goal", [rows], [])])
+    assert "- to -" not in page
+    assert "± -" not in page
+    # The known map attains all too, but it is a bound.
+    assert re.findall(r'<tr class="best"><td[^>]*>([^<]*)<', page) == ["oracle"]
+    # Ticks of worlds between 0 and 1 are none of a whole number.
+    worlds = page.split("<figure>")[3]
+    assert not re.search(r">0\.5<", worlds[: worlds.index("cost of all of them")])
+
+
+def test_progress_says_nothing_twice(monkeypatch, caplog):
+    monkeypatch.setattr("potlp_jax.cli.sweep.SECONDS_BETWEEN_LINES", 0.0)
+    reporter = _Reporter()
+    with caplog.at_level("INFO", logger="potlp_jax"):
+        for done in (0, 0, 1):
+            reporter.report(Progress(done, 2))
+    reporter.close()
+    assert [record.message.partition(" (")[0] for record in caplog.records] == ["0 of 2 trials", "1 of 2 trials"]
 
 
 def test_where_the_loss_is():

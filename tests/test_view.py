@@ -4,6 +4,7 @@ import dataclasses
 import io
 import itertools
 import json
+import re
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
@@ -15,6 +16,7 @@ from matplotlib.colors import to_hex
 from PIL import Image, ImageSequence
 from rich.console import Console
 
+from potlp_jax.cli.output import print_table
 from potlp_jax.errors import PictureError, TaskWarning
 from potlp_jax.sweep.statistics import Comparison, TrialResult
 from potlp_jax.sweep.store import Item, Row
@@ -28,6 +30,7 @@ from potlp_jax.view.comparisons import comparison_table, draw_scatter, remark_li
 from potlp_jax.view.decisions import (
     FIGURES,
     action_name,
+    action_names,
     action_table,
     decision_to_dict,
     describe_decision,
@@ -50,6 +53,7 @@ from potlp_jax.view.style import (
     WALL_SEEN,
     WALL_UNSEEN,
     area_colour,
+    faded,
     new_figure,
     policy_styles,
     rgb,
@@ -175,6 +179,76 @@ def test_a_trial_that_failed_shows_what_was_left_to_try(trial):
     assert not {"s0", "s1"} & {text.get_text() for text in draw_trial(trial).axes[0].texts}
 
 
+def test_the_legend_names_what_is_drawn_and_covers_nothing(trial, tmp_path):
+    """The subgoals of a trial that failed have a row of the legend for themselves where the others are full."""
+    stuck = dataclasses.replace(trial, outcome=Outcome.STUCK)
+    bare = dataclasses.replace(trial.decisions[-1], subgoals=(), target=None)
+    both, left = {"subgoal", "chosen"}, dataclasses.replace(stuck, decisions=(bare,))
+    for shown, expected in ((stuck, both), (_long_names(stuck), both), (left, set())):
+        figure = draw_trial(shown)
+        # Legends are laid out in drawing.
+        save_figure(figure, tmp_path / "trial.png")
+        renderer = figure.canvas.get_renderer()
+        texts = [text for legend in figure.legends for text in legend.get_texts()]
+        assert {"subgoal", "chosen"} & {text.get_text() for text in texts} == expected
+        lowest = figure.axes[0].get_tightbbox(renderer).y0
+        assert all(text.get_window_extent(renderer).y1 < lowest for text in texts)
+
+
+def _long_names(trial):
+    """The beginning of the trial on a narrow map, with names as long as names may be."""
+    pytest.importorskip("spot")
+    names = tuple(f"{'proposition':_<43}_{name}" for name in trial.propositions)
+    task = Task.from_formula(" & ".join(f"F {name}" for name in names), propositions=names)
+    occupied, letters = np.array(trial.world.occupied)[:, :8], np.zeros((HEIGHT, 8), np.int32)
+    occupied[:, -1] = True
+    letters[2, 5], letters[9, 5] = 1, 2
+    return dataclasses.replace(
+        trial,
+        world=make_world(occupied, letters, (6, 2), propositions=names),
+        first_seen=trial.first_seen[:, :8],
+        propositions=names,
+        task_text=task.text,
+        task_hoa=task.to_hoa(),
+        path=trial.path[:5],
+        states=trial.states[:5],
+        word=trial.word[:5],
+        decisions=trial.decisions[:1],
+    )
+
+
+def test_long_names_leave_no_picture(trial, tmp_path):
+    long = _long_names(trial)
+    figure = draw_trial(long)
+    save_figure(figure, tmp_path / "long.png")
+    renderer = figure.canvas.get_renderer()
+    for legend in figure.legends:
+        for text in legend.get_texts():
+            box = text.get_window_extent(renderer)
+            assert 0 <= box.x0 < box.x1 <= figure.bbox.width, text.get_text()
+    # Of the animation the figure is not at hand: what is drawn to its very edge was cut off there.
+    save_animation(long, tmp_path / "long.gif")
+    with Image.open(tmp_path / "long.gif") as animation:
+        frame = np.asarray(animation.convert("RGB"))
+    for edge in (frame[0], frame[-1], frame[:, 0], frame[:, -1]):
+        assert np.all(edge == 255)
+
+
+def test_names_and_formulas_with_dollars_are_no_mathematics(trial, tmp_path):
+    pytest.importorskip("spot")
+    names = ("cost$a", "co_st$^b")
+    task = Task.from_formula('F "cost$a" & F "co_st$^b"', propositions=names)
+    dear = dataclasses.replace(trial, propositions=names, task_text=task.text, task_hoa=task.to_hoa())
+    save_figure(draw_trial(dear), tmp_path / "trial.svg")
+    save_figure(draw_side_by_side([dear, dear]), tmp_path / "both.png")
+    save_figure(draw_automaton(task), tmp_path / "task.svg")
+    assert save_animation(dear, tmp_path / "trial.gif") > 1
+    tree = _tree_node([_tree_action(0, 7.0, 40, _tree_outcome(1.0, None, None))])
+    save_figure(draw_tree(tree, task, task.text), tmp_path / "tree.svg")
+    for file in ("trial.svg", "task.svg", "tree.svg"):
+        assert "cost$a" in "".join(ElementTree.parse(tmp_path / file).getroot().itertext()), file
+
+
 def _lightness_and_warmth(colour: str) -> tuple[float, float]:
     """Oklab lightness, and how far red-yellow outweighs green-blue (Ottosson 2020)."""
     linear = np.array(
@@ -228,6 +302,11 @@ def test_heading_names_the_environment_briefly(trial, environment, shown):
     assert describe_outcome(dataclasses.replace(trial, environment=environment)).startswith(
         f"{shown}  ·  policy oracle"
     )
+
+
+def test_a_world_from_python_has_a_heading_too(trial):
+    nameless = dataclasses.replace(trial, environment="", world_number=None)
+    assert describe_outcome(nameless).startswith("no named environment  ·  policy oracle")
 
 
 def test_side_by_side_shows_each_path_under_its_cost_and_wastes_no_room(trial, tmp_path):
@@ -346,6 +425,25 @@ def test_animation_has_a_frame_per_decision_and_one_for_the_end(trial, tmp_path)
     assert (tmp_path / "trial.gif").stat().st_size < 3_000_000
 
 
+def test_an_unseen_area_has_its_own_colour_in_an_animation(trial, tmp_path):
+    """Even the smallest one: with the palette's nearest colour it would be taken for another proposition's."""
+    names = (*trial.propositions, *(f"p{bit}" for bit in range(2, len(AREA_COLOURS))))
+    letters = np.zeros((HEIGHT, WIDTH), np.int32)
+    # Far from the names' boxes, which would cover cells that touch each other.
+    places = [(2 + 3 * (bit // 4), 14 + 3 * (bit % 4)) for bit in range(len(names))]
+    for bit, cell in enumerate(places):
+        letters[cell] = 1 << bit
+    world = make_world(np.asarray(trial.world.occupied), letters, (6, 2), propositions=names)
+    unseen = np.full((HEIGHT, WIDTH), NEVER_SEEN, np.int32)
+    save_animation(
+        dataclasses.replace(trial, world=world, propositions=names, first_seen=unseen), tmp_path / "trial.gif"
+    )
+    with Image.open(tmp_path / "trial.gif") as animation:
+        shown = _colours(animation)
+    areas = np.array([rgb(colour) for colour in AREA_COLOURS], np.uint8)
+    assert {tuple(colour) for colour in faded(areas).tolist()} <= shown
+
+
 def test_animation_is_thinned_out_evenly(trial):
     many = dataclasses.replace(trial, decisions=tuple(_decision(index, 0, (6, 2)) for index in range(101)))
     kept = frame_steps(many, 11)
@@ -398,6 +496,13 @@ def test_automata_in_dot_and_mermaid_have_every_state_and_transition(name, tmp_p
         assert (tmp_path / f"task.{ending}").read_text() == text
 
 
+def test_no_name_is_markup_of_mermaid():
+    pytest.importorskip("spot")
+    text = to_mermaid(Task.from_formula('F "a<b>#1"', propositions=("a<b>#1",)))
+    assert "a#lt;b#gt;#35;1" in text
+    assert not re.search(r"a<b|#1\b(?!24)", text)
+
+
 def test_pictures_are_reproducible(tmp_path):
     for ending in ("svg", "pdf", "png"):
         for name in ("a", "b"):
@@ -436,6 +541,46 @@ def test_action_table_marks_the_choice(trial):
     assert ["finish", "-", "-", "0.250", "12.5", "7.0", "10.0", "55.0", "40"] in lines
 
 
+@pytest.mark.parametrize("width", [80, 60, 40])
+def test_no_terminal_is_too_narrow_for_a_number(trial, width):
+    console = Console(width=width, record=True, file=io.StringIO())
+    actions = tuple(
+        _action(index, 1234.5, subgoal=index, success_cost=1000.25, failure_cost=999.75, visits=20_000)
+        for index in range(3)
+    )
+    print_table(console, action_table(trial, dataclasses.replace(trial.decisions[1], actions=actions)))
+    text = console.export_text()
+    assert "…" not in text
+    assert max(map(len, text.splitlines())) <= max(width, 80)
+    rows = [line.split() for line in text.splitlines() if "0→1" in line]
+    assert [row[-6:] for row in rows] == [["0.250", "1000.2", "999.8", "10.0", "1234.5", "20000"]] * 3
+    assert all("s" + str(index) + ":" in row for index, row in enumerate(rows))
+
+
+def test_actions_that_would_read_the_same_are_told_apart(trial):
+    """Two states that ask for the same thing, or names of which the end is cut off."""
+
+    def named(task, *moves, **others):
+        actions = [
+            dataclasses.replace(_action(index, 5.0, subgoal), from_state=start, to_state=end)
+            for index, (subgoal, start, end) in enumerate(moves)
+        ]
+        return [*action_names(dataclasses.replace(trial.decisions[0], actions=tuple(actions)), task, **others).values()]
+
+    assert named(task_of(trial), (0, 0, 1), (1, 0, 1)) == ["s0: find goal", "s1: find goal"]
+    both = task_of(_long_names(trial))
+    goal = [
+        (move["from"], move["to"])
+        for move in both.describe()["transitions"]
+        if transition_words(both, move["from"], move["to"], brief=True) == f"find {both.propositions[0]}"
+    ]
+    assert len(goal) == 2
+    assert len({*named(both, *((0, *move) for move in goal))}) == 2
+    cut = named(both, (0, 0, 1), (0, 0, 2), letters=30)
+    assert [len(name) for name in cut] == [30, 30]
+    assert [name[:15] + name[-5:] for name in cut] == ["s0: find propos(0→1)", "s0: find propos(0→2)"]
+
+
 def test_a_decision_without_actions_says_why(trial):
     empty = dataclasses.replace(trial.decisions[0], actions=(), choice=None, preferred=None, kind="fallback")
     invalid = dataclasses.replace(empty, status=int(Status.INVALID | Status.FALLBACK))
@@ -463,7 +608,7 @@ def test_chosen_action_leads_among_equals(trial):
 
 
 def test_a_decision_that_keeps_on_says_what_was_better(trial):
-    actions = (_action(0, 9.0), _action(1, 8.5))
+    actions = (_action(0, 9.0), _action(1, 8.5, subgoal=1))
     keeping = dataclasses.replace(trial.decisions[0], actions=actions, choice=0, preferred=1)
     turning = dataclasses.replace(keeping, choice=1)
     assert keeping.overruled == actions[1]
@@ -584,9 +729,26 @@ def test_comparison_tables():
     # The one whose tree was full counts nowhere.
     figures = ["3", "of", "4", "12.0", "80.0%", "80.0", "..", "80.0%", "40.0%", "40.0", "±", "0.0%", "-213.3%"]
     assert ["oracle", *figures] in lines
+    narrow = Console(width=40, record=True, file=io.StringIO())
+    print_table(narrow, comparison_table(comparison))
+    text = narrow.export_text()
+    assert "…" not in text
+    assert ["oracle", *figures] in [line.split() for line in text.splitlines()]
     remarks = remark_lines(comparison)
     assert remarks[0].startswith("Costs and savings are of the 2 worlds")
     assert "oracle: 1 stuck" in remarks
     assert "Worlds with a trial that counts in no mean, left out of all tables: 1." in remarks
     assert "oracle: trials with tree overflow: 1 (left out of costs and savings)" in remarks
+    # The bootstrap of two worlds is none.
+    known = [not np.isnan(row.attainable_low) for row in comparison.satisfied.rows]
+    assert ("interval says" in remarks[-1]) == any(known)
     assert remarks[-1].startswith("2 worlds are few")
+
+
+def test_few_worlds_without_an_interval_promise_none():
+    rows = {
+        policy: [TrialResult(cost, "satisfied", 100.0, 0)] for policy, cost in (("known-map", 9.0), ("baseline", 20.0))
+    }
+    comparison = Comparison.from_results(rows, resamples=50)
+    assert all(np.isnan(row.attainable_low) for row in comparison.satisfied.rows)
+    assert remark_lines(comparison)[-1] == "1 worlds are few: too few for an interval."

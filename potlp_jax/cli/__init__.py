@@ -5,7 +5,9 @@ import the library inside of their functions, and what only annotations need und
 ``tests/test_cli.py`` holds them to it.
 """
 
+import io
 import logging
+import sys
 from typing import Annotated
 
 import typer
@@ -89,5 +91,9 @@ def _keep_compiled_programs() -> None:
 
 def main() -> None:
     """Entry point of the ``potlp`` script. Only here is the cache turned on: ``app`` may run within other programs."""
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal or pipe of another encoding than UTF-8 shows "?" for a letter that it lacks: better than no table.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     # The context's object is what a command calls before it runs (`group.Command.invoke`).
     app(obj=_keep_compiled_programs)

@@ -86,6 +86,8 @@ def compare_policies(
     # Before any trial runs: minutes later the complaint would cost those minutes.
     if picture is not None and out is None:
         fail("--picture needs --out, the folder in which the picture is written")
+    if picture is not None and picture < world:
+        fail(f"--picture {picture}: the worlds compared begin with {world}")
     generator = make(environment)
     chosen_split = read_split(split, generator)
     changes = setting_changes(simulations=simulations, search=search, camera=camera)
@@ -106,8 +108,6 @@ def compare_policies(
     if out is not None:
         results = _run(specification, make_folder(out), processes)
         files = _write(results, out)
-        if picture is not None:
-            files.append(_draw(specification, results, out, picture))
     # Without a folder the store is needed only until the results are read from it.
     else:
         files = []
@@ -116,12 +116,14 @@ def compare_policies(
     # The document of `potlp sweep show --json`: one way to read the results of both.
     if json:
         print_json(results.to_dict())
-        return
-    (cell,) = results.cells
-    print_cell(console(), cell, specification.split)
-    for line in results.remarks():
-        console().print(line)
-    if out is not None:
+    else:
+        print_cell(console(), results.cells[0], specification.split)
+        for line in results.remarks():
+            console().print(line)
+    # After the table: which worlds are impossible, and so have no picture, is known only by then.
+    if out is not None and picture is not None:
+        files.append(_draw(specification, results, out, picture))
+    if out is not None and not json:
         console().print(f"wrote {', '.join(file.name for file in files)} in {out}")
         console().print(f"next: potlp report {out}", style="dim")
 
@@ -176,7 +178,8 @@ def _draw(specification: "Specification", results: "Results", folder: Path, worl
     numbers = [world_of(pair) for pair in cell.pairs]
     # Impossible worlds are not among those compared, although their numbers lie between them.
     if world not in numbers:
-        fail(f"--picture {world}: the worlds compared are {', '.join(map(str, numbers))}")
+        told = f"{len(numbers)} of {numbers[0]} to {numbers[-1]}" if numbers else "none"
+        fail(f"--picture {world}: the worlds compared are {told}")
     # Rows keep no maps. The trials are made again from world and key, and are the same (tests/test_sweep.py).
     sweep, pair = Sweep(specification, folder, read_only=True), cell.pairs[numbers.index(world)]
     # The known map's path shows no exploration, which is what the picture is to compare.

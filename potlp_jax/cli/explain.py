@@ -9,7 +9,7 @@ import typer
 
 from potlp_jax.cli.group import Command, command_app
 from potlp_jax.cli.options import EstimatorName, Json
-from potlp_jax.cli.output import console, fail, print_json
+from potlp_jax.cli.output import console, fail, print_json, print_table
 
 if TYPE_CHECKING:
     from potlp_jax.trials.record import Decision, Trial
@@ -62,7 +62,7 @@ def explain_decision(
         return
     output = console()
     if found.actions:
-        output.print(action_table(trial, found))
+        print_table(output, action_table(trial, found))
     else:
         output.print(describe_decision(trial, found))
         output.print(why_no_actions(trial, found))

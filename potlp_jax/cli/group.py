@@ -1,6 +1,7 @@
 """The group of commands, imported one at a time, and what every command does around its work."""
 
 import importlib
+import re
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
@@ -61,6 +62,11 @@ class CommandGroup(TyperGroup):
 
 class Command(TyperCommand):
     """A command that reports errors as one line and uses the compilation cache where the script turned it on."""
+
+    def __init__(self, *arguments: Any, epilog: str | None = None, **named: Any) -> None:
+        # Line ends within a paragraph are the source's: the terminal has its own width.
+        joined = None if epilog is None else re.sub(r"(?<=[^\n])\n(?=[^\n])", " ", epilog)
+        super().__init__(*arguments, epilog=joined, **named)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""

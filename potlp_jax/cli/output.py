@@ -19,6 +19,7 @@ from potlp_jax.errors import PotlpError, PotlpWarning
 
 if TYPE_CHECKING:
     from rich.progress import Progress
+    from rich.table import Table
 
 logger = logging.getLogger(__name__)
 
@@ -48,6 +49,21 @@ def error_console() -> Console:
 def file_console(file: TextIO, width: int) -> Console:
     """Writes tables into a text file with lines of up to ``width`` columns: a file has no terminal to ask."""
     return _literal_console(file=file, width=width)
+
+
+def print_table(output: Console, table: "Table") -> None:
+    """A table, where the terminal is narrower than its numbers at their own width: Rich would cut digits off."""
+    wide = output.options.update(max_width=PIPE_COLUMNS)
+    for column in table.columns:
+        if column.no_wrap:
+            # Rich takes the longest word for the least width of any column.
+            column.min_width = max(
+                output.measure(cell, options=wide).maximum for cell in (column.header, *column.cells)
+            )
+    least = output.measure(table, options=wide).minimum
+    if least > output.width:
+        table.width = least
+    output.print(table, crop=False)
 
 
 def _literal_console(**options: Any) -> Console:

@@ -157,7 +157,7 @@ def _write(trial: "Trial", folder: Path, animation: bool) -> list[Path]:
 
     files = [folder / RECORD, folder / "trial.png"]
     # What shows an earlier trial would stand beside the record of this one.
-    for shown in ("trial.gif", PAGE):
+    for shown in ("trial.png", "trial.gif", PAGE):
         (folder / shown).unlink(missing_ok=True)
     trial.save(files[0])
     save_figure(draw_trial(trial), files[1])
@@ -190,6 +190,8 @@ def _print(trial: "Trial", files: list[Path]) -> None:
         out.print(f"wrote {file}")
     # What one would do next with these files; a newcomer need not look it up.
     if files:
-        out.print(f"next: potlp explain {files[0].parent}:0", style="dim")
+        # A trial that ended where it began has no decision to explain.
+        command = f"explain {files[0].parent}:0" if trial.decisions else f"view {files[0].parent}"
+        out.print(f"next: potlp {command}", style="dim")
     else:
         out.print("add --out FOLDER for the record, a picture and an animation", style="dim")

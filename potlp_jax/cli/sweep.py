@@ -14,7 +14,7 @@ from typer.core import TyperGroup
 
 from potlp_jax.cli.group import Command, command_app
 from potlp_jax.cli.options import ClusterName, Json, SweepFolder
-from potlp_jax.cli.output import FAILED, console, fail, make_folder, print_json, progress_bar
+from potlp_jax.cli.output import FAILED, console, fail, make_folder, print_json, print_table, progress_bar
 
 if TYPE_CHECKING:
     from potlp_jax.engine.engine import Engine
@@ -163,6 +163,7 @@ class _Reporter:
     def __init__(self) -> None:
         # Of the monotonic clock: a clock that is set while a sweep runs must not change the rate.
         self._start, self._done_before, self._last_line = time.monotonic(), -1, 0.0
+        self._last_said = ""
         self._bar = progress_bar()
         self._task: Any = None
 
@@ -185,7 +186,13 @@ class _Reporter:
         now = time.monotonic()
         if self._bar.disable and (finished or now - self._last_line >= SECONDS_BETWEEN_LINES):
             self._last_line = now
-            logger.info(f"{progress.done} of {progress.total} trials{text}")
+            self._say(f"{progress.done} of {progress.total} trials{text}")
+
+    def _say(self, line: str) -> None:
+        # Before the first trial has ended, which takes as long as compilation, there is nothing new.
+        if line != self._last_said:
+            logger.info(line)
+        self._last_said = line
 
     def close(self) -> None:
         """A bar that is left running would keep the terminal's cursor hidden."""
@@ -220,7 +227,7 @@ def print_cell(out: Console, cell: "CellResults", split: str) -> None:
 
     redrawn = f", {cell.redrawn} impossible ones left out" if cell.redrawn else ""
     out.print(f"{cell.environment}/{split}, task {cell.task}: {len(cell.pairs)} worlds{redrawn}", style="bold")
-    out.print(comparison_table(cell.comparison))
+    print_table(out, comparison_table(cell.comparison))
     for line in [*remark_lines(cell.comparison), *remarks_on_worlds(cell.pairs)]:
         out.print(line)
 

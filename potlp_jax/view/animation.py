@@ -1,6 +1,7 @@
 """Animation of a trial: one frame a decision, with the map as believed then and the actions that were weighed."""
 
 import io
+import math
 import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,25 +18,29 @@ from potlp_jax.task.words import state_words
 from potlp_jax.trials.record import NEVER_SEEN, ActionRecord, Decision, Trial
 from potlp_jax.view.decisions import (
     FIGURES,
-    action_name,
+    action_names,
     cost_text,
     decision_number,
     describe_move,
     figure_texts,
     rank_actions,
+    shortened,
     task_of,
 )
 from potlp_jax.view.labels import draw_labels, map_extent, place_labels
 from potlp_jax.view.layers import (
+    LEGEND_SIZE,
     area_handles,
     draw_ends,
     draw_path,
     draw_subgoals,
+    legend_columns,
+    shorten_labels,
     show_cells,
     state_handles,
     subgoal_handles,
 )
-from potlp_jax.view.maps import MAX_INCHES_PER_CELL, describe_outcome
+from potlp_jax.view.maps import MAX_INCHES_PER_CELL, Handle, describe_outcome
 from potlp_jax.view.style import (
     AREA_COLOURS,
     CHOSEN,
@@ -49,8 +54,10 @@ from potlp_jax.view.style import (
     STATE_COLOURS,
     WALL_SEEN,
     WALL_UNSEEN,
+    faded,
     new_figure,
     rgb,
+    take_literally,
 )
 
 MAX_FRAMES: int = 36
@@ -69,7 +76,9 @@ LETTER_INCHES: float = 0.075
 NAME_LETTERS: int = 36
 """Of an action's name, so that it ends before the bar of P_S."""
 
-LABEL_SIZE: float = 8.0
+LABEL_SIZE, SMALL_SIZE = 8.0, 7.0
+"""Points of names on the map, and of the legend."""
+
 ROW_INCHES: float = 0.25
 IMAGE_PIXELS: int = 400
 """Longer side of the map's raster: coarser than in a picture, for a GIF stores every frame."""
@@ -135,14 +144,15 @@ class _Stage:
 
     def __init__(self, trial: Trial) -> None:
         self._trial = trial
-        self._figure, self._axes, self._panel, self._scale = _layout(*map_extent(trial.world))
+        handles = _legend_handles(trial)
+        self._figure, self._axes, self._panel, self._scale = _layout(*map_extent(trial.world), handles)
         # Names are placed once for the whole path, so that they stand still from frame to frame.
         self._labels = place_labels(
             trial.world, trial.propositions, trial.path, inches_per_cell=self._scale, size=LABEL_SIZE
         )
         self._axes.set(xticks=[], yticks=[])
         self._panel.axis("off")
-        _legend(self._axes, trial)
+        _legend(self._figure, self._axes, handles)
         # One line: the layout leaves room for two lines of heading, and the second one says how it went.
         formula = trial.task_text if len(trial.task_text) <= 90 else trial.task_text[:87] + "..."
         place = 1 - 0.1 / self._figure.get_figheight()
@@ -168,6 +178,7 @@ class _Stage:
             # draw_artist knows no order of its own: lower layers first, as a full drawing would.
             fresh.sort(key=lambda artist: artist.get_zorder())
             for artist in fresh:
+                take_literally(artist)
                 axes.draw_artist(artist)
             for artist in fresh:
                 artist.remove()
@@ -190,24 +201,30 @@ class _Stage:
             _draw_intention(axes, decision)
 
 
-def _layout(rows: int, columns: int) -> tuple[Figure, Axes, Axes, float]:
-    """The map beside its panel, or above it if the map is wide; the last value is inches per cell."""
+def _layout(rows: int, columns: int, handles: Sequence[Handle]) -> tuple[Figure, Axes, Axes, float]:
+    """The map beside its panel, or above it if the map is wide, with room for a legend of these entries below the map.
+
+    The last value is inches per cell.
+    """
     # A wide map beside a panel would shrink to a strip.
     if columns >= 1.6 * rows:
         width, panel_height = 9.0, 2.35
         scale = min((width - 0.3) / columns, 4.4 / rows, MAX_INCHES_PER_CELL)
-        height = rows * scale + panel_height + 0.95
+        foot = panel_height + _legend_inches(handles, width)
+        height = rows * scale + foot + 0.45
         figure = new_figure(width, height)
         left = (width - columns * scale) / 2
-        place = (left / width, (panel_height + 0.45) / height, columns * scale / width, rows * scale / height)
+        place = (left / width, foot / height, columns * scale / width, rows * scale / height)
         return figure, figure.add_axes(place), figure.add_axes((0.02, 0.0, 0.96, panel_height / height)), scale
     # A row of the table in letters of 8.5 points needs 5.6 inches; the map takes what it needs beside them.
-    height, panel_width = 6.2, 5.6
+    panel_width = 5.6
     scale = min(5.2 / rows, 5.6 / columns, MAX_INCHES_PER_CELL)
     width = columns * scale + panel_width + 0.4
+    foot = _legend_inches(handles, width)
+    height = foot + 5.7
     figure = new_figure(width, height)
-    place = (0.2 / width, 0.5 / height, columns * scale / width, rows * scale / height)
-    panel = ((columns * scale + 0.4) / width, 0.1, (panel_width - 0.1) / width, 0.8)
+    place = (0.2 / width, foot / height, columns * scale / width, rows * scale / height)
+    panel = ((columns * scale + 0.4) / width, (foot + 0.12) / height, (panel_width - 0.1) / width, 4.96 / height)
     return figure, figure.add_axes(place), figure.add_axes(panel), scale
 
 
@@ -221,28 +238,45 @@ def _draw_intention(axes: Axes, decision: Decision) -> None:
     axes.plot(column, row, "o", ms=9, mfc=ROBOT, mec=INK, mew=1.3, zorder=8)
 
 
-def _legend(axes: Axes, trial: Trial) -> None:
+def _legend_handles(trial: Trial) -> list[Handle]:
     """Short entries; what a state asks for is said beside the map at each decision."""
-    handles = [
+    return [
         Patch(facecolor=FREE_UNSEEN, edgecolor=FAINT, label="not seen yet"),
         *state_handles(trial.states, task_of(trial), words=False),
         *area_handles(trial.propositions, trial.world),
         Line2D([], [], marker="o", ls="", ms=7, mfc=ROBOT, mec=INK, label="robot"),
-        *subgoal_handles(),
+        *subgoal_handles(trial.decisions),
         Line2D([], [], color=CHOSEN, linewidth=1.8, linestyle=(0, (2, 1.2)), label="path to it"),
     ]
-    axes.legend(
-        handles=handles,
+
+
+def _legend_columns(handles: Sequence[Handle], width: float) -> int:
+    """Two rows where a figure of ``width`` inches has room for them, more below each other where it has not."""
+    return min(max(6, (len(handles) + 1) // 2), legend_columns(handles, width * LEGEND_SIZE / SMALL_SIZE))
+
+
+def _legend_inches(handles: Sequence[Handle], width: float) -> float:
+    return 0.18 + 0.16 * max(2, math.ceil(len(handles) / _legend_columns(handles, width)))
+
+
+def _legend(figure: Figure, axes: Axes, handles: Sequence[Handle]) -> None:
+    """The legend below the map; where it is wider than the map, from the left edge of the figure on."""
+    shorten_labels(handles, figure.get_figwidth())
+    legend = axes.legend(
+        handles=list(handles),
         loc="upper center",
         bbox_to_anchor=(0.5, -0.005),
-        # Two rows at most: the layout leaves half an inch below the map.
-        ncols=min(6, len(handles)) if len(handles) <= 6 else (len(handles) + 1) // 2,
-        fontsize=7.0,
+        ncols=_legend_columns(handles, figure.get_figwidth()),
+        fontsize=SMALL_SIZE,
         frameon=False,
         handlelength=1.4,
         columnspacing=1.0,
         labelspacing=0.2,
     )
+    take_literally(legend)
+    if legend.get_window_extent().x0 < 0:
+        legend.set_loc("upper left")
+        legend.set_bbox_to_anchor((0.0, axes.get_position().y0), figure.transFigure)
 
 
 def _draw_panel(panel: Axes, trial: Trial, decision: Decision | None) -> None:
@@ -261,7 +295,7 @@ def _draw_panel(panel: Axes, trial: Trial, decision: Decision | None) -> None:
         return
     lines = [
         f"{decision_number(trial, decision)}   step {decision.step}   expected cost {cost_text(decision.value)}",
-        textwrap.shorten(f"state {decision.state}: {state_words(task, decision.state)}", letters, placeholder=" ..."),
+        shortened(f"state {decision.state}: {state_words(task, decision.state)}", letters),
     ]
     if not decision.actions:
         # A policy that does not search has no expected cost.
@@ -286,6 +320,7 @@ _BAR, _BAR_WIDTH = 0.44, 0.1
 
 def _action_rows(panel: Axes, actions: Sequence[ActionRecord], trial: Trial, decision: Decision) -> None:
     """The best actions as a table, and below it what its columns mean."""
+    names = action_names(decision, task_of(trial), letters=NAME_LETTERS)
     panel.text(0.0, 2.2, "best actions", size=8, color=QUIET, va="center")
     for name, place in _COLUMNS.items():
         panel.text(place, 2.2, name, size=8, color=QUIET, ha="right", va="center")
@@ -294,8 +329,7 @@ def _action_rows(panel: Axes, actions: Sequence[ActionRecord], trial: Trial, dec
         if chosen:
             panel.add_patch(Rectangle((-0.01, row - 0.34), 1.02, 0.9, facecolor=CHOSEN_ROW, edgecolor="none"))
         colour, weight = (CHOSEN, "bold") if chosen else (INK, "normal")
-        name = textwrap.shorten(action_name(action, task_of(trial)), NAME_LETTERS, placeholder=" ...")
-        panel.text(0.0, row + 0.1, name, size=8.5, color=colour, weight=weight, va="center")
+        panel.text(0.0, row + 0.1, names[action.index], size=8.5, color=colour, weight=weight, va="center")
         # The grey bar is a certain success, against which the coloured one is read.
         for share, fill in ((1.0, "#EEEEEE"), (action.success_probability, colour)):
             bar = Rectangle((_BAR, row - 0.15), _BAR_WIDTH * share, 0.5, facecolor=fill, edgecolor="none")
@@ -324,7 +358,10 @@ def _encode(frames: Sequence[Image.Image]) -> bytes:
 
 def _palette(frames: Sequence[Image.Image]) -> Image.Image:
     """The colours of the pictures' parts exactly, the rest (rims of letters and lines) as the frames need them."""
-    fixed = np.array([rgb(colour) for colour in (*THEME, *STATE_COLOURS, *AREA_COLOURS)], np.uint8)
+    areas = np.array([rgb(colour) for colour in AREA_COLOURS], np.uint8)
+    others = np.array([rgb(colour) for colour in (*THEME, *STATE_COLOURS)], np.uint8)
+    # A small area that was not seen would else take the nearest colour, which may be that of another proposition.
+    fixed = np.concatenate([others, areas, faded(areas)])
     # Every third pixel of three frames has all mixed colours that matter; all of them would take seconds.
     thumbnails = [np.asarray(frame)[::3, ::3] for frame in (frames[0], frames[len(frames) // 2], frames[-1])]
     sample = Image.fromarray(np.concatenate(thumbnails)).quantize(MIXED_COLOURS, method=Image.Quantize.MEDIANCUT)

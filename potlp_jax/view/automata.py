@@ -33,6 +33,10 @@ MAX_EDGES: int = 14
 """A picture with more edges than this is thinned out; all of them are in the table of ``potlp task``."""
 
 
+# Mermaid reads these of a label as its own; on the right are its names for them.
+_MERMAID = str.maketrans({'"': "#quot;", "|": "#124;", "<": "#lt;", ">": "#gt;", "#": "#35;", "\n": "<br>"})
+
+
 @dataclasses.dataclass(frozen=True)
 class Edge:
     """A transition: the words for it, and its guard as a formula."""
@@ -97,9 +101,7 @@ def to_mermaid(task: Task) -> str:
         lines.append(f"  s{state}{left}{state}{right}")
     for edge in automaton_edges(task):
         arrow = "-.->" if task.dfa.trap[edge.target] else "-->"
-        # Mermaid reads quotes, pipes and line ends of a label as its own; these are its names for them.
-        label = edge.label.replace('"', "#quot;").replace("|", "#124;").replace("\n", "<br>")
-        lines.append(f'  s{edge.source} {arrow}|"{label}"| s{edge.target}')
+        lines.append(f'  s{edge.source} {arrow}|"{edge.label.translate(_MERMAID)}"| s{edge.target}')
     return "\n".join([*lines, ""])
 
 

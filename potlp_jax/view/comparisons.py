@@ -97,7 +97,9 @@ def remark_lines(comparison: Comparison) -> list[str]:
             lines.append(f"{policy}: {', '.join(others)}")
     lines += flag_lines(comparison)
     if 0 < satisfied.pairs < FEW_WORLDS:
-        lines.append(f"{satisfied.pairs} worlds are few: the interval says how far the share may be off.")
+        known = any(not math.isnan(row.attainable_low) for row in satisfied.rows)
+        told = "the interval says how far the share may be off" if known else "too few for an interval"
+        lines.append(f"{satisfied.pairs} worlds are few: {told}.")
     return lines
 
 

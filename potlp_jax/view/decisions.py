@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections import Counter
 from collections.abc import Mapping
 from functools import lru_cache
 from types import MappingProxyType
@@ -75,6 +76,32 @@ def action_name(action: ActionRecord, task: Task) -> str:
     return f"s{action.subgoal}: {transition_words(task, action.from_state, action.to_state, brief=True)}"
 
 
+def action_names(decision: Decision, task: Task, *, letters: int | None = None) -> dict[int, str]:
+    """The names of a decision's actions; those that would read the same end in their states: ``s8: find key (5→7)``.
+
+    Args:
+        decision: whose actions are named.
+        task: says what they try.
+        letters: to which a name is cut; default: none is.
+
+    Returns:
+        One name an action, by its index.
+    """
+    whole = {action.index: action_name(action, task) for action in decision.actions}
+    names = {index: name if letters is None else shortened(name, letters) for index, name in whole.items()}
+    alike = Counter(names.values())
+    for action in decision.actions:
+        if alike[names[action.index]] > 1:
+            end, name = f" ({action.from_state}→{action.to_state})", whole[action.index]
+            names[action.index] = (name if letters is None else shortened(name, letters - len(end))) + end
+    return names
+
+
+def shortened(text: str, letters: int) -> str:
+    """The text in so many letters at most, cut within a word if need be: names without spaces are long."""
+    return text if len(text) <= letters else text[: letters - 3].rstrip() + "..."
+
+
 def why_no_actions(trial: Trial, decision: Decision) -> str:
     """Why a decision weighed no actions, one sentence."""
     if decision.status & Status.INVALID:
@@ -93,11 +120,15 @@ def action_table(trial: Trial, decision: Decision) -> Table:
         title_justify="left",
         box=SIMPLE_HEAD,
         caption_justify="left",
+        # Its twelve columns have to fit the 80 of a terminal.
+        padding=0,
+        pad_edge=False,
     )
     table.add_column("", width=1)
-    for name in ("action", "transition", "subgoal"):
-        # Words may wrap; a number that is broken into two lines is misread.
-        table.add_column(name, no_wrap=name != "action")
+    # Words may wrap; a number that is broken into two lines is misread.
+    table.add_column("action", min_width=16)
+    for name in ("states", "subgoal"):
+        table.add_column(name, no_wrap=True)
     for name in FIGURES:
         table.add_column(name, justify="right", no_wrap=True)
     for action in rank_actions(decision):
@@ -142,7 +173,7 @@ def describe_decision(trial: Trial, decision: Decision) -> str:
 def describe_move(trial: Trial, decision: Decision) -> str:
     """What was decided: the attempt and where it is made, or why the robot went elsewhere."""
     target = "" if decision.target is None else f" at {decision.target[0]},{decision.target[1]}"
-    chosen = chosen_action(decision)
+    chosen, names = chosen_action(decision), action_names(decision, task_of(trial))
     if decision.status & Status.INVALID:
         # Whatever the robot did, no action was weighed.
         move = (
@@ -152,10 +183,10 @@ def describe_move(trial: Trial, decision: Decision) -> str:
         move = KINDS.get(decision.kind, decision.kind) + target
     else:
         # The cell stands after the subgoal's number: "s2 at 11,30: find alarm".
-        move = action_name(chosen, task_of(trial)).replace(":", f"{target}:", 1)
+        move = names[chosen.index].replace(":", f"{target}:", 1)
     # Hysteresis: the robot keeps its target unless another is clearly better (docs/model.md, section 8).
     better = decision.overruled
-    kept = "" if better is None else f"; kept although {action_name(better, task_of(trial))} is better"
+    kept = "" if better is None else f"; kept although {names[better.index]} is better"
     return move + kept + _setbacks(decision)
 
 

@@ -18,6 +18,7 @@ from matplotlib.patches import Patch
 from potlp_jax.task.task import Task
 from potlp_jax.task.words import state_words
 from potlp_jax.trials.record import Decision, Trial
+from potlp_jax.view.decisions import shortened
 from potlp_jax.view.labels import map_extent
 from potlp_jax.view.style import (
     CHOSEN,
@@ -31,6 +32,7 @@ from potlp_jax.view.style import (
     WALL_SEEN,
     WALL_UNSEEN,
     area_colour,
+    faded,
     rgb,
     state_colour,
 )
@@ -46,6 +48,12 @@ MAX_CELL_PIXELS: int = 60
 
 PATH_WIDTH: float = 2.4
 """Of the line of a path, in points."""
+
+MARK_INCHES, LETTER_INCHES = 0.5, 0.068
+"""Of a legend: the mark and the gaps before and after its words, and their letters of ``LEGEND_SIZE``."""
+
+LEGEND_SIZE: float = 8.5
+"""Points."""
 
 MAX_CHANGES: int = 30
 """Changes of state that are marked; a trial with more shows the first."""
@@ -87,8 +95,7 @@ def cell_image(
         image[area] = striped[area]
     unseen = _enlarge(~seen, scale)
     area = _enlarge(letters > 0, scale) & unseen
-    # Unseen areas stay recognisable: a reader sees what the robot did not know.
-    image[area] = (0.55 * image[area] + 0.45 * np.array(rgb(FREE_UNSEEN))).astype(np.uint8)
+    image[area] = faded(image[area])
     # Every fourteenth diagonal, two pixels wide: visible, and calmer than the walls.
     if hatch:
         image[unseen & (stripe % 14 < 2)] = rgb(HATCH)
@@ -254,12 +261,14 @@ def end_handles() -> list[Line2D | Patch]:
     ]
 
 
-def subgoal_handles() -> list[Line2D | Patch]:
-    """Legend entries of a decision's subgoals and of its target."""
-    return [
-        Line2D([], [], marker="^", ls="", ms=7, mfc="white", mec=CHOSEN, mew=1.5, label="subgoal"),
-        Line2D([], [], marker="^", ls="", ms=7, mfc=CHOSEN, mec="white", label="chosen"),
-    ]
+def subgoal_handles(decisions: Sequence[Decision]) -> list[Line2D | Patch]:
+    """Legend entries of the subgoals and targets of decisions, of which there may be none."""
+    handles: list[Line2D | Patch] = []
+    if any(decision.subgoals for decision in decisions):
+        handles.append(Line2D([], [], marker="^", ls="", ms=7, mfc="white", mec=CHOSEN, mew=1.5, label="subgoal"))
+    if any(decision.target is not None for decision in decisions):
+        handles.append(Line2D([], [], marker="^", ls="", ms=7, mfc=CHOSEN, mec="white", label="chosen"))
+    return handles
 
 
 def state_handles(states: Sequence[int], task: Task, *, words: bool = True) -> list[Line2D]:
@@ -289,10 +298,16 @@ def legend_columns(handles: Sequence[Line2D | Patch], width: float) -> int:
     """As many columns of a legend as fit ``width`` inches, such that its rows are equally long if possible."""
     # matplotlib makes a column as wide as its widest entry; as if all were as wide as the longest, none runs out.
     longest = max(len(str(handle.get_label())) for handle in handles)
-    # Inches of a legend's letters of 8.5 points, and of the mark and the gap before and after them.
-    fit = max(1, int(width / (0.5 + 0.068 * longest)))
+    fit = max(1, int(width / (MARK_INCHES + LETTER_INCHES * longest)))
     # Seven entries in rows of six would leave one alone in the second row.
     return math.ceil(len(handles) / math.ceil(len(handles) / fit))
+
+
+def shorten_labels(handles: Sequence[Line2D | Patch], width: float) -> None:
+    """Cut the labels of legend entries that alone are wider than ``width`` inches."""
+    letters = int((width - MARK_INCHES) / LETTER_INCHES)
+    for handle in handles:
+        handle.set_label(shortened(str(handle.get_label()), letters))
 
 
 def _enlarge(cells: np.ndarray, scale: int) -> np.ndarray:

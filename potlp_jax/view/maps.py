@@ -15,6 +15,7 @@ from potlp_jax.trials.record import NEVER_SEEN, Outcome, Trial
 from potlp_jax.view.decisions import task_of
 from potlp_jax.view.labels import draw_labels, map_extent, place_labels
 from potlp_jax.view.layers import (
+    LEGEND_SIZE,
     area_handles,
     cell_handles,
     draw_ends,
@@ -24,6 +25,7 @@ from potlp_jax.view.layers import (
     legend_columns,
     mark_changes,
     mark_decisions,
+    shorten_labels,
     show_cells,
     state_handles,
     subgoal_handles,
@@ -42,6 +44,9 @@ LINE: float = 0.24
 LEGEND_LINE: float = 0.2
 """Inches from one line of the legend to the next."""
 
+NAMELESS: str = "no named environment"
+"""What is said of a world that was made in Python."""
+
 Handle = Line2D | Patch
 
 
@@ -56,19 +61,20 @@ def draw_trial(trial: Trial) -> Figure:
     # 0.55 inches on the left are for the numbers of the rows.
     total_width = width + 0.9
     heading = [*_formula_lines(trial, total_width), *textwrap.wrap(describe_outcome(trial), _letters(total_width))]
-    groups = _legend_groups([trial])
+    groups = _legend_groups([trial], total_width)
     if trial.decisions:
         # A trial whose task is infeasible from the start has decided nothing.
         groups[0].append(Line2D([], [], marker="o", ls="", ms=3.5, color=INK, label="decision"))
+    left = trial.decisions[-1:] if trial.outcome is not Outcome.SATISFIED else ()
+    groups[0] += subgoal_handles(left)
     head, foot = LINE * len(heading) + 0.2, 0.5 + _legend_inches(groups, total_width)
     total = height + head + foot
     figure = new_figure(total_width, total)
     axes = figure.add_axes((0.55 / total_width, foot / total, width / total_width, height / total))
     _draw_walk(axes, trial, inches_per_cell=width / columns)
     mark_decisions(axes, trial)
-    if trial.outcome is not Outcome.SATISFIED and trial.decisions:
-        draw_subgoals(axes, trial.decisions[-1])
-        groups[0] += subgoal_handles()
+    for decision in left:
+        draw_subgoals(axes, decision)
     axes.tick_params(labelsize=7, colors=QUIET, length=2)
     axes.set_xlabel("column", size=8, color=QUIET, labelpad=1)
     axes.set_ylabel("row", size=8, color=QUIET, labelpad=1)
@@ -105,7 +111,7 @@ def draw_side_by_side(trials: Sequence[Trial], titles: Sequence[str] | None = No
     edge, gap, title = 0.12, 0.2, 0.3
     total_width = across * width + (across - 1) * gap + 2 * edge
     heading = [*_formula_lines(first, total_width), _world_in_words(first)]
-    groups = _legend_groups(trials)
+    groups = _legend_groups(trials, total_width)
     head, foot = LINE * len(heading) + 0.14, _legend_inches(groups, total_width) + 0.16
     total = head + foot + down * (height + title)
     figure = new_figure(total_width, total)
@@ -135,8 +141,8 @@ def draw_side_by_side(trials: Sequence[Trial], titles: Sequence[str] | None = No
 
 def describe_outcome(trial: Trial) -> str:
     """Environment, policy, cost and how the trial ended, in one line."""
-    world = _world_in_words(trial)
-    return f"{world}  ·  policy {trial.policy}  ·  cost {trial.cost:.1f}  ·  {trial.outcome.value}"
+    parts = (_world_in_words(trial), f"policy {trial.policy}", f"cost {trial.cost:.1f}", trial.outcome.value)
+    return "  ·  ".join(parts)
 
 
 def _world_in_words(trial: Trial) -> str:
@@ -144,6 +150,7 @@ def _world_in_words(trial: Trial) -> str:
     # Environments made from files are named KIND:PATH,SETTINGS/SPLIT. The heading has no room for folders and settings;
     # the record has them.
     environment = re.sub(r"^(map|floorplan|parcels):(?:[^,]*/)?([^/,]+)/?(,.*)?(/\w+)$", r"\1:\2\4", trial.environment)
+    environment = environment or NAMELESS
     return environment if trial.world_number is None else f"{environment}, world {trial.world_number}"
 
 
@@ -187,13 +194,19 @@ def _add_heading(figure: Figure, lines: Sequence[str]) -> None:
         figure.text(0.5, place, text, ha="center", va="center", color=INK, size=size, weight=weight)
 
 
-def _legend_groups(trials: Sequence[Trial]) -> list[list[Handle]]:
-    """Two legends for trials of one world and task: short entries, and the states that any trial visited in words."""
+def _legend_groups(trials: Sequence[Trial], width: float) -> list[list[Handle]]:
+    """Two legends for trials of one world and task: short entries, and the states that any trial visited in words.
+
+    No entry is wider than ``width`` inches.
+    """
     first = trials[0]
     states = [state for trial in trials for state in trial.states]
     # Apart, for the words of states are long: in one legend they would widen its columns and scatter the short entries.
     short = [*cell_handles(), *area_handles(first.propositions, first.world), *end_handles()]
-    return [short, [*state_handles(states, task_of(first))]]
+    groups: list[list[Handle]] = [short, [*state_handles(states, task_of(first))]]
+    for handles in groups:
+        shorten_labels(handles, width)
+    return groups
 
 
 def _legend_inches(groups: Sequence[Sequence[Handle]], width: float) -> float:
@@ -212,7 +225,7 @@ def _add_legend(figure: Figure, groups: Sequence[Sequence[Handle]]) -> None:
             loc="lower center",
             bbox_to_anchor=(0.5, bottom / height),
             ncols=columns,
-            fontsize=8.5,
+            fontsize=LEGEND_SIZE,
             frameon=False,
             handlelength=1.6,
             columnspacing=1.4,

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from potlp_jax.trials.record import Decision, Trial
-from potlp_jax.view.decisions import FIGURES, action_name, describe_decision, rank_actions, task_of
+from potlp_jax.view.decisions import FIGURES, action_names, describe_decision, rank_actions, task_of
 from potlp_jax.view.style import CHOSEN, INK, QUIET, new_figure
 from potlp_jax.world.camera import bearing, roll_to
 
@@ -98,11 +98,13 @@ def _cell_text(cell: tuple[int, int]) -> str:
 def _answers(trial: Trial, decision: Decision, subgoal: int) -> str:
     """The cheapest actions of a subgoal as lines of text; says how many are left out."""
     own = [action for action in rank_actions(decision) if action.subgoal == subgoal]
+    # The picture says which subgoal it is.
+    head = f"s{subgoal}: "
+    names = action_names(decision, task_of(trial), letters=len(head) + _NAME_LETTERS)
     lines = [f"{'try':{_NAME_LETTERS}}  P_S    R_S    R_F      Q"] if own else ["nothing can be tried here"]
     for action in own[:_ACTIONS_SHOWN]:
-        name = action_name(action, task_of(trial)).split(": ", 1)[1]
+        name = names[action.index].removeprefix(head)
         costs = "".join(f" {value:6.0f}" for value in (action.success_cost, action.failure_cost, action.q_value))
-        shown = textwrap.shorten(name, _NAME_LETTERS, placeholder="...")
-        lines.append(f"{shown:{_NAME_LETTERS}} {action.success_probability:.2f}{costs}")
+        lines.append(f"{name:{_NAME_LETTERS}} {action.success_probability:.2f}{costs}")
     hidden = len(own) - _ACTIONS_SHOWN
     return "\n".join(lines + ([f"and {hidden} more"] if hidden > 0 else []))

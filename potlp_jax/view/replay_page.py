@@ -1,6 +1,7 @@
 """A trial as one page that a browser opens: the map as it was revealed, and what was weighed at each decision."""
 
 import base64
+import dataclasses
 import html
 import io
 import json
@@ -16,8 +17,9 @@ from potlp_jax.task.task import Task
 from potlp_jax.task.words import state_words, transition_words
 from potlp_jax.trials.record import ActionRecord, Decision, Trial
 from potlp_jax.trials.replay import Views
-from potlp_jax.view.decisions import FIGURES, action_name, describe_move, figure_texts, rank_actions, task_of
+from potlp_jax.view.decisions import FIGURES, action_names, describe_move, figure_texts, rank_actions, task_of
 from potlp_jax.view.labels import map_extent, place_labels
+from potlp_jax.view.maps import NAMELESS
 from potlp_jax.view.overlays import LEAST_CHANCE, describe_overlay, pack_overlay
 from potlp_jax.view.style import IMAGINED_FREE, IMAGINED_WALL, area_colour, state_colour
 
@@ -88,7 +90,7 @@ def replay_data(trial: Trial, views: Views) -> dict[str, Any]:
         "facts": _facts(trial),
         "extent": [rows, columns],
         "cell_pixels": pixels,
-        "labels": [{"name": label.name, "x": label.centre[0], "y": label.centre[1]} for label in labels],
+        "labels": [dataclasses.asdict(label) for label in labels],
         "width": int(letters.shape[1]),
         "occupied": _base64(np.asarray(trial.world.occupied, np.uint8)),
         # Little-endian, as JavaScript's typed arrays are on every machine that runs a browser.
@@ -134,26 +136,28 @@ def _overlays(views: Views, extent: tuple[int, int]) -> dict[str, Any]:
 def _facts(trial: Trial) -> str:
     world = "" if trial.world_number is None else f", world {trial.world_number}"
     return (
-        f"{trial.environment or 'no named environment'}{world}; policy {trial.policy}: {trial.outcome} at cost "
+        f"{trial.environment or NAMELESS}{world}; policy {trial.policy}: {trial.outcome} at cost "
         f"{trial.cost:.1f} after {len(trial.path) - 1} steps and {len(trial.decisions)} decisions"
     )
 
 
 def _decision(trial: Trial, decision: Decision) -> dict[str, Any]:
+    names = action_names(decision, task_of(trial))
     return {
         "index": decision.index,
         "step": decision.step,
         "state": decision.state,
         "cell": list(decision.cell),
         "text": f"Decision {decision.index}: {describe_move(trial, decision)}",
-        # JSON has no infinity; the script then leaves the expected cost out.
-        "value": decision.value if math.isfinite(decision.value) else None,
+        # A policy that does not search has no expected cost, and JSON no infinity; the script then leaves it out.
+        "value": decision.value if decision.actions and math.isfinite(decision.value) else None,
+        "target": None if decision.target is None else list(decision.target),
         "subgoals": [list(cell) for cell in decision.subgoals],
         "observations": list(decision.observations),
         "path": [list(cell) for cell in decision.path],
         "actions": [
             {
-                "name": action_name(action, task_of(trial)),
+                "name": names[action.index],
                 "meaning": _meaning(task_of(trial), action),
                 "subgoal": action.subgoal,
                 "chosen": action.index == decision.choice,

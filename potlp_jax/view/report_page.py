@@ -131,12 +131,12 @@ def _table(table: Table, caption: str, styles: Mapping[str, PolicyStyle]) -> str
     body = ""
     for row in table.rows:
         # NaN equals nothing: where nothing can be attained, no row is marked.
-        kind = ' class="best"' if row.attainable_share == best else ""
+        kind = ' class="best"' if row.attainable_share == best and row.policy != KNOWN_MAP else ""
         cells = (
             _percent(row.attainable_share),
-            f"{_percent(row.attainable_low)} to {_percent(row.attainable_high)}",
+            _interval(row.attainable_low, row.attainable_high),
             _percent(row.net_savings),
-            f"{_percent(row.trial_savings)} ± {_percent(row.trial_savings_error)}",
+            _with_error(row.trial_savings, row.trial_savings_error),
             "-" if math.isnan(row.mean_cost) else f"{row.mean_cost:.1f}",
         )
         figures = "".join(f"<td>{html.escape(text)}</td>" for text in cells)
@@ -158,6 +158,16 @@ def _policy_cell(policy: str, styles: Mapping[str, PolicyStyle]) -> str:
 def _percent(share: float) -> str:
     # Adding zero turns a rounded -0.0 into 0.0.
     return "-" if math.isnan(share) else f"{100 * share + 0.0:.1f} %"
+
+
+def _interval(low: float, high: float) -> str:
+    # Of few worlds there is none.
+    return "-" if math.isnan(low) else f"{_percent(low)} to {_percent(high)}"
+
+
+def _with_error(share: float, error: float) -> str:
+    # A single world has no standard error.
+    return _percent(share) + ("" if math.isnan(error) else f" ± {_percent(error)}")
 
 
 def _outcome_lines(outcomes: Mapping[str, Mapping[str, int]]) -> list[str]:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from potlp_jax.sweep.results import Pair, charged_cost
 from potlp_jax.sweep.statistics import BASELINE
@@ -25,6 +26,7 @@ def cumulative(pairs: Sequence[Pair], policies: Sequence[str]) -> str:
     for policy, style in policy_styles(policies).items():
         total = np.cumsum([charged_cost(pair[policy]) for pair in pairs])
         axes.plot(np.arange(1, len(pairs) + 1), total, style.line, color=style.colour, linewidth=1.6, label=policy)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set(xlim=(0, max(len(pairs), 1)), xlabel="worlds", ylabel="cost of all of them")
     # From 0: only then are lengths in the plot in proportion to costs.
     axes.set_ylim(bottom=0)

@@ -9,11 +9,16 @@ import io
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import matplotlib
+import numpy as np
+from jaxtyping import UInt8
+from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from potlp_jax.errors import PictureError
 
@@ -126,9 +131,30 @@ def rgb(colour: str) -> tuple[int, int, int]:
     return round(red * 255), round(green * 255), round(blue * 255)
 
 
+def faded(colours: UInt8[np.ndarray, "... 3"]) -> UInt8[np.ndarray, "... 3"]:
+    """Colours of areas where they were not seen: still recognisable, so that one sees what the robot did not know."""
+    return (0.55 * colours + 0.45 * np.array(rgb(FREE_UNSEEN))).astype(np.uint8)
+
+
+def take_literally(artist: Artist) -> None:
+    """Take the texts of a part of a figure as they are: names and formulas may hold ``$``, which begins mathematics."""
+    for text in artist.findobj(Text):
+        assert isinstance(text, Text)
+        text.set_parse_math(False)
+
+
+class _LiteralFigure(Figure):
+    """A figure without mathematics in its texts, however it is drawn."""
+
+    # Renderers have no base in common: that of SVG and PDF is none of matplotlib's `RendererBase`.
+    def draw(self, renderer: Any) -> None:
+        take_literally(self)
+        super().draw(renderer)
+
+
 def new_figure(width: float, height: float) -> Figure:
     """An empty white figure of the given size in inches, drawn by Agg."""
-    figure = Figure(figsize=(width, height), dpi=DOTS_PER_INCH, facecolor="white")
+    figure = _LiteralFigure(figsize=(width, height), dpi=DOTS_PER_INCH, facecolor="white")
     # The canvas registers itself with the figure; without one matplotlib would import pyplot's.
     FigureCanvasAgg(figure)
     return figure

@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 
 from potlp_jax.task.task import Task
 from potlp_jax.task.words import transition_words
-from potlp_jax.view.decisions import cost_text
+from potlp_jax.view.decisions import cost_text, shortened
 from potlp_jax.view.style import CHOSEN, FAINT, INK, QUIET, new_figure
 
 LEVEL_INCHES: float = 2.35
@@ -114,7 +114,7 @@ def _outcome_text(action: Mapping[str, Any], task: Task, outcome: Mapping[str, A
         return f"finish\nin known space\n{figures}\n{last}"
     words = transition_words(task, action["from_state"], action["to_state"], brief=True)
     head = f"s{action['subgoal']} {'succeeds' if success else 'fails'}  P {outcome['probability']:.2f}"
-    return f"{head}\n{textwrap.shorten(words, NAME_LETTERS, placeholder=' ...')}\n{figures}\n{last}"
+    return f"{head}\n{shortened(words, NAME_LETTERS)}\n{figures}\n{last}"
 
 
 def _then(outcome: Mapping[str, Any]) -> str:

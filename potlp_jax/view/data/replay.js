@@ -3,6 +3,8 @@
 // `data` is what view/replay_page.py writes. Steps and decisions count from 0, as in the record.
 
 const MARK_PIXELS = 7;
+// Of its own width that the map keeps on a narrow screen.
+const LEAST_SHARE = 0.75;
 // Chances of the legend of what is imagined.
 const CHANCES = [0, 0.05, 0.1, 0.25, 0.5, 1];
 // Of one chance alone: from pale to dark, so that lightness alone tells, on light and dark screens.
@@ -46,6 +48,8 @@ function mountReplay(root, data) {
   const canvas = part("canvas"), slider = part("input");
   canvas.width = columns * scale;
   canvas.height = rows * scale;
+  // On a narrower screen it scrolls: its letters are of canvas pixels, and would be too small to read.
+  canvas.style.minWidth = `${LEAST_SHARE * canvas.width}px`;
   part(".facts").textContent = data.facts;
   part(".names").append(...legend());
   part(".overlay").hidden = choices.length < 2;
@@ -280,26 +284,37 @@ function mountReplay(root, data) {
 
   function drawPlan(context, decision) {
     if (!decision) return;
-    line(context, decision.path, colour("--chosen"), Math.max(1, scale / 5), [scale, scale]);
-    const chosen = decision.actions.find((action) => action.chosen);
+    line(context, decision.path, colour("--planned"), Math.max(1, scale / 5), [scale, scale]);
+    decision.subgoals.forEach((cell) => drawMark(context, cell, false));
+    // The target need be none of the subgoals: finishing in known space has one too.
+    if (decision.target) drawMark(context, decision.target, true);
     decision.subgoals.forEach((cell, number) => {
-      const mine = chosen && chosen.subgoal === number;
+      const mine = isTarget(decision, cell);
       const [x, y] = [(cell[1] + 0.5) * scale, (cell[0] + 0.5) * scale];
-      context.beginPath();
-      for (const corner of [-90, 30, 150]) {
-        const angle = (corner * Math.PI) / 180;
-        context.lineTo(x + MARK_PIXELS * Math.cos(angle), y + MARK_PIXELS * Math.sin(angle));
-      }
-      context.closePath();
-      context.fillStyle = mine ? colour("--chosen") : colour("--free");
-      context.strokeStyle = mine ? colour("--free") : colour("--chosen");
-      context.lineWidth = 2;
-      context.fill();
-      context.stroke();
       // Toward the middle, so that no number leaves the map.
       const inward = [x < canvas.width / 2 ? 1 : -1, y < canvas.height / 2 ? 1 : -1];
       write(context, `s${number}`, x + 15 * inward[0], y + 12 * inward[1], mine ? "--chosen" : "--ink", 700);
     });
+  }
+
+  function isTarget(decision, cell) {
+    return decision.target !== null && decision.target[0] === cell[0] && decision.target[1] === cell[1];
+  }
+
+  // A triangle at a subgoal: open, or filled where the robot goes.
+  function drawMark(context, cell, filled) {
+    const [x, y] = [(cell[1] + 0.5) * scale, (cell[0] + 0.5) * scale];
+    context.beginPath();
+    for (const corner of [-90, 30, 150]) {
+      const angle = (corner * Math.PI) / 180;
+      context.lineTo(x + MARK_PIXELS * Math.cos(angle), y + MARK_PIXELS * Math.sin(angle));
+    }
+    context.closePath();
+    context.fillStyle = filled ? colour("--planned") : colour("--free");
+    context.strokeStyle = filled ? colour("--free") : colour("--planned");
+    context.lineWidth = 2;
+    context.fill();
+    context.stroke();
   }
 
   // Text with a rim in the colour of the paper, readable on walls and paths.
@@ -316,13 +331,20 @@ function mountReplay(root, data) {
   }
 
   function drawNames(context) {
-    for (const label of data.labels) write(context, label.name, (label.x + 0.5) * scale, (label.y + 0.5) * scale, "--ink", 400);
+    for (const { name, centre, anchor, half_size } of data.labels) {
+      // A name that stands beside its area is joined to it, as in the pictures.
+      const apart = anchor.some((place, axis) => Math.abs(place - centre[axis]) > half_size[axis]);
+      const cells = [centre, anchor].map(([x, y]) => [y, x]);
+      // A rim, as letters have: on a dark screen the ink of the page is as light as free space.
+      if (apart) for (const [ink, width] of [["--paper", 3], ["--ink", 1]]) line(context, cells, colour(ink), width);
+      write(context, name, (centre[0] + 0.5) * scale, (centre[1] + 0.5) * scale, "--ink", 400);
+    }
   }
 
   function drawRobot(context) {
     context.beginPath();
     const [row, column] = data.path[step];
-    context.arc((column + 0.5) * scale, (row + 0.5) * scale, Math.max(4, scale), 0, 2 * Math.PI);
+    context.arc((column + 0.5) * scale, (row + 0.5) * scale, Math.min(8, Math.max(4, scale / 2)), 0, 2 * Math.PI);
     context.fillStyle = "#FFD400";
     context.fill();
     context.lineWidth = 2;
@@ -373,12 +395,11 @@ function mountReplay(root, data) {
     const views = part(".views");
     views.replaceChildren();
     if (!decision) return;
-    const chosen = decision.actions.find((action) => action.chosen);
     decision.observations.forEach((look, number) => {
       const source = data.panoramas[look];
       if (!source) return;
       const figure = document.createElement("figure"), image = document.createElement("img"), text = document.createElement("figcaption");
-      const mine = chosen && chosen.subgoal === number;
+      const mine = isTarget(decision, decision.subgoals[number]);
       if (mine) figure.className = "chosen-view";
       rolled(source, turn(data.decisions[look].cell, decision.subgoals[number])).then((url) => { image.src = url; });
       text.textContent = `s${number} is in the middle${mine ? ", chosen" : ""}; seen ${look === decision.index ? "now" : `at decision ${look}`}`;
@@ -411,7 +432,7 @@ function mountReplay(root, data) {
     drawPlan(context, decision);
     drawRobot(context);
     const state = data.state_names[data.states[step]];
-    part(".where").textContent = `step ${step} of ${last}, decision ${number < 0 ? "-" : number} (last: ${data.decisions.length - 1})`;
+    part(".where").textContent = `step ${step} of ${last}, ${decisionInWords()}`;
     canvas.setAttribute("aria-label", `map after step ${step}: robot at row ${data.path[step][0]}, column ${data.path[step][1]}, ${state}`);
     part(".decision").textContent = decision ? decision.text : "";
     const expected = decision && decision.value !== null ? `, expected cost ${decision.value.toFixed(1)}` : "";
@@ -420,6 +441,11 @@ function mountReplay(root, data) {
     showActions(decision);
     showViews(decision);
     showReading(decision);
+  }
+
+  function decisionInWords() {
+    const count = data.decisions.length;
+    return count ? `decision ${number < 0 ? "-" : number} (last: ${count - 1})` : "no decisions";
   }
 
   function go(where) {
@@ -455,7 +481,8 @@ function mountReplay(root, data) {
   root.tabIndex = -1;
   root.addEventListener("keydown", (event) => {
     const where = keys[event.key];
-    if (!where) return;
+    // Of the browser: with Alt it goes back a page, and the arrows move through a list.
+    if (!where || event.altKey || event.ctrlKey || event.metaKey || event.shiftKey || event.target.matches("select")) return;
     event.preventDefault();
     go(where);
   });
