@@ -59,11 +59,17 @@ def valid_problem() -> PlanningProblem:
     return dataclasses.replace(problem, subgoal_mask=jnp.array([True, True, False]))
 
 
+def with_arrays(arrays, **wrong):
+    """A problem, or a task, with other arrays, past the checks of annotations that run in tests alone."""
+    changed = copy.copy(arrays)
+    for name, array in wrong.items():
+        object.__setattr__(changed, name, array)
+    return changed
+
+
 def of_shape(problem: PlanningProblem, name: str, shape: tuple[int, ...]) -> PlanningProblem:
-    """A problem with an array of another shape, past the checks of annotations that run in tests alone."""
-    wrong = copy.copy(problem)
-    object.__setattr__(wrong, name, jnp.ones(shape, getattr(problem, name).dtype))
-    return wrong
+    """A problem with an array of another shape."""
+    return with_arrays(problem, **{name: jnp.ones(shape, getattr(problem, name).dtype)})
 
 
 def stack(problems: list[PlanningProblem]) -> PlanningProblem:
@@ -181,6 +187,62 @@ def test_shapes_of_a_batch_are_checked_with_its_axis():
         jax.eval_shape(lambda keys: search(wrong, keys), keys)
     with pytest.raises(ProblemError, match=r"subgoal_mask has shape \(2, 3\), expected \(3, 'S'\)"):
         jax.eval_shape(lambda problems: search(problems, jax.vmap(jax.random.key)(jnp.arange(3))), problems)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "expected"),
+    [
+        ("travel", jnp.int32, "float32"),
+        ("success_probability", jnp.float16, "float32"),
+        ("dead_end_cost", jnp.bfloat16, "float32"),
+        ("subgoal_mask", jnp.int32, "bool"),
+        ("dfa_state", jnp.uint8, "int32"),
+    ],
+)
+def test_types_are_checked_as_shapes_are(name, kind, expected):
+    """The search's kernel reads memory by the type that an array should have."""
+    wrong = with_arrays(valid_problem(), **{name: getattr(valid_problem(), name).astype(kind)})
+    message = f"{name} has the type {jnp.dtype(kind)}, expected {expected}"
+    with pytest.raises(ProblemError, match=message):
+        wrong.check()
+    with pytest.raises(ProblemError, match=message):
+        jax.eval_shape(lambda key: plan_actions(wrong, key), jax.random.key(0))
+
+
+def test_what_is_no_array_is_refused():
+    with pytest.raises(ProblemError, match="dfa_state is of type int; give an array"):
+        with_arrays(valid_problem(), dfa_state=0).check()
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "found", "expected"),
+    [
+        ("edges", jnp.zeros((4, 2), jnp.int32), r"shape \(4, 2\)", r"\(5, 2\): E = 5"),
+        ("accepting", jnp.zeros(3, bool), r"shape \(3,\)", r"\(4,\): Z = 4"),
+        ("implies", jnp.zeros((5, 4), bool), r"shape \(5, 4\)", r"\(5, 5\): M = 5, M = 5"),
+        ("condition_classes", jnp.zeros(5, jnp.int32), r"shape \(5,\)", r"\('M', 'K'\)"),
+        ("edge_condition", jnp.zeros(5, jnp.int8), "the type int8", "int32"),
+    ],
+)
+def test_the_arrays_of_the_task_are_checked(name, array, found, expected):
+    wrong = with_arrays(valid_problem(), task=with_arrays(valid_problem().task, **{name: array}))
+    message = f"task.{name} has {found}, expected {expected}"
+    with pytest.raises(ProblemError, match=message):
+        wrong.check()
+    with pytest.raises(ProblemError, match=message):
+        jax.eval_shape(lambda key: plan_actions(wrong, key), jax.random.key(0))
+
+
+def test_a_batch_has_tasks_and_one_problem_has_one():
+    problems = jax.tree.map(lambda leaf: leaf[None].repeat(2, axis=0), valid_problem())
+    keys = jax.vmap(jax.random.key)(jnp.arange(2))
+    shared = with_arrays(problems, task=valid_problem().task)
+    with pytest.raises(ProblemError, match=r"task.state_mask has shape \(4,\), expected \(2, 'Z'\)"):
+        search(shared, keys)
+    several = with_arrays(valid_problem(), task=problems.task)
+    for refuse in (several.check, lambda: plan_actions(several, keys[0])):
+        with pytest.raises(ProblemError, match=r"task.state_mask has shape \(2, 4\), expected \('Z',\)"):
+            refuse()
 
 
 def answering_nan(belief, subgoals, task):

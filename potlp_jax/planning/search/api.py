@@ -58,7 +58,7 @@ def plan_actions(
       The plan.
 
     Raises:
-      ProblemError: the shapes of the problem's arrays do not agree.
+      ProblemError: shapes or types of the problem's arrays do not agree.
     """
     return _search_one(problem, key, config, None, simulations, with_trees=False)[0]
 
@@ -85,7 +85,7 @@ def search_tree(
       The plan and the tree: ``Tree`` under ``BestFirstConfig``, ``UctTree`` under ``UctConfig``.
 
     Raises:
-      ProblemError: the shapes of the problem's arrays do not agree.
+      ProblemError: shapes or types of the problem's arrays do not agree.
     """
     return _search_one(problem, key, config, tree, simulations, with_trees=True)
 
@@ -111,7 +111,7 @@ def search(
       Plans and trees with the leading axis B.
 
     Raises:
-      ProblemError: the shapes of the problems' arrays do not agree.
+      ProblemError: shapes or types of the problems' arrays do not agree.
     """
     check_shapes(problems, keys.shape)
     seeds = jax.vmap(_seed)(keys)
