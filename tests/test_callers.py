@@ -103,6 +103,73 @@ def test_what_has_another_type_is_refused_by_name():
         assert said in line
 
 
+OF_ANOTHER_SHAPE = """
+import dataclasses
+import jax
+import jax.numpy as jnp
+from potlp_jax import BeliefMap, DecisionConfig, SensorConfig, frontier_subgoals, make, observe
+from potlp_jax.planning.decision import subgoals_at
+from potlp_jax.planning.distances.paths import shortest_path
+from potlp_jax.planning.distances.product import distance_table, grid_distances, product_distances, product_transitions
+from potlp_jax.planning.policies import decide
+from potlp_jax.task.task import stack_tasks
+world = make("toy").world(0)
+belief, task = observe(BeliefMap.unobserved(world), world, world.start, SensorConfig()), world.task("F goal")
+arrays, free, one, key = task.arrays, belief.free, jnp.float32(1), jax.random.key(0)
+product = product_transitions(arrays, belief.letters, free)
+two, cells = jnp.array([0, 1]), jnp.array([[1, 1]])
+fields = product_distances(product, free, cells, two[:1], one)[0]
+ends = (cells[0], two[0], cells[0], two[0])
+
+def decided(cell, state, known=belief, of=arrays):
+    return decide(known, cell, state, of, None, key, policy="baseline", config=DecisionConfig())
+
+for make in (
+    lambda: frontier_subgoals(belief, world.start, two, arrays),
+    lambda: decided(jnp.array([5]), 0),
+    lambda: decided(cells, 0),
+    lambda: decided(world.start, 0, dataclasses.replace(belief, letters=belief.letters[1:])),
+    lambda: decided(world.start, 0, of=stack_tasks([task, task])),
+    lambda: product_distances(product, free, cells, two, one),
+    lambda: product_distances(product, free[1:], cells, two[:1], one),
+    lambda: distance_table(product, free, arrays.accepting, cells, two[:1], jnp.array([1, 1]), one),
+    lambda: grid_distances(free, jnp.array([1, 1, 1]), one),
+    lambda: shortest_path(fields[1:], product, free, *ends, horizon=4, resolution=one),
+    lambda: shortest_path(fields, product, free, cells, *ends[1:], horizon=4, resolution=one),
+    lambda: subgoals_at(cells, jnp.array([True, True]), 5, 5),
+    lambda: subgoals_at(jnp.array([[1.0, 1.0]]), jnp.array([True]), 5, 5),
+    lambda: subgoals_at(cells.astype(jnp.uint8), jnp.array([True]), 5, 5).cells.dtype,
+):
+    try:
+        print("no error", make())
+    except ValueError as error:
+        print(type(error).__name__, error)
+"""
+
+
+def test_what_has_another_shape_is_refused_by_name():
+    """The kernels read memory by these shapes."""
+    run = subprocess.run([sys.executable, "-c", OF_ANOTHER_SHAPE], capture_output=True, text=True, check=True)
+    expected = (
+        "ProblemError state has shape (2,), expected (): the map is",
+        "ProblemError cell has shape (1,), expected (2,): the map is",
+        "ProblemError cell has shape (1, 2), expected (2,): the map is",
+        "ProblemError belief.letters has shape",
+        "ProblemError task.state_mask has shape",
+        "ProblemError source_cells has shape (1, 2), expected (2, 2)",
+        "ProblemError free has shape",
+        "ProblemError target_cells has shape (2,), expected (2, 2)",
+        "ProblemError cell has shape (3,), expected (2,)",
+        "ProblemError distances has shape",
+        "ProblemError source_cell has shape (1, 2), expected (2,)",
+        "ProblemError cells has shape (1, 2), expected (2, 2)",
+        "ProblemError cells has the type float32: give whole numbers",
+        "no error int32",
+    )
+    for line, said in zip(run.stdout.splitlines(), expected, strict=True):
+        assert line.startswith(said)
+
+
 def test_no_key_is_used_twice():
     """In a trial and in a batch of trials: keys of worlds, of the camera's disturbance and of the sampling search."""
     settings = TrialConfig(

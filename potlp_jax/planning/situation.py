@@ -25,6 +25,7 @@ from potlp_jax.planning.distances.product import (
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
+from potlp_jax.planning.shapes import check_task, require_shapes
 from potlp_jax.precision import whole_numbers
 from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import TaskArrays
@@ -143,7 +144,7 @@ def assess(
 
     Args:
       belief: what is known of the map.
-      cell: the robot's cell.
+      cell: the robot's cell, which the belief knows to be free.
       state: the automaton's state, the letter of the robot's cell read.
       task: arrays of the task.
       config: how frontiers become subgoals.
@@ -154,11 +155,13 @@ def assess(
 
     Raises:
       PropositionsError: belief and task are not over the same propositions; while tracing, under jit.
-      ProblemError: cell or state are no whole numbers, or the task is not its arrays.
+      ProblemError: cell or state are no whole numbers, the task is not its arrays, or an array has another shape.
     """
     if not isinstance(task, TaskArrays):
         raise ProblemError(f"the task is a {type(task).__name__}; give its arrays, task.arrays")
     cell, state = whole_numbers(cell, "cell", ProblemError), whole_numbers(state, "state", ProblemError)
+    _check_shapes(belief, cell, state)
+    check_task(task)
     belief = dataclasses.replace(belief, resolution=jnp.asarray(belief.resolution, jnp.float32))
     # Every decision, of every policy, begins here: what follows reads letters with the task's tables.
     require_same_propositions(task.propositions, belief.propositions, knower="the belief")
@@ -203,6 +206,21 @@ def assess(
         finish_cost=finish_cost,
         status=subgoals.status | status_if(~_can_be_assessed(belief, cell, state, task), Status.INVALID),
     )
+
+
+def _check_shapes(belief: BeliefMap, cell: Array, state: Array) -> None:
+    """Raise ProblemError, while tracing, where map, cell and state are not those of one robot."""
+    grid = jnp.shape(belief.cells)
+    if len(grid) != 2:
+        raise ProblemError(f"belief.cells has shape {grid}, expected ('H', 'W'): one map")
+    expected = {
+        "belief.letters": (belief.letters, grid),
+        "belief.resolution": (belief.resolution, ()),
+        "belief.extent": (belief.extent, (2,)),
+        "cell": (cell, (2,)),
+        "state": (state, ()),
+    }
+    require_shapes(expected, f"the map is {grid}")
 
 
 # Under vmap the maps are taken one after the other, so that ``cond`` runs one branch only: a task without irrevocable
@@ -251,7 +269,9 @@ def _can_be_assessed(
     """Whether cell, state, letters and resolution are what the map and the task allow."""
     # An index out of range is clamped on the device, and would be answered as if it were another.
     states, letters = task.transitions.shape
-    is_cell = is_in_map(cell, belief)
+    # No path begins in a cell that is not free: moves out of it would cut its own corners.
+    height, width = belief.cells.shape
+    is_cell = is_in_map(cell, belief) & belief.free[jnp.clip(cell[0], 0, height - 1), jnp.clip(cell[1], 0, width - 1)]
     is_state = (state >= 0) & (state < states) & task.state_mask[jnp.clip(state, 0, states - 1)]
     are_letters = jnp.all((belief.letters >= 0) & (belief.letters < letters))
     is_length = (belief.resolution > 0.0) & jnp.isfinite(belief.resolution)
