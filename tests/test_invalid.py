@@ -1,5 +1,6 @@
 """Inputs that the model does not allow: nothing is planned with them, and no other row of a batch is harmed."""
 
+import contextlib
 import copy
 import dataclasses
 from functools import cache
@@ -13,14 +14,20 @@ from typer.testing import CliRunner
 from potlp_jax.cli import app
 from potlp_jax.environments.registry import make
 from potlp_jax.errors import ProblemError
+from potlp_jax.native import libraries
 from potlp_jax.planning.estimates import Estimates
+from potlp_jax.planning.move import Move, MoveKind
+from potlp_jax.planning.policies import decide_jit
 from potlp_jax.planning.problem import PlanningProblem, enumerate_actions, screen
 from potlp_jax.planning.search.api import plan_actions, search
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
+from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.trials.batch import Start, run_batch
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL, Status
-from tests.reference.problems import random_problem
+from potlp_jax.world.frontiers import FrontierConfig
+from potlp_jax.world.grid import BeliefMap, belief_from_numpy
+from tests.reference.problems import random_problem, task_of
 
 TASK = "F a & F b"
 SEARCHES = (BestFirstConfig(simulations=60), UctConfig(simulations=60))
@@ -243,6 +250,56 @@ def test_a_batch_has_tasks_and_one_problem_has_one():
     for refuse in (several.check, lambda: plan_actions(several, keys[0])):
         with pytest.raises(ProblemError, match=r"task.state_mask has shape \(2, 4\), expected \('Z',\)"):
             refuse()
+
+
+def known_map(rows: list[str], letter: int = 0, resolution: float = 1.0) -> BeliefMap:
+    """A belief: ``.`` free, ``#`` occupied, ``?`` unknown, with a letter at (1, 2)."""
+    meaning = {".": BeliefMap.FREE, "#": BeliefMap.OCCUPIED, "?": BeliefMap.UNKNOWN}
+    cells = np.array([[meaning[mark] for mark in row] for row in rows], np.int8)
+    known = belief_from_numpy(cells, np.zeros(cells.shape, np.int32), propositions=("a", "b"))
+    # Past the checks of what makes a belief on the host.
+    return dataclasses.replace(known, letters=known.letters.at[1, 2].set(letter), resolution=jnp.float32(resolution))
+
+
+def decided(belief: BeliefMap, cell: tuple[int, int], policy: str, state: int = 0) -> Move:
+    estimator = jax.tree_util.Partial(answering_half) if policy == "potlp" else None
+    config = DecisionConfig(frontiers=FrontierConfig(max_subgoals=2), search=BestFirstConfig(simulations=20))
+    arrays, key = task_of(TASK).arrays, jax.random.key(0)
+    return decide_jit(belief, jnp.array(cell), jnp.int32(state), arrays, estimator, key, policy=policy, config=config)
+
+
+def answering_half(belief, subgoals, task):
+    shape = subgoals.mask.shape[0], task.class_mask.shape[0]
+    return Estimates(
+        success_probability=jnp.full(shape, 0.5), success_cost=jnp.ones(shape), failure_cost=jnp.ones(shape)
+    )
+
+
+@pytest.mark.parametrize("kernels", ["native", "twins"])
+@pytest.mark.parametrize("mark", ["#", "?"])
+@pytest.mark.parametrize("policy", ["baseline", "optimistic", "potlp"])
+def test_no_move_is_made_from_a_cell_that_is_not_free(policy, mark, kernels):
+    """A path back to such a cell is never found: the kernel said so, its twin looked for it without end."""
+    belief = known_map(["#######", f"#..{mark}..?", "#######"])
+    with libraries.twin_only() if kernels == "twins" else contextlib.nullcontext():
+        move = decided(belief, (1, 3), policy)
+    assert int(move.status) & int(Status.INVALID)
+    assert (int(move.kind), int(move.path.length), float(move.value)) == (MoveKind.NONE, 0, np.inf)
+    assert tuple(np.asarray(move.target_cell)) == (1, 3)
+    assert not int(decided(known_map(["#######", "#.....?", "#######"]), (1, 3), policy).status) & int(Status.INVALID)
+
+
+@pytest.mark.parametrize("policy", ["baseline", "optimistic"])
+@pytest.mark.parametrize(
+    ("letter", "resolution", "state"),
+    [(9, 1.0, 0), (0, -1.0, 0), (0, 0.0, 0), (0, np.nan, 0), (0, np.inf, 0), (0, 1.0, 99)],
+)
+def test_a_robot_that_does_not_know_where_to_go_stays(letter, resolution, state, policy):
+    belief = known_map(["#######", "#.....?", "#######"], letter, resolution)
+    move = decided(belief, (1, 3), policy, state)
+    assert int(move.status) & int(Status.INVALID)
+    assert (int(move.kind), int(move.path.length), float(move.value)) == (MoveKind.NONE, 0, np.inf)
+    assert tuple(np.asarray(move.target_cell)) == (1, 3)
 
 
 def answering_nan(belief, subgoals, task):
