@@ -45,8 +45,8 @@ class DecisionConfig:
       commitment: hysteresis: fraction of its expected cost by which another action must be cheaper before the robot
         switches to it. 0: it switches at once, as published. The default was chosen on validation worlds, against
         0, 30 % and fixed numbers of cells (docs/results/panorama.md, "Commitment").
-      least_chance: share of the largest P_S of a class below which a subgoal is no way to it (``worthwhile``). 0: all
-        count, as published.
+      least_chance: share of the largest P_S of a class, among the subgoals in reach, below which a subgoal is no way to
+        it (``worthwhile``). 0: all count, as published.
       irrevocable_last: an irrevocable move is made only on a known path to acceptance, or where no frontier can be
         reached without one (docs/model.md section 7). False: it is weighed like any other move.
       path_horizon: moves in the path of one decision, at most; None means ``4 (H + W)``.
@@ -297,9 +297,10 @@ def planning_problem(situation: Situation, estimates: Estimates, config: Decisio
       The unbatched problem.
     """
     task, subgoals = situation.task, situation.subgoals
-    estimates = worthwhile(estimates, subgoals, config.least_chance)
-    travel, finish = _subgoal_travel(situation, estimates)
     at_subgoals = situation.distances[subgoals.cells[:, 0], subgoals.cells[:, 1]]
+    in_reach = subgoals.mask & jnp.any(jnp.isfinite(at_subgoals), axis=1)
+    estimates = worthwhile(estimates, in_reach, config.least_chance)
+    travel, finish = _subgoal_travel(situation, estimates)
     # The robot's node has its own state alone: no rollout is there in another.
     at_robot = jnp.arange(task.transitions.shape[0])[:, None, None] == situation.state
     robot_travel = jnp.where(at_robot & subgoals.mask[None, :, None], at_subgoals[None], jnp.inf)
@@ -321,25 +322,27 @@ def planning_problem(situation: Situation, estimates: Estimates, config: Decisio
     )
 
 
-def worthwhile(estimates: Estimates, subgoals: Subgoals, least_chance: float) -> Estimates:
-    """The estimates without subgoals that are hardly a way to a class while there are far better ones.
+def worthwhile(estimates: Estimates, in_reach: Bool[Array, " S"], least_chance: float) -> Estimates:
+    """The estimates without subgoals that are hardly a way to a class while there are far better ones in reach.
 
     The model takes attempts to be independent of each other, and adds up chances that are one: thirty dark rooms, each
     of which may have a second door to the one hallway that was not seen, are thirty chances to get there. Behind doors
     that the robot stands before, such chances cost little and are tried first; there is always a next one.
 
+    A subgoal that the robot cannot get to is no measure of others: it is never tried, so that they would never count.
+
     Args:
       estimates: of every subgoal and class; masked entries may hold anything.
-      subgoals: those that are asked about.
-      least_chance: share of the largest P_S of a class; below it P_S counts as 0.
+      in_reach: True on the real subgoals that a permitted move of the robot can lead to, in some state.
+      least_chance: share of the largest P_S of a class among those in reach; below it P_S counts as 0.
 
     Returns:
-      The estimates; the largest P_S of each class is always left.
+      The estimates; the largest P_S of each class in reach is always left.
     """
     if least_chance == 0.0:
         return estimates
     chance = estimates.success_probability
-    best = jnp.max(jnp.where(subgoals.mask[:, None], chance, 0.0), axis=0, keepdims=True)
+    best = jnp.max(jnp.where(in_reach[:, None], chance, 0.0), axis=0, keepdims=True)
     kept = jnp.where(chance < jnp.float32(least_chance) * best, 0.0, chance)
     return dataclasses.replace(estimates, success_probability=kept)
 
