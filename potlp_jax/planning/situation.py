@@ -13,7 +13,7 @@ from flax import struct
 from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
-from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, require_fields
+from potlp_jax.checks import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, as_python_numbers, require_fields
 from potlp_jax.errors import ProblemError
 from potlp_jax.planning.distances.product import (
     distance_table,
@@ -67,7 +67,8 @@ class DecisionConfig:
         require_fields(self, ("commitment",), NOT_NEGATIVE, ValueError)
         require_fields(self, ("least_chance",), SHARE, ValueError)
         if self.path_horizon is not None:
-            require_fields(self, ("path_horizon",), AT_LEAST_ONE, ValueError)
+            require_fields(self, ("path_horizon",), COUNT, ValueError)
+            as_python_numbers(self, ("path_horizon",))
 
     def horizon(self, height: int, width: int) -> int:
         """Moves in the path of one decision on a map of this size."""
