@@ -243,8 +243,10 @@ def _check_reachable(dfa: Dfa, max_positive_literals: int) -> None:
     A guard keeps a cube exactly if it holds such a letter, so this also covers states that no edge leaves
     because no letter stays there.
     """
-    if not is_whole(max_positive_literals) or max_positive_literals < 0:
-        raise TaskError(f"max_positive_literals is {max_positive_literals!r}: it must be None or a whole number from 0")
+    if not is_whole(max_positive_literals):
+        raise TaskError(f"max_positive_literals is {max_positive_literals!r}: it must be None or a whole number")
+    if max_positive_literals < 0:
+        raise TaskError(f"max_positive_literals is {max_positive_literals}: it must be None or at least 0")
     letters = _allowed_letters(dfa, max_positive_literals)
     reached, queue = {dfa.initial}, [dfa.initial]
     for state in queue:
