@@ -1,6 +1,7 @@
 """Checks of configurations: one form of rule and of message wherever several fields are checked alike."""
 
 import math
+import numbers
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -13,7 +14,20 @@ class Kind:
     holds: Callable[[Any], bool]
     wanted: str
 
+    def allows(self, value: Any) -> bool:
+        """Whether a value is of the kind; what cannot be compared with numbers is of none."""
+        try:
+            return self.holds(value)
+        except TypeError:
+            return False
 
+
+def is_whole(value: object) -> bool:
+    """Whether it is a whole number of whatever type, NumPy's too; True and False are none."""
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
+
+
+COUNT: Kind = Kind(lambda value: is_whole(value) and value >= 1, "a whole number of at least 1")
 AT_LEAST_ONE: Kind = Kind(lambda value: value >= 1, "at least 1")
 POSITIVE: Kind = Kind(lambda value: math.isfinite(value) and value > 0, "a positive number")
 NOT_NEGATIVE: Kind = Kind(lambda value: math.isfinite(value) and value >= 0, "a number from 0")
@@ -25,8 +39,21 @@ def require_fields(config: object, names: Iterable[str], kind: Kind, error: type
     """Raise ``error`` with name and value of the first of these fields of ``config`` that is not of the kind."""
     for name in names:
         value = getattr(config, name)
-        if not kind.holds(value):
+        if not kind.allows(value):
             raise error(f"{name} is {value}; give {kind.wanted}")
+
+
+def as_python_numbers(config: object, names: Iterable[str]) -> None:
+    """Make whole numbers of other types Python's, in a frozen dataclass: records of settings hold no others.
+
+    Args:
+        config: which is being made.
+        names: fields; what is no whole number stays as it is.
+    """
+    for name in names:
+        value = getattr(config, name)
+        if is_whole(value):
+            object.__setattr__(config, name, int(value))
 
 
 def require_rules(rules: Iterable[tuple[bool, str]], what: str, error: type[Exception]) -> None:

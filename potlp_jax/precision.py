@@ -44,6 +44,11 @@ def in_32_bits(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, 
     return narrowed
 
 
+def narrow_type(kind: Any) -> jnp.dtype:
+    """The type in which the library computes with an array of this one: 64 bits are rounded to 32."""
+    return jnp.dtype(_NARROWER.get(jnp.dtype(kind), kind))
+
+
 def whole_numbers(given: Any, what: str, error: type[Exception]) -> Int32[Array, "*shape"]:
     """Whole numbers of any type, Python's included, as the kernels take them. Raises ``error`` for other numbers."""
     array = jnp.asarray(given)

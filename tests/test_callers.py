@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from potlp_jax.trials.config import TrialConfig
 from tests.reference.domains import domain_of
 from tests.reference.toy_plan import TASK, C, S, plan
 
+ROOT = Path(__file__).parents[1]
 TOY = potlp_jax.make("toy")
 NETWORK = NetworkConfig(
     propositions=TOY.propositions, first_widths=(4,) * 4, second_widths=(4,) * 8, dense_widths=(8,) * 4, fovea=3
@@ -61,24 +63,46 @@ def test_cells_and_states_may_be_whole_numbers_of_any_type(kind):
         assert float(found.value) == float(expected.value)
 
 
-def test_who_asks_for_a_derivative_is_told_what_to_do():
+@pytest.mark.parametrize("config", [BestFirstConfig(simulations=20), UctConfig(simulations=20)])
+def test_who_asks_for_a_derivative_is_told_what_to_do(config):
     def value(chances):
-        return plan(chances, jax.random.key(0), BestFirstConfig(simulations=20)).value
+        return plan(chances, jax.random.key(0), config).value
 
     chances = jnp.full((S, C), 0.5)
     with pytest.raises(NotImplementedError, match="stop_gradient"):
         jax.jvp(value, (chances,), (chances,))
+    with pytest.raises(NotImplementedError, match="stop_gradient"):
+        jax.grad(value)(chances)
     assert jax.grad(lambda chances: jnp.sum(chances) + value(jax.lax.stop_gradient(chances)))(chances).shape == (S, C)
 
 
 OF_ANOTHER_TYPE = """
-from potlp_jax import BeliefMap, BestFirstConfig, DecisionConfig, FrontierConfig, frontier_subgoals, make
+import jax
+import numpy as np
+from potlp_jax import BeliefMap, BestFirstConfig, DecisionConfig, FrontierConfig, Task, UctConfig
+from potlp_jax import frontier_subgoals, make, plan_actions
+from tests.reference.toy_plan import C, S, problem
 world = make("toy").world(0)
 belief, task = BeliefMap.unobserved(world), world.task("F goal")
 for make in (
     lambda: DecisionConfig(search="uct"),
     lambda: BestFirstConfig(simulations=1e3),
+    lambda: BestFirstConfig(simulations=True),
+    lambda: BestFirstConfig(simulations=None),
+    lambda: BestFirstConfig(optimism="x"),
+    lambda: repr(BestFirstConfig(simulations=np.int64(50)).simulations),
+    lambda: UctConfig(exploration="x"),
     lambda: FrontierConfig(max_subgoals=8.0),
+    lambda: FrontierConfig(min_size=True),
+    lambda: repr(FrontierConfig(max_subgoals=np.int32(4)).max_subgoals),
+    lambda: DecisionConfig(path_horizon=2.5),
+    lambda: DecisionConfig(commitment="x"),
+    lambda: Task.from_formula("F a", max_positive_literals="1"),
+    lambda: Task.from_formula("F a", max_positive_literals=2.5),
+    lambda: Task.from_formula("F a", max_positive_literals=True),
+    lambda: repr(Task.from_formula("F a", max_positive_literals=np.int64(1)).max_positive_literals),
+    lambda: plan_actions(problem(np.full((S, C), 0.5), np), jax.random.key(0), simulations=2.7),
+    lambda: plan_actions(problem(np.full((S, C), 0.5), np), jax.random.key(0), simulations=jax.numpy.array([2])),
     lambda: frontier_subgoals(belief, (1.5, 1.0), 0, task.arrays),
     lambda: frontier_subgoals(belief, world.start, 0, task),
 ):
@@ -91,16 +115,99 @@ for make in (
 
 def test_what_has_another_type_is_refused_by_name():
     """In a program of its own: here annotations are checked."""
-    told = subprocess.run([sys.executable, "-c", OF_ANOTHER_TYPE], capture_output=True, text=True, check=True).stdout
+    command = [sys.executable, "-c", OF_ANOTHER_TYPE]
+    told = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT).stdout
     expected = (
         "search is 'uct'; give a BestFirstConfig",
         "simulations is 1000.0, must be a whole",
+        "simulations is True, must be a whole",
+        "simulations is None, must be a whole",
+        "optimism is x, must lie in [0, 1]",
+        "no error 50",
+        "exploration is x, must be finite",
         "must be whole",
+        "must be whole",
+        "no error 4",
+        "path_horizon is 2.5; give a whole number",
+        "commitment is x; give a number from 0",
+        "max_positive_literals is '1': it must be None or a whole",
+        "max_positive_literals is 2.5: it must be None or a whole",
+        "max_positive_literals is True: it must be None or a whole",
+        "no error 1",
+        "simulations has the type float32: give whole",
+        "simulations has shape (1,), expected (): one number for each problem",
         "cell has the type float32: give whole",
         "the task is a Task; give its arrays",
     )
     for line, said in zip(told.splitlines(), expected, strict=True):
         assert said in line
+
+
+OF_ANOTHER_SHAPE = """
+import dataclasses
+import jax
+import jax.numpy as jnp
+from potlp_jax import BeliefMap, DecisionConfig, SensorConfig, frontier_subgoals, make, observe
+from potlp_jax.planning.decision import subgoals_at
+from potlp_jax.planning.distances.paths import shortest_path
+from potlp_jax.planning.distances.product import distance_table, grid_distances, product_distances, product_transitions
+from potlp_jax.planning.policies import decide
+from potlp_jax.task.task import stack_tasks
+world = make("toy").world(0)
+belief, task = observe(BeliefMap.unobserved(world), world, world.start, SensorConfig()), world.task("F goal")
+arrays, free, one, key = task.arrays, belief.free, jnp.float32(1), jax.random.key(0)
+product = product_transitions(arrays, belief.letters, free)
+two, cells = jnp.array([0, 1]), jnp.array([[1, 1]])
+fields = product_distances(product, free, cells, two[:1], one)[0]
+ends = (cells[0], two[0], cells[0], two[0])
+
+def decided(cell, state, known=belief, of=arrays):
+    return decide(known, cell, state, of, None, key, policy="baseline", config=DecisionConfig())
+
+for make in (
+    lambda: frontier_subgoals(belief, world.start, two, arrays),
+    lambda: decided(jnp.array([5]), 0),
+    lambda: decided(cells, 0),
+    lambda: decided(world.start, 0, dataclasses.replace(belief, letters=belief.letters[1:])),
+    lambda: decided(world.start, 0, of=stack_tasks([task, task])),
+    lambda: product_distances(product, free, cells, two, one),
+    lambda: product_distances(product, free[1:], cells, two[:1], one),
+    lambda: distance_table(product, free, arrays.accepting, cells, two[:1], jnp.array([1, 1]), one),
+    lambda: grid_distances(free, jnp.array([1, 1, 1]), one),
+    lambda: shortest_path(fields[1:], product, free, *ends, horizon=4, resolution=one),
+    lambda: shortest_path(fields, product, free, cells, *ends[1:], horizon=4, resolution=one),
+    lambda: subgoals_at(cells, jnp.array([True, True]), 5, 5),
+    lambda: subgoals_at(jnp.array([[1.0, 1.0]]), jnp.array([True]), 5, 5),
+    lambda: subgoals_at(cells.astype(jnp.uint8), jnp.array([True]), 5, 5).cells.dtype,
+):
+    try:
+        print("no error", make())
+    except ValueError as error:
+        print(type(error).__name__, error)
+"""
+
+
+def test_what_has_another_shape_is_refused_by_name():
+    """The kernels read memory by these shapes."""
+    run = subprocess.run([sys.executable, "-c", OF_ANOTHER_SHAPE], capture_output=True, text=True, check=True)
+    expected = (
+        "ProblemError state has shape (2,), expected (): the map is",
+        "ProblemError cell has shape (1,), expected (2,): the map is",
+        "ProblemError cell has shape (1, 2), expected (2,): the map is",
+        "ProblemError belief.letters has shape",
+        "ProblemError task.state_mask has shape",
+        "ProblemError source_cells has shape (1, 2), expected (2, 2)",
+        "ProblemError free has shape",
+        "ProblemError target_cells has shape (2,), expected (2, 2)",
+        "ProblemError cell has shape (3,), expected (2,)",
+        "ProblemError distances has shape",
+        "ProblemError source_cell has shape (1, 2), expected (2,)",
+        "ProblemError cells has shape (1, 2), expected (2, 2)",
+        "ProblemError cells has the type float32: give whole numbers",
+        "no error int32",
+    )
+    for line, said in zip(run.stdout.splitlines(), expected, strict=True):
+        assert line.startswith(said)
 
 
 def test_no_key_is_used_twice():

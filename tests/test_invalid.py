@@ -1,5 +1,6 @@
 """Inputs that the model does not allow: nothing is planned with them, and no other row of a batch is harmed."""
 
+import contextlib
 import copy
 import dataclasses
 from functools import cache
@@ -13,14 +14,20 @@ from typer.testing import CliRunner
 from potlp_jax.cli import app
 from potlp_jax.environments.registry import make
 from potlp_jax.errors import ProblemError
+from potlp_jax.native import libraries
 from potlp_jax.planning.estimates import Estimates
+from potlp_jax.planning.move import Move, MoveKind
+from potlp_jax.planning.policies import decide_jit
 from potlp_jax.planning.problem import PlanningProblem, enumerate_actions, screen
 from potlp_jax.planning.search.api import plan_actions, search
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
+from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.trials.batch import Start, run_batch
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL, Status
-from tests.reference.problems import random_problem
+from potlp_jax.world.frontiers import FrontierConfig
+from potlp_jax.world.grid import BeliefMap, belief_from_numpy
+from tests.reference.problems import random_problem, task_of
 
 TASK = "F a & F b"
 SEARCHES = (BestFirstConfig(simulations=60), UctConfig(simulations=60))
@@ -59,11 +66,17 @@ def valid_problem() -> PlanningProblem:
     return dataclasses.replace(problem, subgoal_mask=jnp.array([True, True, False]))
 
 
+def with_arrays(arrays, **wrong):
+    """A problem, or a task, with other arrays, past the checks of annotations that run in tests alone."""
+    changed = copy.copy(arrays)
+    for name, array in wrong.items():
+        object.__setattr__(changed, name, array)
+    return changed
+
+
 def of_shape(problem: PlanningProblem, name: str, shape: tuple[int, ...]) -> PlanningProblem:
-    """A problem with an array of another shape, past the checks of annotations that run in tests alone."""
-    wrong = copy.copy(problem)
-    object.__setattr__(wrong, name, jnp.ones(shape, getattr(problem, name).dtype))
-    return wrong
+    """A problem with an array of another shape."""
+    return with_arrays(problem, **{name: jnp.ones(shape, getattr(problem, name).dtype)})
 
 
 def stack(problems: list[PlanningProblem]) -> PlanningProblem:
@@ -181,6 +194,112 @@ def test_shapes_of_a_batch_are_checked_with_its_axis():
         jax.eval_shape(lambda keys: search(wrong, keys), keys)
     with pytest.raises(ProblemError, match=r"subgoal_mask has shape \(2, 3\), expected \(3, 'S'\)"):
         jax.eval_shape(lambda problems: search(problems, jax.vmap(jax.random.key)(jnp.arange(3))), problems)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "expected"),
+    [
+        ("travel", jnp.int32, "float32"),
+        ("success_probability", jnp.float16, "float32"),
+        ("dead_end_cost", jnp.bfloat16, "float32"),
+        ("subgoal_mask", jnp.int32, "bool"),
+        ("dfa_state", jnp.uint8, "int32"),
+    ],
+)
+def test_types_are_checked_as_shapes_are(name, kind, expected):
+    """The search's kernel reads memory by the type that an array should have."""
+    wrong = with_arrays(valid_problem(), **{name: getattr(valid_problem(), name).astype(kind)})
+    message = f"{name} has the type {jnp.dtype(kind)}, expected {expected}"
+    with pytest.raises(ProblemError, match=message):
+        wrong.check()
+    with pytest.raises(ProblemError, match=message):
+        jax.eval_shape(lambda key: plan_actions(wrong, key), jax.random.key(0))
+
+
+def test_what_is_no_array_is_refused():
+    with pytest.raises(ProblemError, match="dfa_state is of type int; give an array"):
+        with_arrays(valid_problem(), dfa_state=0).check()
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "found", "expected"),
+    [
+        ("edges", jnp.zeros((4, 2), jnp.int32), r"shape \(4, 2\)", r"\(5, 2\): E = 5"),
+        ("accepting", jnp.zeros(3, bool), r"shape \(3,\)", r"\(4,\): Z = 4"),
+        ("implies", jnp.zeros((5, 4), bool), r"shape \(5, 4\)", r"\(5, 5\): M = 5, M = 5"),
+        ("condition_classes", jnp.zeros(5, jnp.int32), r"shape \(5,\)", r"\('M', 'K'\)"),
+        ("edge_condition", jnp.zeros(5, jnp.int8), "the type int8", "int32"),
+    ],
+)
+def test_the_arrays_of_the_task_are_checked(name, array, found, expected):
+    wrong = with_arrays(valid_problem(), task=with_arrays(valid_problem().task, **{name: array}))
+    message = f"task.{name} has {found}, expected {expected}"
+    with pytest.raises(ProblemError, match=message):
+        wrong.check()
+    with pytest.raises(ProblemError, match=message):
+        jax.eval_shape(lambda key: plan_actions(wrong, key), jax.random.key(0))
+
+
+def test_a_batch_has_tasks_and_one_problem_has_one():
+    problems = jax.tree.map(lambda leaf: leaf[None].repeat(2, axis=0), valid_problem())
+    keys = jax.vmap(jax.random.key)(jnp.arange(2))
+    shared = with_arrays(problems, task=valid_problem().task)
+    with pytest.raises(ProblemError, match=r"task.state_mask has shape \(4,\), expected \(2, 'Z'\)"):
+        search(shared, keys)
+    several = with_arrays(valid_problem(), task=problems.task)
+    for refuse in (several.check, lambda: plan_actions(several, keys[0])):
+        with pytest.raises(ProblemError, match=r"task.state_mask has shape \(2, 4\), expected \('Z',\)"):
+            refuse()
+
+
+def known_map(rows: list[str], letter: int = 0, resolution: float = 1.0) -> BeliefMap:
+    """A belief: ``.`` free, ``#`` occupied, ``?`` unknown, with a letter at (1, 2)."""
+    meaning = {".": BeliefMap.FREE, "#": BeliefMap.OCCUPIED, "?": BeliefMap.UNKNOWN}
+    cells = np.array([[meaning[mark] for mark in row] for row in rows], np.int8)
+    known = belief_from_numpy(cells, np.zeros(cells.shape, np.int32), propositions=("a", "b"))
+    # Past the checks of what makes a belief on the host.
+    return dataclasses.replace(known, letters=known.letters.at[1, 2].set(letter), resolution=jnp.float32(resolution))
+
+
+def decided(belief: BeliefMap, cell: tuple[int, int], policy: str, state: int = 0) -> Move:
+    estimator = jax.tree_util.Partial(answering_half) if policy == "potlp" else None
+    config = DecisionConfig(frontiers=FrontierConfig(max_subgoals=2), search=BestFirstConfig(simulations=20))
+    arrays, key = task_of(TASK).arrays, jax.random.key(0)
+    return decide_jit(belief, jnp.array(cell), jnp.int32(state), arrays, estimator, key, policy=policy, config=config)
+
+
+def answering_half(belief, subgoals, task):
+    shape = subgoals.mask.shape[0], task.class_mask.shape[0]
+    return Estimates(
+        success_probability=jnp.full(shape, 0.5), success_cost=jnp.ones(shape), failure_cost=jnp.ones(shape)
+    )
+
+
+@pytest.mark.parametrize("kernels", ["native", "twins"])
+@pytest.mark.parametrize("mark", ["#", "?"])
+@pytest.mark.parametrize("policy", ["baseline", "optimistic", "potlp"])
+def test_no_move_is_made_from_a_cell_that_is_not_free(policy, mark, kernels):
+    """A path back to such a cell is never found: the kernel said so, its twin looked for it without end."""
+    belief = known_map(["#######", f"#..{mark}..?", "#######"])
+    with libraries.twin_only() if kernels == "twins" else contextlib.nullcontext():
+        move = decided(belief, (1, 3), policy)
+    assert int(move.status) & int(Status.INVALID)
+    assert (int(move.kind), int(move.path.length), float(move.value)) == (MoveKind.NONE, 0, np.inf)
+    assert tuple(np.asarray(move.target_cell)) == (1, 3)
+    assert not int(decided(known_map(["#######", "#.....?", "#######"]), (1, 3), policy).status) & int(Status.INVALID)
+
+
+@pytest.mark.parametrize("policy", ["baseline", "optimistic"])
+@pytest.mark.parametrize(
+    ("letter", "resolution", "state"),
+    [(9, 1.0, 0), (0, -1.0, 0), (0, 0.0, 0), (0, np.nan, 0), (0, np.inf, 0), (0, 1.0, 99)],
+)
+def test_a_robot_that_does_not_know_where_to_go_stays(letter, resolution, state, policy):
+    belief = known_map(["#######", "#.....?", "#######"], letter, resolution)
+    move = decided(belief, (1, 3), policy, state)
+    assert int(move.status) & int(Status.INVALID)
+    assert (int(move.kind), int(move.path.length), float(move.value)) == (MoveKind.NONE, 0, np.inf)
+    assert tuple(np.asarray(move.target_cell)) == (1, 3)
 
 
 def answering_nan(belief, subgoals, task):

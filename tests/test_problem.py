@@ -1,6 +1,8 @@
 """PlanningProblem: types, validation, enumeration of actions."""
 
 import dataclasses
+import subprocess
+import sys
 
 import chex
 import jax
@@ -76,6 +78,42 @@ def test_check_names_the_field_whose_shape_is_wrong():
     wrong = dict.fromkeys(("success_probability", "success_cost", "failure_cost"), jnp.ones((2, 4)))
     with pytest.raises(ProblemError, match=r"success_probability has shape \(2, 4\), expected \(2, 5\)"):
         dataclasses.replace(random_problem(TASK, 2, 0), **wrong).check()
+
+
+OF_64_BITS = """
+import dataclasses
+import sys
+import jax
+import numpy as np
+from potlp_jax import BestFirstConfig, PlanningProblem, Task, plan_actions
+jax.config.update("jax_enable_x64", sys.argv[1] == "on")
+task = Task.shipped("toy-2")
+values = np.random.default_rng(0)
+sizes = S, Z, C = 2, task.dfa.num_states, len(task.classes)
+problem = PlanningProblem.from_arrays(
+    task.arrays, travel=values.uniform(1, 9, (S + 1, Z, S, Z)), finish=np.full((S + 1, Z), np.inf),
+    success_probability=values.random((S, C)), success_cost=values.uniform(1, 9, (S, C)),
+    failure_cost=values.random((S, C)), dfa_state=task.dfa.initial, subgoal_mask=np.ones(S, bool), dead_end_cost=100.0,
+)
+names = ("travel", "success_probability", "dfa_state")
+found = []
+for kind in (np.asarray, jax.numpy.asarray):
+    wide = {name: np.asarray(getattr(problem, name)) for name in names}
+    wide = {name: kind(array.astype(array.dtype.str.replace("4", "8"))) for name, array in wide.items()}
+    given = dataclasses.replace(problem, **wide)
+    given.check()
+    found.append(plan_actions(given, jax.random.key(0), BestFirstConfig(simulations=20)).q_values)
+own = plan_actions(problem, jax.random.key(0), BestFirstConfig(simulations=20)).q_values
+print(given.travel.dtype, all(np.array_equal(own, q_values) for q_values in found))
+"""
+
+
+@pytest.mark.parametrize(("switch", "kind"), [("on", "float64"), ("off", "float32")])
+def test_arrays_of_64_bits_are_rounded(switch, kind):
+    """In a program of its own: here annotations are checked."""
+    command = [sys.executable, "-c", OF_64_BITS, switch]
+    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert told.split() == [kind, "True"]
 
 
 def test_from_arrays_is_traceable_and_sets_types():

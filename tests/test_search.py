@@ -12,6 +12,7 @@ from flax import struct
 from jaxtyping import Array, Int32
 
 from potlp_jax.bench.problems import family_problem
+from potlp_jax.errors import ProblemError
 from potlp_jax.planning.exact.api import solve_exact
 from potlp_jax.planning.history import terms_of_all
 from potlp_jax.planning.search import best_first, descending
@@ -391,6 +392,39 @@ def test_a_search_goes_on_where_it_stopped():
     _, tree = tree_jit(problem, jax.random.key(0), config=half)
     assert_same_plans(one, tree_jit(problem, jax.random.key(0), config=half, tree=tree))
     assert not np.array_equal(one[1].simulations, tree.simulations)
+
+
+@pytest.mark.parametrize(
+    ("grown", "config", "said"),
+    [
+        (QUICK, UctConfig(simulations=64, tree_capacity=65), "of type Tree; UctConfig goes on with UctTree"),
+        (QUICK, dataclasses.replace(QUICK, tree_capacity=66), r"tree\.q_values has shape .*: a tree of 66 nodes"),
+        (UctConfig(simulations=5), UctConfig(simulations=9), r"tree\.q_values has shape .*: a tree of 10 nodes"),
+    ],
+)
+def test_a_search_does_not_go_on_with_a_tree_of_another(grown, config, said):
+    problem, key = shared_shape("F a & F b", 3), jax.random.key(0)
+    with pytest.raises(ProblemError, match=said):
+        jax.eval_shape(lambda: search_tree(problem, key, config, search_tree(problem, key, grown)[1])[0].value)
+
+
+def test_a_search_does_not_go_on_with_a_tree_of_a_problem_of_another_size():
+    problem, key = shared_shape("F a & F b", 3), jax.random.key(0)
+    larger = problem.padded(SUBGOALS + 1)
+    with pytest.raises(ProblemError, match=r"tree\.q_values has shape"):
+        jax.eval_shape(lambda: search_tree(problem, key, QUICK, search_tree(larger, key, QUICK)[1])[0].value)
+
+
+@pytest.mark.parametrize("config", [QUICK, UctConfig(simulations=8)])
+@pytest.mark.parametrize("shape", [(0,), (0, 3), (2, 0)])
+def test_a_batch_may_have_no_rows(shape, config):
+    problem = shared_shape("F a & F b", 3)
+    plan = lambda key: plan_actions(problem, key, config)  # noqa: E731
+    for _ in shape:
+        plan = jax.vmap(plan)
+    found = plan(keys(3)[:0].reshape(shape))
+    assert found.value.shape == shape
+    assert found.q_values.shape == (*shape, problem.action_count)
 
 
 def test_seconds_as_the_budget():

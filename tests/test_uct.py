@@ -129,6 +129,13 @@ def test_a_search_goes_on_where_it_stopped():
     assert int(one[1].simulations) == 80
 
 
+@pytest.mark.parametrize("exploration", [float("inf"), float("nan"), -1.0])
+def test_the_weight_of_exploration_is_finite(exploration):
+    """With infinity the first action would be taken again and again."""
+    with pytest.raises(ValueError, match=r"UctConfig.exploration is .*, must be finite and not negative"):
+        UctConfig(exploration=exploration)
+
+
 def test_seconds_as_the_budget():
     problem = shared_shape("F a & F b", 3, unreachable=0.1)
     plan, tree = plan_within(problem, jax.random.key(0), 600.0, UctConfig(simulations=50, tree_capacity=60))

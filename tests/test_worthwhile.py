@@ -8,6 +8,7 @@ import pytest
 import potlp_jax
 from potlp_jax.planning.decision import decide_from_estimates_jit, subgoals_at
 from potlp_jax.planning.estimates import Estimates
+from potlp_jax.planning.move import MoveKind
 from potlp_jax.planning.situation import DecisionConfig, worthwhile
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import trial_config_for
@@ -32,17 +33,17 @@ def _subgoals(columns, real):
 
 
 def test_chances_below_a_share_of_the_best_of_their_class_count_as_none():
-    subgoals = _subgoals([2, 5, 8, 11], [True, True, True, False])
-    # What is masked may hold anything, and is no measure of others.
+    in_reach = jnp.array([True, True, True, False])
+    # What is masked, or out of reach, may hold anything, and is no measure of others.
     estimates = _estimates([[0.5, 0.04], [0.049, 0.0], [0.05, 0.004], [np.nan, 1.0]])
-    found = worthwhile(estimates, subgoals, 0.1)
+    found = worthwhile(estimates, in_reach, 0.1)
     expected = np.array([[0.5, 0.04], [0.0, 0.0], [0.05, 0.004]], np.float32)
     np.testing.assert_array_equal(found.success_probability[:3], expected)
     np.testing.assert_array_equal(found.success_cost, estimates.success_cost)
     np.testing.assert_array_equal(found.failure_cost, estimates.failure_cost)
     none = _estimates(np.zeros((4, 2)))
-    np.testing.assert_array_equal(worthwhile(none, subgoals, 0.5).success_probability, none.success_probability)
-    assert worthwhile(estimates, subgoals, 0.0) is estimates
+    np.testing.assert_array_equal(worthwhile(none, in_reach, 0.5).success_probability, none.success_probability)
+    assert worthwhile(estimates, in_reach, 0.0) is estimates
 
 
 def test_a_chance_that_is_none_is_still_reported_as_wrong():
@@ -84,6 +85,28 @@ def test_where_all_chances_are_small_none_is_left_out():
     move = _decide(belief, subgoals, [[0.003], [0.003]], 0.1)
     assert int(move.search.plan.subgoal) == 0
     assert int(jnp.sum(move.search.terms.success_probability > 0)) >= 2
+
+
+def test_a_subgoal_that_is_barred_is_no_measure_of_others():
+    """It is never tried, so that the robot would fall back on the nearest frontier for good."""
+    task = Task.from_formula("!hazard U goal", ("goal", "hazard"))
+    cells = np.full((5, 10), BeliefMap.OCCUPIED, np.int8)
+    # The robot's hallway is open in the west; the way to the east goes over the hazard.
+    cells[1, 1:9] = cells[2, 5] = cells[3, 1:8] = BeliefMap.FREE
+    cells[1, 0] = cells[3, 8] = BeliefMap.UNKNOWN
+    letters = np.zeros(cells.shape, np.int32)
+    letters[2, 5] = 0b10
+    belief = belief_from_numpy(cells, letters, propositions=("goal", "hazard"))
+    near, barred = (1, 1), (3, 7)
+    chances = np.array([[0.3], [0.9]], np.float32).repeat(task.arrays.class_mask.shape[0], axis=1)
+    given = subgoals_at(jnp.array([near, barred]), jnp.array([True, True]), *cells.shape)
+    config = DecisionConfig(frontiers=FrontierConfig(max_subgoals=2), least_chance=0.5)
+    at = jnp.array([1, 4], jnp.int32), task.arrays.initial
+    move = decide_from_estimates_jit(
+        belief, given, _estimates(chances), task.arrays, *at, jax.random.key(0), config=config
+    )
+    assert int(move.kind) == MoveKind.ACTION
+    assert tuple(np.asarray(move.target_cell)) == near
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.1, float("nan")])

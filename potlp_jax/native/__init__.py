@@ -30,3 +30,4 @@ from potlp_jax.native.libraries import is_usable as is_usable
 from potlp_jax.native.libraries import status as status
 from potlp_jax.native.libraries import target as target
 from potlp_jax.native.libraries import twin_only as twin_only
+from potlp_jax.native.libraries import without_derivative as without_derivative

@@ -136,6 +136,14 @@ def _no_derivative(*_: Any, **__: Any) -> Any:
     )
 
 
+@jax.custom_jvp
+def without_derivative(array: jax.Array) -> jax.Array:
+    """The array; who asks for a derivative by it is told that there is none."""
+    return array
+
+
+without_derivative.defjvp(_no_derivative)
+
 batching.primitive_batchers[_choice] = _vectorise
 ad.primitive_jvps[_choice] = _no_derivative
 mlir.register_lowering(_choice, mlir.lower_fun(lambda *leaves, twin, **_: twin(*leaves), multiple_results=True))

@@ -20,6 +20,7 @@ from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimates, check_shapes
 from potlp_jax.planning.move import Move
 from potlp_jax.planning.policies import search_move
+from potlp_jax.planning.shapes import require_shapes
 from potlp_jax.planning.situation import DecisionConfig, assess, is_in_map
 from potlp_jax.precision import in_32_bits, whole_numbers
 from potlp_jax.task.task import TaskArrays
@@ -40,7 +41,7 @@ def frontier_subgoals(
 
     Args:
       belief: what is known of the map.
-      cell: the robot's cell.
+      cell: the robot's cell, which the belief knows to be free.
       state: the automaton's state, the letter of the robot's cell read.
       task: arrays of the task.
       config: ``config.frontiers`` is what matters here.
@@ -50,6 +51,7 @@ def frontier_subgoals(
 
     Raises:
       PropositionsError: belief and task are not over the same propositions.
+      ProblemError: cell or state are no whole numbers, the task is not its arrays, or an array has another shape.
     """
     return assess(belief, cell, state, task, config.frontiers, config.irrevocable_last).subgoals
 
@@ -67,8 +69,13 @@ def subgoals_at(cells: Int32[Array, "S 2"], mask: Bool[Array, " S"], height: int
 
     Returns:
       The subgoals.
+
+    Raises:
+      ProblemError: the cells are no whole numbers, or cells and mask are not of as many subgoals.
     """
+    cells = whole_numbers(cells, "cells", ProblemError)
     count = mask.shape[0]
+    require_shapes({"mask": (mask, (count,)), "cells": (cells, (count, 2))}, "the mask has one entry a subgoal")
     return Subgoals(
         cells=cells,
         mask=mask,
@@ -103,7 +110,7 @@ def decide_from_estimates(
         them, or they are the caller's own, by ``subgoals_at``.
       estimates: P_S, R_S and R_F for these subgoals, in their order.
       task: arrays of the task.
-      cell: the robot's cell.
+      cell: the robot's cell, which the belief knows to be free.
       state: the automaton's state, the letter of the robot's cell read.
       key: drives the search where it samples (``UctConfig``).
       config: settings; ``config.frontiers`` counts where no action is available and the robot falls back on the
@@ -113,44 +120,25 @@ def decide_from_estimates(
 
     Returns:
       The move, with what the search considered. Where an input holds a value that is not allowed (an estimate of a real
-      subgoal and class, a real subgoal outside of the map, the cell, the state, a letter, the resolution), ``status``
-      has ``INVALID`` and ``action`` is ``NO_ACTION``. With wrong estimates alone the move is that of the baseline,
-      which asks none; otherwise there is none.
+      subgoal and class, a real subgoal outside of the map, a cell that is not free, the state, a letter, the
+      resolution), ``status`` has ``INVALID`` and ``action`` is ``NO_ACTION``. With wrong estimates alone the move is
+      that of the baseline, which asks none; otherwise there is none.
 
     Raises:
       EstimatesError: an array of the estimates has another shape than ``[S, C]``.
       ProblemError: another argument has a wrong shape.
       PropositionsError: belief and task are not over the same propositions.
     """
-    cell, state = whole_numbers(cell, "cell", ProblemError), whole_numbers(state, "state", ProblemError)
-    _check_shapes(belief, subgoals, cell, state)
-    check_shapes(estimates, subgoals.mask.shape[0], task.class_mask.shape[0])
     # Assessed again, although the caller may have called `frontier_subgoals`: arrays in between are the caller's.
     situation = assess(belief, cell, state, task, config.frontiers, config.irrevocable_last)
+    require_shapes({"subgoals.cells": (subgoals.cells, (*subgoals.mask.shape, 2))}, "the mask has one entry a subgoal")
+    check_shapes(estimates, subgoals.mask.shape[0], task.class_mask.shape[0])
     # The frontiers themselves stay those of the belief: they count where no action is available.
     given = dataclasses.replace(situation.subgoals, cells=subgoals.cells, mask=subgoals.mask)
     # Outside of the map an index would be clamped, and the distances of another cell be taken for those of the subgoal.
     outside = status_if(jnp.any(subgoals.mask & ~is_in_map(subgoals.cells, belief)), Status.INVALID)
     situation = dataclasses.replace(situation, subgoals=given, status=situation.status | outside)
     return search_move(situation.with_status_of(estimates), estimates, key, config, intention)
-
-
-def _check_shapes(belief: BeliefMap, subgoals: Subgoals, cell: Int32[Array, "*_"], state: Int32[Array, "*_"]) -> None:
-    """Check what the caller brings, while tracing; raises ProblemError for what does not fit the map or the mask."""
-    count, grid = subgoals.mask.shape, belief.cells.shape
-    expected = {
-        "belief.letters": (belief.letters, grid),
-        "belief.resolution": (belief.resolution, ()),
-        "belief.extent": (belief.extent, (2,)),
-        "subgoals.cells": (subgoals.cells, (*count, 2)),
-        "cell": (cell, (2,)),
-        "state": (state, ()),
-    }
-    for name, (array, shape) in expected.items():
-        if jnp.shape(array) != shape:
-            raise ProblemError(
-                f"{name} has shape {jnp.shape(array)}, expected {shape}: the map is {grid}, the subgoals' mask {count}"
-            )
 
 
 decide_from_estimates_jit = jax.jit(decide_from_estimates, static_argnames="config")

@@ -126,12 +126,14 @@ def move_to(
     )
     # What was cut off among the subgoals, or forgotten by the estimator, concerns every move that was chosen here.
     bits = status_array() if status is None else status
+    # What a search found stays beside its move, also where the robot stays: it is what the task costs by it.
+    cost = value if search is not None else jnp.where(goes, value, jnp.inf)
     return Move(
         kind=kind.astype(jnp.int32),
         target_cell=cell,
         target_state=state,
         action=jnp.int32(NO_ACTION) if action is None else action,
-        value=value,
+        value=cost,
         path=path,
         subgoals=situation.subgoals,
         search=search,

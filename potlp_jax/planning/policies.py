@@ -83,7 +83,7 @@ def decide(
 
     Args:
         belief: what is known of the map.
-        cell: the robot's cell.
+        cell: the robot's cell, which the belief knows to be free.
         state: the automaton's state, the letter of the robot's cell read.
         task: arrays of the task, ``task.arrays``.
         estimator: answers P_S, R_S and R_F for the policies that ask; None for the others.
@@ -93,13 +93,14 @@ def decide(
         config: settings; static.
 
     Returns:
-        The move; its path has length 0 where the target is out of reach.
+        The move; its path has length 0 where the target is out of reach. Where cell, state, a letter or the resolution
+        is not allowed, ``status`` has ``INVALID`` and the kind is NONE.
 
     Raises:
         PropositionsError: belief, task and estimator are not over the same propositions.
         ValueError: the policy searches and there is no estimator.
         EstimatesError: the estimator's answer has other shapes than were asked for.
-        ProblemError: cell or state are no whole numbers, or the task is not its arrays.
+        ProblemError: cell or state are no whole numbers, the task is not its arrays, or an array has another shape.
         PluginError: there is no policy of the name, or the user's returned no move.
     """
     situation = assess(belief, cell, state, task, config.frontiers, config.irrevocable_last)
@@ -315,6 +316,9 @@ def _optimistic(situation: Situation, config: DecisionConfig) -> Move:
     )[0]
     accepted = jnp.where(task.accepting[None, None, :], distances, jnp.inf)
     target_cell, target_state = cell_and_state(jnp.argmin(accepted.reshape(-1)), accepted.shape)
+    # Where no move follows from the inputs the path leads to where the robot is, as that of `move_to` does.
+    target_cell = jnp.where(situation.is_valid, target_cell, situation.cell)
+    target_state = jnp.where(situation.is_valid, target_state, situation.state)
     path = shortest_path(
         distances,
         situation.transitions,
@@ -338,7 +342,7 @@ def _optimistic(situation: Situation, config: DecisionConfig) -> Move:
         target_cell=known.cells[known.length],
         target_state=known.states[known.length],
         action=jnp.int32(NO_ACTION),
-        value=path.cost,
+        value=jnp.where(kind == MoveKind.NONE, jnp.inf, path.cost),
         path=known,
         subgoals=situation.subgoals,
         search=None,
@@ -362,11 +366,11 @@ def _unless_withheld(situation: Situation, move: Move, config: DecisionConfig) -
 
 def _cut_before_unobserved(path: KnownPath, belief: BeliefMap) -> KnownPath:
     """The part of a path before its first unobserved cell: a path never enters one (docs/model.md section 7)."""
-    # The first cell is the robot's own, which it has observed, so that at least that remains.
+    # The first cell is the robot's own: it remains, also where no move is valid because it has not been observed.
     hidden = belief.unknown[path.cells[:, 0], path.cells[:, 1]]
     index = jnp.arange(hidden.shape[0], dtype=jnp.int32)
     first_hidden = jnp.min(jnp.where(hidden, index, path.length + 1))
-    length = jnp.minimum(path.length, first_hidden - 1)
+    length = jnp.minimum(path.length, jnp.maximum(first_hidden - 1, 0))
     kept = jnp.minimum(index, length)
     return dataclasses.replace(path, cells=path.cells[kept], states=path.states[kept], length=length)
 

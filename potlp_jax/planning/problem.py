@@ -15,6 +15,7 @@ from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float32, Int32
 
 from potlp_jax.errors import ProblemError
+from potlp_jax.planning.shapes import check_arrays, check_task, last_axis
 from potlp_jax.precision import in_32_bits
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_CLASS
@@ -155,7 +156,7 @@ class PlanningProblem:
         """Validate one unbatched problem on the host: the rules of ``screen``, with a message.
 
         Raises:
-          ProblemError: shapes do not agree, or a value is not allowed; the first such value is named.
+          ProblemError: shapes or types do not agree, or a value is not allowed; the first such value is named.
         """
         # Shapes first: the masks of values below rely on them.
         check_shapes(self)
@@ -240,37 +241,21 @@ def take_rows(values: Array, index: Int32[Array, "*N"]) -> Array:
 
 
 def check_shapes(problem: PlanningProblem, batch: tuple[int, ...] = ()) -> None:
-    """Check that the arrays of a problem fit together; also while tracing, when shapes are all that is known.
+    """Check that the arrays of a problem fit together; also while tracing, when shapes and types are all that is known.
+
+    Arrays of 64 bits pass: the searches round them.
 
     Args:
       problem: its subgoal mask and its task give the sizes that all other arrays must have.
-      batch: leading axes that every array has.
+      batch: leading axes that every array has, those of the task too.
 
     Raises:
-      ProblemError: an array has another shape; the message names it, its shape and the one expected.
+      ProblemError: an array has another shape or type; the message names it, what was found and what is expected.
     """
     # The mask gives S, so that it must be an array with an axis before anything is compared with it.
-    mask, task = problem.subgoal_mask.shape, problem.task
-    if len(mask) != len(batch) + 1 or mask[:-1] != batch:
-        raise ProblemError(f"subgoal_mask has shape {mask}, expected {(*batch, 'S')} for S subgoals")
-    subgoals, states, classes = mask[-1], task.state_mask.shape[-1], task.class_mask.shape[-1]
-    expected = {
-        "travel": (subgoals + 1, states, subgoals, states),
-        "finish": (subgoals + 1, states),
-        "success_probability": (subgoals, classes),
-        "success_cost": (subgoals, classes),
-        "failure_cost": (subgoals, classes),
-        "dfa_state": (),
-        "dead_end_cost": (),
-    }
+    subgoals = last_axis("subgoal_mask", problem.subgoal_mask, batch, ("S",))
     # Not left to broadcasting: [S, 1] would pass for the same answer to every class.
-    for name, shape in expected.items():
-        found = getattr(problem, name).shape
-        if found != (*batch, *shape):
-            raise ProblemError(
-                f"{name} has shape {found}, expected {(*batch, *shape)}: {subgoals} subgoals (from subgoal_mask), "
-                f"{states} states and {classes} outcome classes (from the task)"
-            )
+    check_arrays(problem, check_task(problem.task, batch) | {"S": subgoals, "S1": subgoals + 1}, batch)
 
 
 def _present_entries(problem: PlanningProblem) -> dict[str, Bool[Array, "..."]]:

@@ -13,7 +13,7 @@ from flax import struct
 from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
-from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, require_fields
+from potlp_jax.checks import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, as_python_numbers, require_fields
 from potlp_jax.errors import ProblemError
 from potlp_jax.planning.distances.product import (
     distance_table,
@@ -25,6 +25,7 @@ from potlp_jax.planning.distances.product import (
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
+from potlp_jax.planning.shapes import check_task, require_shapes
 from potlp_jax.precision import whole_numbers
 from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import TaskArrays
@@ -44,8 +45,8 @@ class DecisionConfig:
       commitment: hysteresis: fraction of its expected cost by which another action must be cheaper before the robot
         switches to it. 0: it switches at once, as published. The default was chosen on validation worlds, against
         0, 30 % and fixed numbers of cells (docs/results/panorama.md, "Commitment").
-      least_chance: share of the largest P_S of a class below which a subgoal is no way to it (``worthwhile``). 0: all
-        count, as published.
+      least_chance: share of the largest P_S of a class, among the subgoals in reach, below which a subgoal is no way to
+        it (``worthwhile``). 0: all count, as published.
       irrevocable_last: an irrevocable move is made only on a known path to acceptance, or where no frontier can be
         reached without one (docs/model.md section 7). False: it is weighed like any other move.
       path_horizon: moves in the path of one decision, at most; None means ``4 (H + W)``.
@@ -66,7 +67,8 @@ class DecisionConfig:
         require_fields(self, ("commitment",), NOT_NEGATIVE, ValueError)
         require_fields(self, ("least_chance",), SHARE, ValueError)
         if self.path_horizon is not None:
-            require_fields(self, ("path_horizon",), AT_LEAST_ONE, ValueError)
+            require_fields(self, ("path_horizon",), COUNT, ValueError)
+            as_python_numbers(self, ("path_horizon",))
 
     def horizon(self, height: int, width: int) -> int:
         """Moves in the path of one decision on a map of this size."""
@@ -143,7 +145,7 @@ def assess(
 
     Args:
       belief: what is known of the map.
-      cell: the robot's cell.
+      cell: the robot's cell, which the belief knows to be free.
       state: the automaton's state, the letter of the robot's cell read.
       task: arrays of the task.
       config: how frontiers become subgoals.
@@ -154,11 +156,13 @@ def assess(
 
     Raises:
       PropositionsError: belief and task are not over the same propositions; while tracing, under jit.
-      ProblemError: cell or state are no whole numbers, or the task is not its arrays.
+      ProblemError: cell or state are no whole numbers, the task is not its arrays, or an array has another shape.
     """
     if not isinstance(task, TaskArrays):
         raise ProblemError(f"the task is a {type(task).__name__}; give its arrays, task.arrays")
     cell, state = whole_numbers(cell, "cell", ProblemError), whole_numbers(state, "state", ProblemError)
+    _check_shapes(belief, cell, state)
+    check_task(task)
     belief = dataclasses.replace(belief, resolution=jnp.asarray(belief.resolution, jnp.float32))
     # Every decision, of every policy, begins here: what follows reads letters with the task's tables.
     require_same_propositions(task.propositions, belief.propositions, knower="the belief")
@@ -203,6 +207,21 @@ def assess(
         finish_cost=finish_cost,
         status=subgoals.status | status_if(~_can_be_assessed(belief, cell, state, task), Status.INVALID),
     )
+
+
+def _check_shapes(belief: BeliefMap, cell: Array, state: Array) -> None:
+    """Raise ProblemError, while tracing, where map, cell and state are not those of one robot."""
+    grid = jnp.shape(belief.cells)
+    if len(grid) != 2:
+        raise ProblemError(f"belief.cells has shape {grid}, expected ('H', 'W'): one map")
+    expected = {
+        "belief.letters": (belief.letters, grid),
+        "belief.resolution": (belief.resolution, ()),
+        "belief.extent": (belief.extent, (2,)),
+        "cell": (cell, (2,)),
+        "state": (state, ()),
+    }
+    require_shapes(expected, f"the map is {grid}")
 
 
 # Under vmap the maps are taken one after the other, so that ``cond`` runs one branch only: a task without irrevocable
@@ -251,7 +270,9 @@ def _can_be_assessed(
     """Whether cell, state, letters and resolution are what the map and the task allow."""
     # An index out of range is clamped on the device, and would be answered as if it were another.
     states, letters = task.transitions.shape
-    is_cell = is_in_map(cell, belief)
+    # No path begins in a cell that is not free: moves out of it would cut its own corners.
+    height, width = belief.cells.shape
+    is_cell = is_in_map(cell, belief) & belief.free[jnp.clip(cell[0], 0, height - 1), jnp.clip(cell[1], 0, width - 1)]
     is_state = (state >= 0) & (state < states) & task.state_mask[jnp.clip(state, 0, states - 1)]
     are_letters = jnp.all((belief.letters >= 0) & (belief.letters < letters))
     is_length = (belief.resolution > 0.0) & jnp.isfinite(belief.resolution)
@@ -277,9 +298,10 @@ def planning_problem(situation: Situation, estimates: Estimates, config: Decisio
       The unbatched problem.
     """
     task, subgoals = situation.task, situation.subgoals
-    estimates = worthwhile(estimates, subgoals, config.least_chance)
-    travel, finish = _subgoal_travel(situation, estimates)
     at_subgoals = situation.distances[subgoals.cells[:, 0], subgoals.cells[:, 1]]
+    in_reach = subgoals.mask & jnp.any(jnp.isfinite(at_subgoals), axis=1)
+    estimates = worthwhile(estimates, in_reach, config.least_chance)
+    travel, finish = _subgoal_travel(situation, estimates)
     # The robot's node has its own state alone: no rollout is there in another.
     at_robot = jnp.arange(task.transitions.shape[0])[:, None, None] == situation.state
     robot_travel = jnp.where(at_robot & subgoals.mask[None, :, None], at_subgoals[None], jnp.inf)
@@ -301,25 +323,27 @@ def planning_problem(situation: Situation, estimates: Estimates, config: Decisio
     )
 
 
-def worthwhile(estimates: Estimates, subgoals: Subgoals, least_chance: float) -> Estimates:
-    """The estimates without subgoals that are hardly a way to a class while there are far better ones.
+def worthwhile(estimates: Estimates, in_reach: Bool[Array, " S"], least_chance: float) -> Estimates:
+    """The estimates without subgoals that are hardly a way to a class while there are far better ones in reach.
 
     The model takes attempts to be independent of each other, and adds up chances that are one: thirty dark rooms, each
     of which may have a second door to the one hallway that was not seen, are thirty chances to get there. Behind doors
     that the robot stands before, such chances cost little and are tried first; there is always a next one.
 
+    A subgoal that the robot cannot get to is no measure of others: it is never tried, so that they would never count.
+
     Args:
       estimates: of every subgoal and class; masked entries may hold anything.
-      subgoals: those that are asked about.
-      least_chance: share of the largest P_S of a class; below it P_S counts as 0.
+      in_reach: True on the real subgoals that a permitted move of the robot can lead to, in some state.
+      least_chance: share of the largest P_S of a class among those in reach; below it P_S counts as 0.
 
     Returns:
-      The estimates; the largest P_S of each class is always left.
+      The estimates; the largest P_S of each class in reach is always left.
     """
     if least_chance == 0.0:
         return estimates
     chance = estimates.success_probability
-    best = jnp.max(jnp.where(subgoals.mask[:, None], chance, 0.0), axis=0, keepdims=True)
+    best = jnp.max(jnp.where(in_reach[:, None], chance, 0.0), axis=0, keepdims=True)
     kept = jnp.where(chance < jnp.float32(least_chance) * best, 0.0, chance)
     return dataclasses.replace(estimates, success_probability=kept)
 

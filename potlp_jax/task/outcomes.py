@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int32
 
+from potlp_jax.checks import is_whole
 from potlp_jax.errors import TaskError
 from potlp_jax.task.automaton import Dfa
 from potlp_jax.task.guards import Phi, cube_letters, hull, minimal_cover
@@ -124,8 +125,8 @@ def find_outcomes(dfa: Dfa, max_positive_literals: int | None = None) -> Outcome
         Edges in lexicographic order, their conditions, and the outcome classes that these are made of.
 
     Raises:
-        TaskError: acceptance becomes unreachable because of ``max_positive_literals``, or there are more than
-            ``MAX_CLASSES`` outcome classes.
+        TaskError: ``max_positive_literals`` is no whole number from 0, acceptance becomes unreachable because of it,
+            or there are more than ``MAX_CLASSES`` outcome classes.
     """
     # Before cubes are dropped: afterwards a state without edges may as well be one that no letter keeps.
     if max_positive_literals is not None:
@@ -242,6 +243,8 @@ def _check_reachable(dfa: Dfa, max_positive_literals: int) -> None:
     A guard keeps a cube exactly if it holds such a letter, so this also covers states that no edge leaves
     because no letter stays there.
     """
+    if not is_whole(max_positive_literals):
+        raise TaskError(f"max_positive_literals is {max_positive_literals!r}: it must be None or a whole number")
     if max_positive_literals < 0:
         raise TaskError(f"max_positive_literals is {max_positive_literals}: it must be None or at least 0")
     letters = _allowed_letters(dfa, max_positive_literals)

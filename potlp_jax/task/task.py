@@ -225,7 +225,7 @@ class Task:
             propositions=propositions,
             dfa=dfa,
             outcomes=find_outcomes(dfa, max_positive_literals),
-            max_positive_literals=max_positive_literals,
+            max_positive_literals=None if max_positive_literals is None else int(max_positive_literals),
             structure=structure,
         )
 

@@ -21,6 +21,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
+from potlp_jax.checks import COUNT, as_python_numbers
 from potlp_jax.native import by_platform, target
 from potlp_jax.precision import in_32_bits
 from potlp_jax.types import NO_SUBGOAL, UNREACHABLE, Status, status_if
@@ -77,12 +78,11 @@ class FrontierConfig:
     most_subgoals: int = 512
 
     def __post_init__(self) -> None:
-        if not all(
-            isinstance(size, int) and size >= 1 for size in (self.max_subgoals, self.min_size, self.most_subgoals)
-        ):
+        if not all(COUNT.allows(size) for size in (self.max_subgoals, self.min_size, self.most_subgoals)):
             raise ValueError(
                 f"max_subgoals, min_size and most_subgoals must be whole numbers of at least 1, found {self}"
             )
+        as_python_numbers(self, ("max_subgoals", "min_size", "most_subgoals"))
 
     def grown(self) -> "FrontierConfig | None":
         """With an array of the next length, None where it is as long as it may become."""

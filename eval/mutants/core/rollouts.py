@@ -169,7 +169,7 @@ MUTANTS = (
         PART,
         "small chances: what pads the subgoals is a measure of the others",
         _SITUATION,
-        "jnp.where(subgoals.mask[:, None], chance, 0.0), axis=0",
+        "jnp.where(in_reach[:, None], chance, 0.0), axis=0",
         "chance, axis=0",
         ("tests/test_worthwhile.py",),
     ),

@@ -7,9 +7,12 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 
+from potlp_jax.errors import ProblemError
 from potlp_jax.native import by_platform, target
 from potlp_jax.planning.distances.bucket_search import wildcard_arrays
 from potlp_jax.planning.distances.sweeping import Wildcard
+from potlp_jax.planning.shapes import require_shapes
+from potlp_jax.precision import whole_numbers
 from potlp_jax.world.moves import LENGTHS, NEIGHBOURS, sides_free
 
 
@@ -59,7 +62,29 @@ def shortest_path(
 
     Returns:
         The path, padded to ``horizon + 1`` product states.
+
+    Raises:
+        ProblemError: an array has another shape, or cells or states are no whole numbers.
     """
+    source_cell, target_cell = (
+        whole_numbers(cell, name, ProblemError)
+        for name, cell in (("source_cell", source_cell), ("target_cell", target_cell))
+    )
+    source_state, target_state = (
+        whole_numbers(state, name, ProblemError)
+        for name, state in (("source_state", source_state), ("target_state", target_state))
+    )
+    require_shapes(
+        {
+            "distances": (distances, transitions.shape),
+            "free": (free, transitions.shape[:2]),
+            "source_cell": (source_cell, (2,)),
+            "source_state": (source_state, ()),
+            "target_cell": (target_cell, (2,)),
+            "target_state": (target_state, ()),
+        },
+        f"the product is {transitions.shape}",
+    )
     # Not within the walk: a product that is added at once may be rounded only after the sum.
     steps = jnp.asarray(LENGTHS, jnp.float32) * resolution
     ends = (source_cell, source_state, target_cell, target_state)

@@ -17,11 +17,13 @@ import jax.numpy as jnp
 from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Bool, Float32, Int32
 
+from potlp_jax.errors import ProblemError
 from potlp_jax.native import by_platform
 from potlp_jax.planning.distances.bucket_search import searched_distances, searched_table
 from potlp_jax.planning.distances.portals import find_active_cells, portals_pay, table_by_portals
 from potlp_jax.planning.distances.sweeping import Links, Sweeper, Wildcard
-from potlp_jax.precision import in_32_bits
+from potlp_jax.planning.shapes import require_shapes
+from potlp_jax.precision import in_32_bits, whole_numbers
 from potlp_jax.task.relations import transitive_closure
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.types import NO_STATE
@@ -85,7 +87,12 @@ def product_distances(
 
     Returns:
         Costs by source, cell and state; ``inf`` where there is no path.
+
+    Raises:
+        ProblemError: an array has another shape, or cells or states are no whole numbers.
     """
+    source_cells, source_states = _checked_sources(source_cells, source_states)
+    _require_map(free, transitions.shape[:2])
     # As plain arrays: vmap puts marks in their place, which are none.
     letters = None if wildcard is None else (wildcard.cells, wildcard.successors)
     return _product_distances(transitions, free, source_cells, source_states, jnp.asarray(resolution), letters)
@@ -146,7 +153,15 @@ def distance_table(
     Returns:
         Costs by source, target and state at the target, and by source the cost of the nearest accepting product state;
         ``inf`` where there is no path.
+
+    Raises:
+        ProblemError: an array has another shape, or cells or states are no whole numbers.
     """
+    source_cells, source_states = _checked_sources(source_cells, source_states)
+    target_cells = whole_numbers(target_cells, "target_cells", ProblemError)
+    states = transitions.shape[2]
+    _require_map(free, transitions.shape[:2])
+    require_shapes({"target_cells": (target_cells, (*target_cells.shape[:1], 2)), "accepting": (accepting, (states,))})
     return _distance_table(
         transitions, free, accepting, source_cells, source_states, target_cells, jnp.asarray(resolution)
     )
@@ -257,7 +272,12 @@ def distances_per_source(
 
     Returns:
         Costs by state, cell and source; ``inf`` where there is no path.
+
+    Raises:
+        ProblemError: an array has another shape, or cells or states are no whole numbers.
     """
+    source_cells, source_states = _checked_sources(source_cells, source_states)
+    _require_map(free, transitions.shape[1:3])
     return _distances_per_source(transitions, free, source_cells, source_states, jnp.asarray(resolution))
 
 
@@ -301,7 +321,11 @@ def grid_distances(
 
     Returns:
         Costs; ``inf`` where unreachable.
+
+    Raises:
+        ProblemError: the cell is none.
     """
+    require_shapes({"cell": (cell, (2,))})
     # A product with one state that every free cell keeps.
     transitions = jnp.where(free, 0, NO_STATE)[:, :, None]
     source = jnp.zeros((1,), jnp.int32)
@@ -322,13 +346,29 @@ def reachable_cells(
 
     Returns:
         True on the cells that can be reached, the source among them.
+
+    Raises:
+        ProblemError: an array has another shape.
     """
+    require_shapes({"cell": (cell, (2,)), "within": (within, free.shape)})
     within = within.at[cell[0], cell[1]].set(True)
     costs = jnp.where(within, 0.0, jnp.inf).astype(jnp.float32)[:, :, None]
     leads_out = free & ~within & jnp.isfinite(Links(free).cheapest_arrival(costs)[:, :, 0])
     return jax.lax.cond(
         jnp.any(leads_out), lambda: jnp.isfinite(grid_distances(free, cell, jnp.float32(1.0))), lambda: within
     )
+
+
+def _checked_sources(cells: Array, states: Array) -> tuple[Int32[Array, "Q 2"], Int32[Array, " Q"]]:
+    """Sources as the kernels take them: they read as many cells as there are states."""
+    cells = whole_numbers(cells, "source_cells", ProblemError)
+    states = whole_numbers(states, "source_states", ProblemError)
+    require_shapes({"source_states": (states, (states.size,)), "source_cells": (cells, (states.size, 2))})
+    return cells, states
+
+
+def _require_map(free: Array, shape: tuple[int, ...]) -> None:
+    require_shapes({"free": (free, shape)}, f"the transitions are of a map of {shape} cells")
 
 
 def _layers_first(transitions: Int32[Array, "H W Z"]) -> Int32[Array, "Z H W 1"]:

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int32, Key, PRNGKeyArray, UInt32
 
+from potlp_jax.errors import ProblemError
 from potlp_jax.planning.problem import PlanningProblem, check_shapes
 from potlp_jax.planning.search.best_first import BEST_FIRST
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
@@ -25,7 +26,8 @@ from potlp_jax.planning.search.graph import Tree
 from potlp_jax.planning.search.lockstep import SearchMethod, run_search
 from potlp_jax.planning.search.plan import Plan
 from potlp_jax.planning.search.uct import UCT, UctTree
-from potlp_jax.precision import in_32_bits
+from potlp_jax.planning.shapes import require_shapes
+from potlp_jax.precision import in_32_bits, whole_numbers
 
 
 @in_32_bits
@@ -58,7 +60,7 @@ def plan_actions(
       The plan.
 
     Raises:
-      ProblemError: the shapes of the problem's arrays do not agree.
+      ProblemError: shapes or types of the problem's arrays do not agree, or ``simulations`` is no whole number.
     """
     return _search_one(problem, key, config, None, simulations, with_trees=False)[0]
 
@@ -85,7 +87,8 @@ def search_tree(
       The plan and the tree: ``Tree`` under ``BestFirstConfig``, ``UctTree`` under ``UctConfig``.
 
     Raises:
-      ProblemError: the shapes of the problem's arrays do not agree.
+      ProblemError: shapes or types of the problem's arrays do not agree, ``simulations`` is no whole number, or the
+        tree is of another search, capacity or size of problem.
     """
     return _search_one(problem, key, config, tree, simulations, with_trees=True)
 
@@ -111,11 +114,13 @@ def search(
       Plans and trees with the leading axis B.
 
     Raises:
-      ProblemError: the shapes of the problems' arrays do not agree.
+      ProblemError: as in ``search_tree``.
     """
     check_shapes(problems, keys.shape)
+    _check_tree(trees, problems, config, keys.shape)
+    budgets = _budgets(simulations, keys.shape)
     seeds = jax.vmap(_seed)(keys)
-    return run_search(_search_for(config), config, problems, seeds, trees, budgets=simulations)
+    return run_search(_search_for(config), config, problems, seeds, trees, budgets=budgets)
 
 
 def _search_one(
@@ -127,11 +132,36 @@ def _search_one(
     with_trees: bool,
 ) -> tuple[Plan, Any]:
     check_shapes(problem)
-    budget = None if simulations is None else jnp.asarray(simulations, jnp.int32)
+    _check_tree(tree, problem, config, ())
+    budget = _budgets(simulations, ())
     # One problem is a batch of one: there is one kernel.
     problems, seeds, trees, budgets = jax.tree.map(lambda leaf: leaf[None], (problem, _seed(key), tree, budget))
     found = run_search(_search_for(config), config, problems, seeds, trees, with_trees, budgets)
     return jax.tree.map(lambda leaf: leaf[0], found)
+
+
+def _budgets(simulations: Int32[Array, "*B"] | int | None, batch: tuple[int, ...]) -> Int32[Array, "*B"] | None:
+    """The simulations that were asked for; raises ProblemError for what is no whole number for each problem."""
+    if simulations is None:
+        return None
+    budgets = whole_numbers(simulations, "simulations", ProblemError)
+    require_shapes({"simulations": (budgets, batch)}, "one number for each problem")
+    return budgets
+
+
+def _check_tree(
+    tree: Tree | UctTree | None, problem: PlanningProblem, config: BestFirstConfig | UctConfig, batch: tuple[int, ...]
+) -> None:
+    """Raise ProblemError, while tracing, for a tree that this search cannot go on with."""
+    if tree is None:
+        return
+    wanted, settings = _search_for(config).tree, type(config).__name__
+    if not isinstance(tree, wanted):
+        raise ProblemError(f"the tree is of type {type(tree).__name__}; {settings} goes on with {wanted.__name__}")
+    # Behind the nodes lies one spare node.
+    shape = (*batch, config.capacity + 1, problem.action_count)
+    why = f"a tree of {config.capacity} nodes (the capacity of {settings}) and {problem.action_count} actions"
+    require_shapes({"tree.q_values": (tree.q_values, shape)}, why)
 
 
 def plan_within(

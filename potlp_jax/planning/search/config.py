@@ -6,6 +6,8 @@ Each has a ``kind`` that says the same as text, for records and settings files: 
 import dataclasses
 from typing import Literal
 
+from potlp_jax.checks import COUNT, NOT_NEGATIVE, SHARE, as_python_numbers
+
 
 @dataclasses.dataclass(frozen=True)
 class BestFirstConfig:
@@ -34,8 +36,8 @@ class BestFirstConfig:
 
     def __post_init__(self) -> None:
         _check_kind(self, "best-first")
-        _check_at_least_one(self, "simulations", "max_depth", "tree_capacity", "guess_failures")
-        if not 0 <= self.optimism <= 1:
+        _check_counts(self, "simulations", "max_depth", "tree_capacity", "guess_failures")
+        if not SHARE.allows(self.optimism):
             raise ValueError(f"BestFirstConfig.optimism is {self.optimism}, must lie in [0, 1]")
 
     @property
@@ -73,9 +75,10 @@ class UctConfig:
 
     def __post_init__(self) -> None:
         _check_kind(self, "uct")
-        _check_at_least_one(self, "simulations", "max_depth", "tree_capacity")
-        if not self.exploration >= 0:
-            raise ValueError(f"UctConfig.exploration is {self.exploration}, must not be negative")
+        _check_counts(self, "simulations", "max_depth", "tree_capacity")
+        # With infinity no action would look better than another, and the first one would be taken again and again.
+        if not NOT_NEGATIVE.allows(self.exploration):
+            raise ValueError(f"UctConfig.exploration is {self.exploration}, must be finite and not negative")
 
     @property
     def capacity(self) -> int:
@@ -89,8 +92,9 @@ def _check_kind(config: BestFirstConfig | UctConfig, kind: str) -> None:
         raise ValueError(f"{type(config).__name__}.kind is {config.kind!r}, must be {kind!r}")
 
 
-def _check_at_least_one(config: BestFirstConfig | UctConfig, *names: str) -> None:
+def _check_counts(config: BestFirstConfig | UctConfig, *names: str) -> None:
     for name in names:
         value = getattr(config, name)
-        if value is not None and not (isinstance(value, int) and value >= 1):
-            raise ValueError(f"{type(config).__name__}.{name} is {value}, must be a whole number of at least 1")
+        if not (COUNT.allows(value) or (value is None and name == "tree_capacity")):
+            raise ValueError(f"{type(config).__name__}.{name} is {value}, must be {COUNT.wanted}")
+    as_python_numbers(config, names)

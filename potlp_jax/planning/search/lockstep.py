@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int32, UInt32
 
-from potlp_jax.native import by_platform
+from potlp_jax.native import by_platform, without_derivative
 from potlp_jax.planning.problem import PlanningProblem, screen
 from potlp_jax.planning.search.plan import Plan
 from potlp_jax.planning.sharding import vary_alike
@@ -83,7 +83,8 @@ def run_search(
     Returns:
       Plans and trees with the leading axis B; None for trees that are not wanted.
     """
-    leaves, structure = jax.tree.flatten(problems)
+    # Not every search has a kernel, and jax would say of a loop no more than that it failed.
+    leaves, structure = jax.tree.flatten(jax.tree.map(without_derivative, problems))
     most = jnp.full(seeds.shape[:1], config.simulations, jnp.int32)
     budgets = most if budgets is None else jnp.clip(budgets.astype(jnp.int32), 1, most)
     kernel = _routed_kernel(search, config, structure, len(leaves), with_trees)
@@ -122,9 +123,9 @@ def _routed_kernel(
             for array, batched in zip(arrays, in_batched, strict=True)
         ]
         # Merged with the axis of an outer vmap, if there is one: nesting ends in one kernel all the same.
-        rows = full[0].shape[0] * full[0].shape[1]
-        results = kernel(*[array.reshape(rows, *array.shape[2:]) for array in full])
-        split = [result.reshape(axis_size, rows // max(axis_size, 1), *result.shape[1:]) for result in results]
+        inner = full[0].shape[1]
+        results = kernel(*[array.reshape(axis_size * inner, *array.shape[2:]) for array in full])
+        split = [result.reshape(axis_size, inner, *result.shape[1:]) for result in results]
         return split, [True] * len(split)
 
     return kernel
