@@ -158,7 +158,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "worst-school": Experiment(
         page="delivery",
         command="python -m eval.limit.worst {all}/delivery/school --out {out} --trials 10 --buildings 8 "
-        "--report docs/results/delivery/worst_school",
+        "--report {out}/worst",
     ),
     "real-maps": Experiment(
         page="delivery",
@@ -172,18 +172,15 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     "worst-gdc": Experiment(
         page="delivery",
-        command="python -m eval.limit.worst {all}/real-maps/gdc_3ne --out {out} --trials 10 "
-        "--report docs/results/real_maps/gdc_worst",
+        command="python -m eval.limit.worst {all}/real-maps/gdc_3ne --out {out} --trials 10 --report {out}/worst",
     ),
     "worst-uma": Experiment(
         page="delivery",
-        command="python -m eval.limit.worst {all}/real-maps/uma_rooms --out {out} --trials 10 "
-        "--report docs/results/real_maps/uma_worst",
+        command="python -m eval.limit.worst {all}/real-maps/uma_rooms --out {out} --trials 10 --report {out}/worst",
     ),
     "worst-intel": Experiment(
         page="delivery",
-        command="python -m eval.limit.worst {all}/real-maps/intel_lab --out {out} --trials 10 "
-        "--report docs/results/real_maps/intel_worst",
+        command="python -m eval.limit.worst {all}/real-maps/intel_lab --out {out} --trials 10 --report {out}/worst",
     ),
     # Each shipped recipe from nothing, and what its stages keep: how long one has to train.
     "recipe-firefighting": Experiment(
