@@ -27,7 +27,7 @@ FOLDERS = "docs|eval|tests|examples|notebooks|train|potlp_jax"
 OTHERS = {
     "pip": {"--no-deps", "--no-cache-dir", "--disable-pip-version-check"},
     "venv, build and twine": {"--clear", "--outdir", "--strict"},
-    "git": {"--porcelain"},
+    "git": {"--porcelain", "--error-unmatch"},
     "CSS": {"--faint"},
     "XLA": {"--xla"},
     "dask": {"--nthreads", "--host", "--port", "--no-dashboard", "--no-nanny", "--death-timeout"},

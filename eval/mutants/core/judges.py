@@ -11,6 +11,24 @@ _ALONE = "not sweep and not command and not row"
 MUTANTS = (
     Mutant(
         PART,
+        "a sweep goes on with rows of worlds that have changed",
+        "potlp_jax/sweep/runner.py",
+        "if not self.work.is_of(row):",
+        "if False:",
+        ("tests/test_sweep.py",),
+        "has_changed",
+    ),
+    Mutant(
+        PART,
+        "a world whose known path is longer than the budget is impossible",
+        "potlp_jax/sweep/work.py",
+        "trial.outcome is not Outcome.INFEASIBLE",
+        "trial.outcome is Outcome.SATISFIED",
+        ("tests/test_sweep.py",),
+        "longer_than_the_budget",
+    ),
+    Mutant(
+        PART,
         "the auditor sees no violation",
         _AUDIT,
         "if len(word) > 1 and violated:",

@@ -175,6 +175,14 @@ MUTANTS = (
     ),
     Mutant(
         PART,
+        "small chances: a subgoal that is barred is a measure of the others",
+        _SITUATION,
+        "in_reach = subgoals.mask & jnp.any(jnp.isfinite(at_subgoals), axis=1)",
+        "in_reach = subgoals.mask",
+        ("tests/test_worthwhile.py",),
+    ),
+    Mutant(
+        PART,
         "small chances: the best of all classes is the measure of each",
         _SITUATION,
         "chance, 0.0), axis=0, keepdims=True)",

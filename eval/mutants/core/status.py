@@ -11,6 +11,15 @@ _RULES = "potlp_jax/trials/rules.py"
 MUTANTS = (
     Mutant(
         PART,
+        "arrays of another type are read as they are",
+        "potlp_jax/planning/shapes.py",
+        "if narrow_type(array.dtype) != kind:",
+        "if False:",
+        ("tests/test_invalid.py",),
+        "types_are",
+    ),
+    Mutant(
+        PART,
         "a full tree of best-first search is not flagged",
         _EXPANDING,
         "status_of_rows(is_new & ~added, Status.TREE_OVERFLOW)",
