@@ -209,7 +209,11 @@ def test_shapes_of_a_batch_are_checked_with_its_axis():
 def test_types_are_checked_as_shapes_are(name, kind, expected):
     """The search's kernel reads memory by the type that an array should have."""
     wrong = with_arrays(valid_problem(), **{name: getattr(valid_problem(), name).astype(kind)})
-    message = f"{name} has the type {jnp.dtype(kind)}, expected {expected}"
+    assert_refused(wrong, f"{name} has the type {jnp.dtype(kind)}, expected {expected}")
+
+
+def assert_refused(wrong, message):
+    """By its own check, and by a search while tracing."""
     with pytest.raises(ProblemError, match=message):
         wrong.check()
     with pytest.raises(ProblemError, match=message):
@@ -233,11 +237,7 @@ def test_what_is_no_array_is_refused():
 )
 def test_the_arrays_of_the_task_are_checked(name, array, found, expected):
     wrong = with_arrays(valid_problem(), task=with_arrays(valid_problem().task, **{name: array}))
-    message = f"task.{name} has {found}, expected {expected}"
-    with pytest.raises(ProblemError, match=message):
-        wrong.check()
-    with pytest.raises(ProblemError, match=message):
-        jax.eval_shape(lambda key: plan_actions(wrong, key), jax.random.key(0))
+    assert_refused(wrong, f"task.{name} has {found}, expected {expected}")
 
 
 def test_a_batch_has_tasks_and_one_problem_has_one():

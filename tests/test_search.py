@@ -1,6 +1,7 @@
 """Best-first search: against the exact solver and a sampled search; batching, padding, keys, compilation."""
 
 import dataclasses
+import functools
 import json
 
 import chex
@@ -419,7 +420,7 @@ def test_a_search_does_not_go_on_with_a_tree_of_a_problem_of_another_size():
 @pytest.mark.parametrize("shape", [(0,), (0, 3), (2, 0)])
 def test_a_batch_may_have_no_rows(shape, config):
     problem = shared_shape("F a & F b", 3)
-    plan = lambda key: plan_actions(problem, key, config)  # noqa: E731
+    plan = functools.partial(plan_actions, problem, config=config)
     for _ in shape:
         plan = jax.vmap(plan)
     found = plan(keys(3)[:0].reshape(shape))

@@ -81,6 +81,7 @@ def compare_policies(
     from potlp_jax.cli.doubts import warn_of_sweep
     from potlp_jax.cli.inputs import read_names, read_split, setting_changes
     from potlp_jax.environments.registry import make
+    from potlp_jax.sweep.results import remarks_on_given_up
     from potlp_jax.sweep.specification import specification_from_dict
 
     # Before any trial runs: minutes later the complaint would cost those minutes.
@@ -118,7 +119,7 @@ def compare_policies(
         print_json(results.to_dict())
     else:
         print_cell(console(), results.cells[0], specification.split)
-        for line in results.remarks():
+        for line in remarks_on_given_up(results.given_up):
             console().print(line)
     # After the table: which worlds are impossible, and so have no picture, is known only by then.
     if out is not None and picture is not None:
@@ -148,6 +149,7 @@ def _run(specification: "Specification", folder: Path, processes: int) -> "Resul
 
 def _write(results: "Results", folder: Path) -> list[Path]:
     """The results for programs, for tables and for people; returns the files."""
+    from potlp_jax.sweep.results import remarks_on_given_up
     from potlp_jax.view.comparisons import draw_scatter
     from potlp_jax.view.style import save_figure
 
@@ -159,7 +161,7 @@ def _write(results: "Results", folder: Path) -> list[Path]:
     # As wide as the widest table: a file has no terminal to ask.
     with table.open("w", encoding="utf-8") as file:
         print_cell(file_console(file, width=150), cell, split)
-        file.writelines(f"{line}\n" for line in results.remarks())
+        file.writelines(f"{line}\n" for line in remarks_on_given_up(results.given_up))
     _write_csv(cell, trials)
     title = f"{cell.environment}/{split}, task {cell.task}: {len(cell.pairs)} worlds"
     save_figure(draw_scatter(cell.pairs, policies, title), scatter)

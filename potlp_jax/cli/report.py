@@ -41,13 +41,13 @@ def write_report(
 ) -> None:
     """Write a sweep as one page: tables, plots, and the worst and best trials as replays."""
     from potlp_jax.cli.inputs import open_store
-    from potlp_jax.sweep.results import pair_rows, read_results
+    from potlp_jax.sweep.results import pair_rows, remarks_on_given_up
     from potlp_jax.sweep.runner import Sweep
     from potlp_jax.sweep.specification import specification_from_store
     from potlp_jax.view.report_page import Cell, report_page
 
     with open_store(folder) as store:
-        specification, facts, given_up = store.specification(), store.facts(), read_results(store).remarks()
+        specification, facts, given_up = store.specification(), store.facts(), remarks_on_given_up(store.broken())
     # A browser goes by the ending of a file's name.
     page = out or folder / PAGE
     if page.suffix != ".html":

@@ -100,7 +100,7 @@ def run(
 def show(folder: SweepFolder, json: Json = False) -> None:
     """Show the tables of what is finished."""
     from potlp_jax.cli.inputs import open_store
-    from potlp_jax.sweep.results import read_results
+    from potlp_jax.sweep.results import read_results, remarks_on_given_up
     from potlp_jax.sweep.specification import own_settings
 
     with open_store(folder) as store:
@@ -112,7 +112,7 @@ def show(folder: SweepFolder, json: Json = False) -> None:
         print_cell(console(), cell, results.specification["split"])
     for policy, told in own_settings(results.specification).items():
         console().print(f"settings of {policy}: {told}")
-    for line in results.remarks():
+    for line in remarks_on_given_up(results.given_up):
         console().print(line)
 
 

@@ -62,13 +62,6 @@ class Results:
             "given_up": [{**dataclasses.asdict(item), "error": error} for item, error in sorted(self.given_up.items())],
         }
 
-    def remarks(self) -> list[str]:
-        """A line for each trial that was given up."""
-        return [
-            f"given up: {item.policy} in world {item.world} of {item.environment}, {item.task}: {error}"
-            for item, error in sorted(self.given_up.items())
-        ]
-
 
 @dataclasses.dataclass(frozen=True)
 class SweepStatus:
@@ -153,6 +146,14 @@ def _require_one_world(pair: Pair) -> None:
             f"{item.environment}: world {item.world} was not the same for all policies: worlds are made from their key "
             "alone, without a random generator or a file that changes; mend that and begin in another folder"
         )
+
+
+def remarks_on_given_up(given_up: Mapping[Item, str]) -> list[str]:
+    """A line for each trial that was given up, with its error."""
+    return [
+        f"given up: {item.policy} in world {item.world} of {item.environment}, {item.task}: {error}"
+        for item, error in sorted(given_up.items())
+    ]
 
 
 def remarks_on_worlds(pairs: Sequence[Pair]) -> list[str]:

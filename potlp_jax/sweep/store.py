@@ -183,7 +183,7 @@ class Store:
         problems = [text for (text,) in self._execute("PRAGMA quick_check") if text != "ok"]
         if problems:
             raise StoreError(f"{self.file}: {_DAMAGED.format(one_line(problems[0]))}")
-        if not has_tables(self.file):
+        if not self._execute("SELECT 1 FROM sqlite_master LIMIT 1"):
             raise StoreError(f"{self.file}: {_NOTHING_YET}")
         if not self._execute("SELECT 1 FROM sqlite_master WHERE name = 'facts'"):
             raise StoreError(f"{self.file}: not a store of results; choose another folder")
