@@ -11,13 +11,16 @@ import cv2
 import jax
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from eval.live.__main__ import run_stream
 from eval.live.perturbation import Network, Perturbation
 from eval.live.server import RosbridgeServer
 from eval.live.simulator import FLOOR, Behaviour, SimulatedLink, SteppedInbox
+from potlp_jax.cli import app
 from potlp_jax.cli.drive import _interruption, _write
 from potlp_jax.cli.inputs import RECORD
+from potlp_jax.cli.view import PAGE
 from potlp_jax.drive.config import DriveConfig, Mode, Topics
 from potlp_jax.drive.driving import drive_robot
 from potlp_jax.drive.inbox import Inbox
@@ -31,6 +34,7 @@ from potlp_jax.environments.ros.places import Disc, Polygon
 from potlp_jax.errors import RobotError
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.record import load_trial
 from potlp_jax.world.grid import BeliefMap
 
 TASK = Task.from_formula("!fire U exit", FLOOR.propositions)
@@ -504,3 +508,30 @@ def test_a_goal_is_not_kept_for_later_while_the_connection_is_lost(server):
     )
     assert told == [(False, "/follow_path was not asked: the connection is lost")]
     link.cancel("/follow_path", goal)
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_the_command_keeps_the_record_of_a_drive_that_ends_by_an_error_too(server, tmp_path, monkeypatch, broken):
+    pytest.importorskip("roslibpy")
+    observe, maps = RemoteRobot.observe, []
+
+    def observe_twice(robot):
+        if broken and len(maps) == 2:
+            raise RobotError("the map needs 9999 rows")
+        maps.append(None)
+        return observe(robot)
+
+    monkeypatch.setattr(RemoteRobot, "observe", observe_twice)
+    limits = ["--silence", "20", "--patience", "60", "--radius", "0.05", "--resolution", str(FLOOR.resolution)]
+    asked = ["--task", TASK.text, "--propositions", ",".join(FLOOR.propositions), "--navigate", "--out", str(tmp_path)]
+    result = CliRunner().invoke(app, ["drive", f"127.0.0.1:{server.port}", *asked, *limits])
+    trial = load_trial(tmp_path / RECORD)
+    assert (tmp_path / PAGE).is_file()
+    if broken:
+        assert result.exit_code not in (0, 1)
+        assert "the map needs 9999 rows" in result.output
+        assert trial.outcome == "unfinished"
+        assert len(trial.decisions) == 2
+    else:
+        assert result.exit_code == 0, result.output
+        assert trial.outcome == "satisfied"

@@ -12,6 +12,7 @@ import potlp_jax
 from potlp_jax.errors import RobotError
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.loop import BrokenDriveError
 from potlp_jax.trials.record import BeliefMap, load_trial
 from potlp_jax.trials.replay import views_of
 from potlp_jax.trials.robot import GrowingRobot, Leg, SimulatedRobot
@@ -370,6 +371,58 @@ class Breaks(Rover):
 def test_a_broken_contract_is_named(fault, said):
     with pytest.raises(RobotError, match=said):
         driven(Breaks(fault))
+
+
+def broken_off(robot):
+    """The record of a drive that ends by an error, the error, and the maps that its decisions were planned on."""
+    maps = []
+    with pytest.raises(BrokenDriveError) as caught:
+        potlp_jax.run_robot(robot, TASK, "baseline", KEY, listener=lambda _, belief: maps.append(belief))
+    assert caught.value.trial is not None
+    return caught.value.trial, str(caught.value), maps
+
+
+@pytest.mark.parametrize("fault", ["jumps", "elsewhere", "blocked", "grows", "nothing"])
+def test_a_drive_that_breaks_off_leaves_its_record(fault, tmp_path):
+    whole, _ = driven(Rover())
+    trial, error, maps = broken_off(Breaks(fault))
+    assert trial.outcome == "unfinished"
+    # The second leg fails: until then it did what a robot without a fault did.
+    assert [decision.target for decision in trial.decisions] == [decision.target for decision in whole.decisions[:2]]
+    assert trial.path == whole.path[: whole.decisions[1].step + 1]
+    assert trial.notes[-1] == f"the drive ended by an error: {error}"
+    trial.save(tmp_path / "trial.json")
+    again = load_trial(tmp_path / "trial.json")
+    for decision, belief in zip(again.decisions, maps, strict=True):
+        assert_same_map(again.planned_on(decision), belief)
+
+
+def test_a_growing_map_that_breaks_off_leaves_the_record_on_the_map_before():
+    class Fails(GrowingRover):
+        def __init__(self, legs):
+            self.legs = legs
+            super().__init__((5, 1))
+
+        def advance(self, path, stop):
+            leg = super().advance(path, stop)
+            self.legs -= 1
+            return leg
+
+        def observe(self):
+            if not self.legs:
+                raise ConnectionError("the battery is empty")
+            return super().observe()
+
+    whole, maps = driven(GrowingRover((5, 1)))
+    assert len({belief.cells.shape for belief in maps}) > 1
+    for legs in range(1, len(whole.decisions)):
+        trial, error, maps = broken_off(Fails(legs))
+        assert error == "observe() of the robot raised ConnectionError: the battery is empty"
+        rows, columns = np.subtract(whole.path[0], trial.path[0])
+        steps = whole.decisions[legs - 1].step
+        assert [(row + rows, column + columns) for row, column in trial.path] == list(whole.path[: steps + 1])
+        for decision, belief in zip(trial.decisions, maps, strict=True):
+            assert int((~trial.planned_on(decision).unknown).sum()) == int((~belief.unknown).sum())
 
 
 @pytest.mark.parametrize("lost", ["top", "right"])

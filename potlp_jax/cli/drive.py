@@ -137,6 +137,7 @@ def drive(
     from potlp_jax.drive.rosbridge import RosbridgeLink
     from potlp_jax.environments.ros.places import load_places
     from potlp_jax.task.reading import read_task
+    from potlp_jax.trials.loop import BrokenDriveError
     from potlp_jax.trials.record import Outcome
 
     chosen = [mode for mode, on in zip(Mode, (advise, navigate, follow, dry_run), strict=True) if on] or [Mode.ADVISE]
@@ -162,6 +163,15 @@ def drive(
     folder = None if out is None else make_folder(out)
     link = RosbridgeLink(robot)
     trials = []
+
+    def keep(trial: "Trial") -> None:
+        trials.append(trial)
+        files = [] if folder is None else _write(trial, folder)
+        if not json:
+            console().print(f"{trial.outcome}: {len(trial.decisions)} decisions along {trial.cost:.2f} m")
+            for file in files:
+                console().print(f"wrote {file}")
+
     try:
         with _interruption() as interrupted:
             for trial in drive_robot(
@@ -176,12 +186,12 @@ def drive(
                 listener=(lambda _decision, _belief: None) if json else _print_decision,
                 interrupted=interrupted,
             ):
-                trials.append(trial)
-                files = [] if folder is None else _write(trial, folder)
-                if not json:
-                    console().print(f"{trial.outcome}: {len(trial.decisions)} decisions along {trial.cost:.2f} m")
-                    for file in files:
-                        console().print(f"wrote {file}")
+                keep(trial)
+    except BrokenDriveError as error:
+        # No drive can be had again.
+        if error.trial is not None:
+            keep(error.trial)
+        raise
     finally:
         link.close()
     if json:

@@ -67,7 +67,8 @@ def drive_robot(
         another ends ``unfinished``.
 
     Raises:
-        RobotError: nothing is heard of the robot, or it broke the contract.
+        RobotError: nothing is heard of the robot, or it broke the contract; once the drive has begun, a
+            ``BrokenDriveError``, which has the record.
         PropositionsError: task, places and estimator are not over the same propositions.
     """
     inbox = Inbox(config, task.propositions) if inbox is None else inbox

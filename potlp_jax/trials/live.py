@@ -13,7 +13,7 @@ from potlp_jax.planning.policies import Policy, PolicyFunction, named_policy
 from potlp_jax.precision import in_32_bits
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials.config import TrialConfig
-from potlp_jax.trials.loop import Listener, drive, make_trial, shifted_cells, shifted_decision
+from potlp_jax.trials.loop import BrokenDriveError, Listener, drive, make_trial, shifted_cells, shifted_decision
 from potlp_jax.trials.record import ROBOT_PREFIX, RunRecord, Trial
 from potlp_jax.trials.robot import Robot
 from potlp_jax.trials.rules import estimator_of
@@ -63,7 +63,8 @@ def run_robot(
         The record, as of a trial in simulation.
 
     Raises:
-        RobotError: the robot broke its side of the contract.
+        RobotError: the robot broke its side of the contract. After its first observation it is a ``BrokenDriveError``,
+            which has the record until then as ``trial``: ``unfinished``, and the error is its last note.
         PropositionsError: the robot's map, task, estimator and ``world`` are not over the same propositions.
         EstimatorError: no estimator is shipped for the task's propositions in such a world.
         PotlpError: the policy is ``oracle`` and there is no ``world``.
@@ -71,23 +72,32 @@ def run_robot(
     policy = named_policy(policy)
     watched = WatchedRobot(robot, seconds_per_cell)
     config = TrialConfig() if config is None else config
-    run = drive(
-        watched,
-        task,
-        policy,
-        key,
-        config,
-        arrays=arrays,
-        estimator=estimator,
-        world=world,
-        setbacks=setbacks,
-        listener=listener,
-    )
-    resolution = float(watched.last_map.resolution)
-    here = Domain.of_robot(resolution) if world is None else Domain.of_world(world, config.camera)
-    asked = estimator_of(policy, task.propositions, here, estimator)
-    trial = _recorded(run, watched, task, policy, config, asked)
-    return dataclasses.replace(trial, environment=f"{ROBOT_PREFIX}{name}")
+
+    def record(run: RunRecord) -> Trial:
+        resolution = float(watched.last_map.resolution)
+        here = Domain.of_robot(resolution) if world is None else Domain.of_world(world, config.camera)
+        asked = estimator_of(policy, task.propositions, here, estimator)
+        trial = _recorded(run, watched, task, policy, config, asked)
+        return dataclasses.replace(trial, environment=f"{ROBOT_PREFIX}{name}")
+
+    try:
+        run = drive(
+            watched,
+            task,
+            policy,
+            key,
+            config,
+            arrays=arrays,
+            estimator=estimator,
+            world=world,
+            setbacks=setbacks,
+            listener=listener,
+        )
+    except BrokenDriveError as error:
+        trial = record(error.run)
+        trial = dataclasses.replace(trial, notes=(*trial.notes, f"the drive ended by an error: {error}"))
+        raise BrokenDriveError(str(error), error.run, trial) from error.__cause__
+    return record(run)
 
 
 def _recorded(
@@ -99,7 +109,7 @@ def _recorded(
     estimator: TrainedEstimator | Estimator | None,
 ) -> Trial:
     """The record of a run; its world is what the robot knew at the end."""
-    belief, origin = watched.last_map, watched.origin
+    belief, origin = watched.last_map, watched.last_origin
     world = _world_of(belief, run)
     # A world has a closed border: one ring more where the map has none.
     ring = (world.shape[0] - belief.cells.shape[0]) // 2

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int32, PRNGKeyArray
 
+from potlp_jax.errors import RobotError
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import TrainedEstimator, identity_of
 from potlp_jax.learning.observing import (
@@ -103,6 +104,19 @@ def run_trial(
     )
 
 
+class BrokenDriveError(RobotError):
+    """A robot broke its side of the contract after the drive had begun. What it had done until then is not lost.
+
+    Attributes:
+        run: what the robot did until its last observation; ``unfinished``.
+        trial: the record of it, from ``run_robot``; ``drive`` makes none.
+    """
+
+    def __init__(self, message: str, run: RunRecord, trial: Trial | None = None) -> None:
+        super().__init__(message)
+        self.run, self.trial = run, trial
+
+
 Listener = Callable[[Decision, BeliefMap], None]
 """Is told each decision before it is carried out, and the map that it was planned on."""
 
@@ -144,6 +158,7 @@ def drive(
         PropositionsError: the robot's map, task, estimator and ``world`` are not over the same propositions.
         EstimatorError: no estimator is shipped for the task's propositions in such a world.
         PotlpError: the policy is ``oracle`` and there is no ``world``.
+        BrokenDriveError: the robot raised ``RobotError`` after its first observation.
     """
     policy = named_policy(policy)
     # Nothing is asked of the robot's map but its names and shape: the loop observes for itself.
@@ -210,9 +225,21 @@ class _Loop:
 
         Returns:
             What it did.
+
+        Raises:
+            BrokenDriveError: the robot raised ``RobotError``.
         """
         self._begin(belief, cell)
+        # The observation that all else is told on: one that fails changes nothing.
+        self._belief = belief
+        try:
+            return self._run(cell)
+        except RobotError as error:
+            raise BrokenDriveError(str(error), self._result(Outcome.UNFINISHED, self._belief)) from error
+
+    def _run(self, cell: Cell) -> RunRecord:
         # Algorithm 1 ends at acceptance; budget, repetition and a robot that ends are ours (docs/model.md section 7).
+        belief = self._belief
         gave_up, leg = False, Leg(cells=())
         while True:
             at = jnp.asarray(cell, jnp.int32)
@@ -228,6 +255,7 @@ class _Loop:
             leg = self._robot.advance(move.path, _stop_of(move, self._tally, belief, config=self._config))
             known_before = belief
             belief, cell = self._robot.observe()
+            self._belief = belief
             cells = self._follow_map(known_before, belief, leg.cells)
             self._after(leg, cells, move, belief)
             gave_up = self._gave_up(leg, move, known_before, belief)

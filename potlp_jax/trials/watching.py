@@ -6,12 +6,13 @@ compared with the contract (``trials.robot``), and an error says what was wrong 
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 from jaxtyping import Array, Int32, UInt8
 
-from potlp_jax.errors import RobotError
+from potlp_jax.errors import PotlpError, RobotError
 from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.trials.record import NEVER_SEEN, Correction, belief_seen_by
 from potlp_jax.trials.robot import GrowingRobot, Leg, NoticesDoubts, RemembersItsWay, Robot
@@ -47,7 +48,7 @@ class WatchedRobot:
         self.history = MapHistory()
         self._late: list[str] = []
         self._belief: BeliefMap | None = None
-        self._origin_before: Cell = (0, 0)
+        self._last_origin: Cell = (0, 0)
         self._expected: Cell | None = None
         # Where the last leg led, in the lattice that never moves.
         self._leg: tuple[Cell, ...] = ()
@@ -64,36 +65,45 @@ class WatchedRobot:
         return self._belief
 
     @property
+    def last_origin(self) -> Cell:
+        """That of the map that the robot reported last."""
+        return self._last_origin
+
+    @property
     def origin(self) -> Cell:
         """That of the robot."""
         return self._robot.origin if isinstance(self._robot, GrowingRobot) else (0, 0)
 
     def observe(self) -> tuple[BeliefMap, Cell]:
         """The map and the robot's cell."""
-        observed = self._robot.observe()
+        with _its_own("observe"):
+            observed = self._robot.observe()
         if not (isinstance(observed, tuple) and len(observed) == 2 and isinstance(observed[0], BeliefMap)):
             raise RobotError(f"observe() returns a BeliefMap and a cell (row, column), found {type(observed).__name__}")
         belief, cell = observed
         self._check_map(belief)
         self._check_cell(belief, cell)
-        self._belief, self._origin_before = belief, self.origin
+        self._belief, self._last_origin = belief, self.origin
         self.history.add(belief, self.origin, len(self._leg))
         self._leg = ()
         return belief, cell
 
     def panorama(self) -> UInt8[Array, "rows columns 3"]:
         """What the robot's camera sees."""
-        return self._robot.panorama()
+        with _its_own("panorama"):
+            return self._robot.panorama()
 
     def panorama_before(self, back: int) -> UInt8[Array, "rows columns 3"] | None:
         """What the robot's camera saw on its way, where it remembers that."""
-        return self._robot.panorama_before(back) if isinstance(self._robot, RemembersItsWay) else None
+        with _its_own("panorama_before"):
+            return self._robot.panorama_before(back) if isinstance(self._robot, RemembersItsWay) else None
 
     def advance(self, path: KnownPath, stop: Stop) -> Leg:
         """Follow a path."""
         row, column = self.origin
         begun = self._clock()
-        leg = self._robot.advance(path, stop)
+        with _its_own("advance"):
+            leg = self._robot.advance(path, stop)
         seconds = self._clock() - begun
         if not isinstance(leg, Leg):
             raise RobotError(f"advance() returns a Leg, found {type(leg).__name__}")
@@ -126,7 +136,7 @@ class WatchedRobot:
                 "where it begins, as the property origin (GrowingRobot)"
             )
         # Earlier decisions and the path are told on the last map: there is no place on it for what it has lost.
-        now, then = self.origin, self._origin_before
+        now, then = self.origin, self._last_origin
         ends = zip(now, belief.cells.shape, then, before.cells.shape, strict=True)
         if not all(
             first <= first_then and first + size >= first_then + size_then
@@ -174,6 +184,17 @@ class WatchedRobot:
             self._late.append(
                 f"a leg of {length} cells took {seconds:.1f} s, more than {limit:.1f} s: the robot is late"
             )
+
+
+@contextmanager
+def _its_own(method: str) -> Iterator[None]:
+    """Whatever somebody else's method raises is the robot's error, so that the record of the drive is kept."""
+    try:
+        yield
+    except PotlpError:
+        raise
+    except Exception as error:
+        raise RobotError(f"{method}() of the robot raised {type(error).__name__}: {error}") from error
 
 
 class MapHistory:
