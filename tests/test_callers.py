@@ -77,6 +77,7 @@ def test_who_asks_for_a_derivative_is_told_what_to_do(config):
 
 
 OF_ANOTHER_TYPE = """
+from dataclasses import replace
 import jax
 import numpy as np
 from potlp_jax import BeliefMap, BestFirstConfig, DecisionConfig, FrontierConfig, Task, UctConfig
@@ -105,6 +106,9 @@ for make in (
     lambda: plan_actions(problem(np.full((S, C), 0.5), np), jax.random.key(0), simulations=jax.numpy.array([2])),
     lambda: frontier_subgoals(belief, (1.5, 1.0), 0, task.arrays),
     lambda: frontier_subgoals(belief, world.start, 0, task),
+    lambda: frontier_subgoals(replace(belief, letters=belief.letters * 1.0), world.start, 0, task.arrays),
+    lambda: frontier_subgoals(replace(belief, cells=belief.cells * 1.0), world.start, 0, task.arrays),
+    lambda: frontier_subgoals(replace(belief, letters=np.int8(belief.letters)), (1, 1), 0, task.arrays).mask.shape,
 ):
     try:
         print("no error", make())
@@ -138,6 +142,9 @@ def test_what_has_another_type_is_refused_by_name():
         "simulations has shape (1,), expected (): one number for each problem",
         "cell has the type float32: give whole",
         "the task is a Task; give its arrays",
+        "belief.letters has the type float32: give whole",
+        "belief.cells has the type float32: give whole",
+        "no error (",
     )
     for line, said in zip(told.splitlines(), expected, strict=True):
         assert said in line

@@ -156,14 +156,17 @@ def assess(
 
     Raises:
       PropositionsError: belief and task are not over the same propositions; while tracing, under jit.
-      ProblemError: cell or state are no whole numbers, the task is not its arrays, or an array has another shape.
+      ProblemError: cell, state or what the map says are no whole numbers, the task is not its arrays, or an array has
+        another shape.
     """
     if not isinstance(task, TaskArrays):
         raise ProblemError(f"the task is a {type(task).__name__}; give its arrays, task.arrays")
     cell, state = whole_numbers(cell, "cell", ProblemError), whole_numbers(state, "state", ProblemError)
     _check_shapes(belief, cell, state)
     check_task(task)
-    belief = dataclasses.replace(belief, resolution=jnp.asarray(belief.resolution, jnp.float32))
+    whole_numbers(belief.cells, "belief.cells", ProblemError)
+    letters, resolution = whole_numbers(belief.letters, "belief.letters", ProblemError), belief.resolution
+    belief = dataclasses.replace(belief, letters=letters, resolution=jnp.asarray(resolution, jnp.float32))
     # Every decision, of every policy, begins here: what follows reads letters with the task's tables.
     require_same_propositions(task.propositions, belief.propositions, knower="the belief")
     # Nothing remains to be done after acceptance: without moves of their own, accepting states need no sweep.
