@@ -7,18 +7,21 @@ import shutil
 import sqlite3
 import struct
 
+import cv2
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 
 from potlp_jax.errors import LogError
+from potlp_jax.images import check_whole
+from potlp_jax.learning.dataset import decode, encode
 from potlp_jax.logs import writing
 from potlp_jax.logs.bag import open_bag
 from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
 from potlp_jax.logs.drive import PanoramaReader, read_drive
 from potlp_jax.logs.inspection import inspect
-from potlp_jax.logs.log import Log, LogConfig, typestore
+from potlp_jax.logs.log import SECOND, Log, LogConfig, typestore
 from potlp_jax.logs.transforms import quaternion_of
 from potlp_jax.logs.writing import BagFormat
 from potlp_jax.trials.record import NEVER_SEEN
@@ -110,14 +113,62 @@ def test_pictures_of_other_encodings_are_lost_and_counted(bags, tmp_path):
         assert np.abs(reader.panorama(step).astype(int) - panorama_of(step)).mean() < 4
 
 
-def test_a_picture_whose_data_end_early_is_passed_over(bags, tmp_path):
+@pytest.mark.parametrize("encoding", ["png", "jpeg"])
+def test_pictures_that_are_cut_off_are_lost_and_counted(bags, tmp_path, encoding):
     def cut(topic, message, time):
         if topic == "/panorama/compressed":
-            message.data = message.data[:60]
+            data = encode(decode(bytes(message.data)), encoding)
+            message.data = np.frombuffer(data, np.uint8)[: int(0.6 * len(data))]
 
-    drive = drive_of(rewrite(bags, tmp_path / "x.bag", cut), places_of(bags))
-    assert drive.pictures  # the header is whole
-    assert PanoramaReader(drive, CAMERA).panorama(0) is None
+    log = Log(rewrite(bags, tmp_path / "x.bag", cut))
+    count = len(tour())
+    assert log.pictures == []  # though their headers are whole
+    assert log.problems == [
+        f"/panorama/compressed: {count} of {count} messages are lost: pictures that are cut off or damaged"
+    ]
+    assert inspect(log)["uses"]["to-dataset"] == "no picture can be read from /panorama/compressed"
+
+
+@pytest.mark.parametrize("behind", [b"", b"\0" * 1000, b"padding" * 100])
+def test_what_cameras_put_behind_a_jpeg_does_not_make_it_cut_off(behind):
+    picture = np.random.default_rng(0).integers(0, 255, (40, 80, 3)).astype(np.uint8)
+    whole = encode(picture, "jpeg")
+    check_whole(whole + behind)
+    # A thumbnail is a whole JPEG within one.
+    thumbnail = encode(picture[:8, :8], "jpeg")
+    with_thumbnail = whole[:2] + b"\xff\xe1" + struct.pack(">H", len(thumbnail) + 2) + thumbnail + whole[2:]
+    check_whole(with_thumbnail + behind)
+    for cut in (whole, with_thumbnail):
+        with pytest.raises(ValueError, match="no end"):
+            check_whole(cut[: -len(whole) // 3] + behind)
+
+
+def test_pictures_of_other_formats_are_read_to_their_end():
+    data = cv2.imencode(".webp", np.zeros((40, 80, 3), np.uint8))[1].tobytes()
+    check_whole(data)
+    with pytest.raises(OSError, match="decoder"):
+        check_whole(data[:-4])
+
+
+def test_a_damaged_picture_takes_no_place_from_a_good_one(bags, tmp_path):
+    taken_at = []
+
+    def spoil(topic, message, time):
+        """Every second picture is cut off; the one after it is taken in the same cell, farther from its middle."""
+        if topic != "/panorama/compressed":
+            return
+        if len(taken_at) % 2 == 0:
+            message.data = message.data[: len(message.data) // 2]
+        else:
+            moment = taken_at[-1] + SECOND // 10
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(moment, SECOND)
+        taken_at.append(time)
+
+    drive = drive_of(rewrite(bags, tmp_path / "x.bag", spoil), places_of(bags))
+    assert {step: picture.index for step, picture in drive.pictures.items()} == {
+        step: step + 1 for step in range(0, len(tour()) - 1, 2)
+    }
+    assert PanoramaReader(drive, CAMERA).panorama(4) is not None
 
 
 def test_messages_of_another_definition_are_lost_and_counted(bags, tmp_path):
