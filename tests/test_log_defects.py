@@ -269,6 +269,19 @@ def test_pictures_in_a_gap_of_the_pose_are_passed_over(bags, tmp_path):
     assert any("pictures are passed over: no pose is near" in note for note in drive.notes)
 
 
+@pytest.mark.parametrize("first", [4.0, 10.0])
+def test_pictures_outside_of_the_drive_are_passed_over_and_told(bags, tmp_path, first):
+    def late(topic, message, time):
+        return step_of(time) >= first if topic == "/panorama/compressed" else step_of(time) < 8.0
+
+    log = Log(rewrite(bags, tmp_path / "x.bag", late))
+    drive = read_drive(log, places_of(bags))
+    outside = sum(step_of(picture.time) >= 8.0 for picture in log.pictures)
+    assert len(drive.pictures) == len(log.pictures) - outside
+    told = f"/panorama/compressed: {outside} of {len(log.pictures)} pictures are passed over: before the first cell or"
+    assert [note for note in drive.notes if "picture" in note] == [f"{told} after the last pose"]
+
+
 def test_stamps_of_another_clock_give_way_to_the_recording(bags, tmp_path):
     def shift(topic, message, time):
         if topic == "/panorama/compressed":

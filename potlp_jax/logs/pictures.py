@@ -61,10 +61,16 @@ def match_pictures(
     """
     # Before the robot entered its first cell, or after its last pose, there is no cell to which a picture belongs.
     taken = [picture for picture in log.pictures if times[0] <= picture.time <= poses.times[-1]]
-    if not taken:
+    if not log.pictures:
         notes.append(
             "no picture: policies that take panoramas, and datasets, need a topic of type sensor_msgs/CompressedImage"
         )
+    if len(taken) < len(log.pictures):
+        notes.append(
+            f"{log.image_topic}: {len(log.pictures) - len(taken)} of {len(log.pictures)} pictures are passed over: "
+            "before the first cell or after the last pose"
+        )
+    if not taken:
         return {}, {}
     moments = np.array([picture.time for picture in taken])
     gap = int(log.config.longest_gap * SECOND)
