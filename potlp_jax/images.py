@@ -82,8 +82,8 @@ def check_whole(contents: bytes) -> None:
         contents: a file of one of the usual formats.
 
     Raises:
-        ValueError: it is no image, is too large, or is a JPEG without an end. So do other errors of Pillow where another
-            format is cut short, or a checksum of a PNG is wrong.
+        ValueError: it is no image, is too large, or is a JPEG without an end. So do other errors of Pillow, where
+            another format is cut short, or a checksum of a PNG is wrong.
     """
     with _header(contents) as image:
         if image.format == "PNG":

@@ -428,20 +428,67 @@ def test_blocks_after_a_damaged_one_are_kept(bags, tmp_path):
     assert f"{whole - kept} of {whole} are lost" in Log(bag).problems[0]
 
 
-def test_rows_around_a_damaged_page_are_kept(bags, tmp_path):
-    copy = tmp_path / name_of(BagFormat.ROS2)
+def damaged_page(bags, out, kind):
+    """The tour in sqlite, where the middle one of the pages of a kind is damaged."""
+    copy = out / name_of(BagFormat.ROS2)
     shutil.copytree(bags / copy.name, copy)
-    file = storage_of(tmp_path, BagFormat.ROS2)
+    file = storage_of(out, BagFormat.ROS2)
     with sqlite3.connect(file) as connection:
         (size,) = connection.execute("PRAGMA page_size").fetchone()
     data = bytearray(file.read_bytes())
-    # A leaf of the table of messages in the middle of the file: type 13, several cells.
-    leaves = [at for at in range(0, len(data), size) if data[at] == 13 and data[at + 3 : at + 5] > b"\0\2"]
-    data[leaves[len(leaves) // 2]] = 0xFF
+    pages = [at for at in range(0, len(data), size) if kind(data[at : at + size])]
+    place = pages[len(pages) // 2]
+    data[place : place + 4] = b"\xff" * 4
     file.write_bytes(data)
+    return copy
+
+
+def leaf(page):
+    """Of the table of messages: type 13, several cells."""
+    return page[0] == 13 and page[3:5] > b"\0\2"
+
+
+def overflow(page):
+    """What of a message does not fit into the table; it begins with the number of the page on which that goes on."""
+    return 0 < int.from_bytes(page[:4], "big") < 2**16
+
+
+@pytest.mark.parametrize("kind", [leaf, overflow])
+def test_rows_around_a_damaged_page_are_kept(bags, tmp_path, kind):
+    copy = damaged_page(bags, tmp_path, kind)
     kept, whole = count_of(copy), count_of(bags / copy.name)
     assert whole / 2 < kept < whole
     assert f"{whole - kept} of {whole} are lost" in Log(copy).problems[0]
+
+
+@pytest.mark.parametrize("kind", [leaf, overflow])
+def test_rows_behind_a_damaged_page_stay_in_the_order_of_time(bags, tmp_path, kind):
+    copy = damaged_page(bags, tmp_path, kind)
+    log = Log(copy)
+    moments = [message.time for message in log.bag.messages(log.bag.topics)]
+    assert moments == sorted(moments)
+    # What a map that is left shows is known from its time on, and not from the end of the drive.
+    drive, maps = read_drive(log, places_of(bags)), {message.time for message in log.read_maps()}
+    times = Log(bags / "tour.bag").bag.times["/map"]
+    steps = np.array([step for step, time in enumerate(times) if time in maps])
+    assert len(tour()) // 2 < len(steps)
+    seen = first_seen_along(WORLD, tour())
+    late = np.append(steps, NEVER_SEEN)[np.searchsorted(steps, np.where(seen == NEVER_SEEN, steps[-1] + 1, seen))]
+    path = set(drive.path)
+    for cell in np.argwhere(late != NEVER_SEEN):
+        if tuple(cell.tolist()) not in path:
+            assert drive.times[drive.first_seen[tuple(cell)]] == times[late[tuple(cell)]]
+
+
+def test_files_of_a_recording_that_was_killed_are_read_by_their_numbers(bags, tmp_path):
+    whole = Log(bags / name_of(BagFormat.ROS2)).bag.times["/map"]
+    ends = [0, whole[7], whole[14], whole[-1] + 1]
+    for number, since, until in zip((1, 2, 10), ends, ends[1:], strict=False):
+        file = tmp_path / f"tour_{number}.db3"
+        shutil.copy(storage_of(bags, BagFormat.ROS2), file)
+        with sqlite3.connect(file) as connection:
+            connection.execute("DELETE FROM messages WHERE timestamp < ? OR timestamp >= ?", (since, until))
+    assert open_bag(tmp_path).times["/map"] == whole
 
 
 def test_what_is_no_bag_is_refused(tmp_path):
