@@ -269,6 +269,51 @@ def test_pictures_in_a_gap_of_the_pose_are_passed_over(bags, tmp_path):
     assert any("pictures are passed over: no pose is near" in note for note in drive.notes)
 
 
+def localised(is_heard):
+    """Odometry is whole; localisation is left out where ``is_heard`` of the cells driven is False."""
+
+    def edit(topic, message, time):
+        if topic == "/tf" and not is_heard(step_of(time)):
+            message.transforms = [each for each in message.transforms if each.child_frame_id == "base_link"]
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    "is_heard", [lambda step: not 8.0 < step < 17.0, lambda step: step < 15.0, lambda step: step > 8.0]
+)
+def test_a_gap_of_localisation_is_told_though_odometry_goes_on(bags, tmp_path, is_heard):
+    drive = drive_of(
+        rewrite(bags, tmp_path / "x.bag", localised(is_heard)), places_of(bags), LogConfig(longest_gap=1.0)
+    )
+    told, over = drive.notes
+    assert told.startswith("pose: map -> odom: 1 gaps of more than 1 s, the longest of")
+    assert "pictures are passed over: no pose is near" in over
+    assert drive.path == tuple(tour())
+    moments = np.array([step_of(time) for time in drive.times])
+    heard = moments[[is_heard(moment) for moment in moments]]
+    distances = np.abs(moments[:, None] - heard).min(axis=1) * writing.SECONDS_A_CELL
+    assert sorted(drive.pictures) == np.flatnonzero(distances <= 1.0).tolist()
+
+
+def test_localisation_that_seldom_speaks_has_no_gap_but_a_note(bags, tmp_path):
+    spoken = {step_of(time) for time in Log(bags / "tour.bag").bag.times["/tf"][::5]}
+    bag = rewrite(bags, tmp_path / "x.bag", localised(lambda step: step in spoken))
+    drive = drive_of(bag, places_of(bags), LogConfig(longest_gap=1.0))
+    (told,) = drive.notes
+    assert told.startswith("pose: map -> odom: 5 messages at no steady rate, with pauses of up to")
+    assert sorted(drive.pictures) == list(range(len(tour())))
+    assert drive.path == tuple(tour())
+
+
+def test_a_gap_of_all_transforms_is_told_once(bags, tmp_path):
+    def lose(topic, message, time):
+        return topic not in ("/tf", "/odom") or not 8.0 < step_of(time) < 17.0
+
+    notes = drive_of(rewrite(bags, tmp_path / "x.bag", lose), places_of(bags), LogConfig(longest_gap=1.0)).notes
+    assert [note[:40] for note in notes if note.startswith("pose")] == ["pose: 1 gaps of more than 1 s, the longe"]
+
+
 @pytest.mark.parametrize("first", [4.0, 10.0])
 def test_pictures_outside_of_the_drive_are_passed_over_and_told(bags, tmp_path, first):
     def late(topic, message, time):

@@ -36,8 +36,8 @@ def save_map(file: Path, free: Bool[np.ndarray, "H W"], frame: GridFrame) -> Pat
     image = file.with_suffix(".pgm")
     pixels = np.where(free, FREE_GREY, OCCUPIED_GREY).astype(np.uint8)
     image.write_bytes(f"P5\n{frame.width} {frame.height}\n255\n".encode() + pixels.tobytes())
-    # Quoted, for names may hold what YAML reads as a comment, a key or a list. A text of JSON is one of YAML too, but for
-    # the halves in which it escapes some characters.
+    # Quoted, for names may hold what YAML reads as a comment, a key or a list. A text of JSON is one of YAML too, but
+    # for characters that are escaped in halves.
     name = json.dumps(image.name, ensure_ascii=False)
     # ``!r`` is the shortest text that reads back as the same float.
     file.write_text(
