@@ -20,6 +20,9 @@ MOST_PIXELS: int = 1 << 25
 # What map savers and cameras write. Formats that run programs or fetch other files (EPS) are not among them.
 _IMAGE_FORMATS = ("PNG", "BMP", "JPEG", "TIFF", "WEBP", "PPM")
 
+# Markers of a JPEG, before its pixels and after them: a thumbnail in front has its own. Pixels never hold one.
+_JPEG_SCAN, _JPEG_END = b"\xff\xda", b"\xff\xd9"
+
 # OpenCV 4 has its switch at the top, OpenCV 5 in a module of its own.
 _OPENCV_LOG: Any = getattr(cv2.utils, "logging", cv2)
 _SILENT = 0
@@ -68,6 +71,30 @@ def image_size(contents: bytes) -> tuple[int, int]:
     """Width and height of an encoded image, by its header. Raises ValueError, and whatever Pillow raises."""
     with _header(contents) as image:
         return image.size
+
+
+def check_whole(contents: bytes) -> None:
+    """Refuse an encoded image that is cut short.
+
+    Cheap enough for every picture of a recording: PNG and JPEG are not decoded.
+
+    Args:
+        contents: a file of one of the usual formats.
+
+    Raises:
+        ValueError: it is no image, is too large, or is a JPEG without an end. So do other errors of Pillow, where
+            another format is cut short, or a checksum of a PNG is wrong.
+    """
+    with _header(contents) as image:
+        if image.format == "PNG":
+            image.verify()
+        # Two pictures in one file are another format to Pillow.
+        elif image.format in ("JPEG", "MPO"):
+            # Not at the very end: cameras put padding behind it.
+            if contents.rfind(_JPEG_END) < contents.rfind(_JPEG_SCAN):
+                raise ValueError("its pixels have no end")
+        else:
+            image.load()
 
 
 def _header(contents: bytes) -> Image.Image:

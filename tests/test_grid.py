@@ -154,6 +154,12 @@ def test_beliefs_from_host_arrays():
         belief_from_numpy(np.array([[-1, 0]]), np.array([[0, 0]]), resolution=-1.0)
 
 
+@pytest.mark.parametrize("shape", [(1, 5), (5, 1), (5,), (6, 6)])
+def test_letters_of_a_belief_have_the_shape_of_its_cells(shape):
+    with pytest.raises(WorldError, match=r"cells \(5, 5\) and letters .* must have one shape"):
+        belief_from_numpy(np.zeros((5, 5), int), np.zeros(shape, int), propositions=NAMES[:1])
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(3, 9), st.integers(3, 9), st.sampled_from([1.0, 0.05, 1 / 3]))
 def test_a_world_is_read_back_bit_for_bit(seed, height, width, resolution):

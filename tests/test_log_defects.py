@@ -7,18 +7,21 @@ import shutil
 import sqlite3
 import struct
 
+import cv2
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 
 from potlp_jax.errors import LogError
+from potlp_jax.images import check_whole
+from potlp_jax.learning.dataset import decode, encode
 from potlp_jax.logs import writing
 from potlp_jax.logs.bag import open_bag
 from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
 from potlp_jax.logs.drive import PanoramaReader, read_drive
 from potlp_jax.logs.inspection import inspect
-from potlp_jax.logs.log import Log, LogConfig, typestore
+from potlp_jax.logs.log import SECOND, Log, LogConfig, typestore
 from potlp_jax.logs.transforms import quaternion_of
 from potlp_jax.logs.writing import BagFormat
 from potlp_jax.trials.record import NEVER_SEEN
@@ -110,14 +113,62 @@ def test_pictures_of_other_encodings_are_lost_and_counted(bags, tmp_path):
         assert np.abs(reader.panorama(step).astype(int) - panorama_of(step)).mean() < 4
 
 
-def test_a_picture_whose_data_end_early_is_passed_over(bags, tmp_path):
+@pytest.mark.parametrize("encoding", ["png", "jpeg"])
+def test_pictures_that_are_cut_off_are_lost_and_counted(bags, tmp_path, encoding):
     def cut(topic, message, time):
         if topic == "/panorama/compressed":
-            message.data = message.data[:60]
+            data = encode(decode(bytes(message.data)), encoding)
+            message.data = np.frombuffer(data, np.uint8)[: int(0.6 * len(data))]
 
-    drive = drive_of(rewrite(bags, tmp_path / "x.bag", cut), places_of(bags))
-    assert drive.pictures  # the header is whole
-    assert PanoramaReader(drive, CAMERA).panorama(0) is None
+    log = Log(rewrite(bags, tmp_path / "x.bag", cut))
+    count = len(tour())
+    assert log.pictures == []  # though their headers are whole
+    assert log.problems == [
+        f"/panorama/compressed: {count} of {count} messages are lost: pictures that are cut off or damaged"
+    ]
+    assert inspect(log)["uses"]["to-dataset"] == "no picture can be read from /panorama/compressed"
+
+
+@pytest.mark.parametrize("behind", [b"", b"\0" * 1000, b"padding" * 100])
+def test_what_cameras_put_behind_a_jpeg_does_not_make_it_cut_off(behind):
+    picture = np.random.default_rng(0).integers(0, 255, (40, 80, 3)).astype(np.uint8)
+    whole = encode(picture, "jpeg")
+    check_whole(whole + behind)
+    # A thumbnail is a whole JPEG within one.
+    thumbnail = encode(picture[:8, :8], "jpeg")
+    with_thumbnail = whole[:2] + b"\xff\xe1" + struct.pack(">H", len(thumbnail) + 2) + thumbnail + whole[2:]
+    check_whole(with_thumbnail + behind)
+    for cut in (whole, with_thumbnail):
+        with pytest.raises(ValueError, match="no end"):
+            check_whole(cut[: -len(whole) // 3] + behind)
+
+
+def test_pictures_of_other_formats_are_read_to_their_end():
+    data = cv2.imencode(".webp", np.zeros((40, 80, 3), np.uint8))[1].tobytes()
+    check_whole(data)
+    with pytest.raises(OSError, match="decoder"):
+        check_whole(data[:-4])
+
+
+def test_a_damaged_picture_takes_no_place_from_a_good_one(bags, tmp_path):
+    taken_at = []
+
+    def spoil(topic, message, time):
+        """Every second picture is cut off; the one after it is taken in the same cell, farther from its middle."""
+        if topic != "/panorama/compressed":
+            return
+        if len(taken_at) % 2 == 0:
+            message.data = message.data[: len(message.data) // 2]
+        else:
+            moment = taken_at[-1] + SECOND // 10
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(moment, SECOND)
+        taken_at.append(time)
+
+    drive = drive_of(rewrite(bags, tmp_path / "x.bag", spoil), places_of(bags))
+    assert {step: picture.index for step, picture in drive.pictures.items()} == {
+        step: step + 1 for step in range(0, len(tour()) - 1, 2)
+    }
+    assert PanoramaReader(drive, CAMERA).panorama(4) is not None
 
 
 def test_messages_of_another_definition_are_lost_and_counted(bags, tmp_path):
@@ -216,6 +267,64 @@ def test_pictures_in_a_gap_of_the_pose_are_passed_over(bags, tmp_path):
 
     drive = drive_of(rewrite(bags, tmp_path / "x.bag", lose), places_of(bags), LogConfig(longest_gap=1.0))
     assert any("pictures are passed over: no pose is near" in note for note in drive.notes)
+
+
+def localised(is_heard):
+    """Odometry is whole; localisation is left out where ``is_heard`` of the cells driven is False."""
+
+    def edit(topic, message, time):
+        if topic == "/tf" and not is_heard(step_of(time)):
+            message.transforms = [each for each in message.transforms if each.child_frame_id == "base_link"]
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    "is_heard", [lambda step: not 8.0 < step < 17.0, lambda step: step < 15.0, lambda step: step > 8.0]
+)
+def test_a_gap_of_localisation_is_told_though_odometry_goes_on(bags, tmp_path, is_heard):
+    drive = drive_of(
+        rewrite(bags, tmp_path / "x.bag", localised(is_heard)), places_of(bags), LogConfig(longest_gap=1.0)
+    )
+    told, over = drive.notes
+    assert told.startswith("pose: map -> odom: 1 gaps of more than 1 s, the longest of")
+    assert "pictures are passed over: no pose is near" in over
+    assert drive.path == tuple(tour())
+    moments = np.array([step_of(time) for time in drive.times])
+    heard = moments[[is_heard(moment) for moment in moments]]
+    distances = np.abs(moments[:, None] - heard).min(axis=1) * writing.SECONDS_A_CELL
+    assert sorted(drive.pictures) == np.flatnonzero(distances <= 1.0).tolist()
+
+
+def test_localisation_that_seldom_speaks_has_no_gap_but_a_note(bags, tmp_path):
+    spoken = {step_of(time) for time in Log(bags / "tour.bag").bag.times["/tf"][::5]}
+    bag = rewrite(bags, tmp_path / "x.bag", localised(lambda step: step in spoken))
+    drive = drive_of(bag, places_of(bags), LogConfig(longest_gap=1.0))
+    (told,) = drive.notes
+    assert told.startswith("pose: map -> odom: 5 messages at no steady rate, with pauses of up to")
+    assert sorted(drive.pictures) == list(range(len(tour())))
+    assert drive.path == tuple(tour())
+
+
+def test_a_gap_of_all_transforms_is_told_once(bags, tmp_path):
+    def lose(topic, message, time):
+        return topic not in ("/tf", "/odom") or not 8.0 < step_of(time) < 17.0
+
+    notes = drive_of(rewrite(bags, tmp_path / "x.bag", lose), places_of(bags), LogConfig(longest_gap=1.0)).notes
+    assert [note[:40] for note in notes if note.startswith("pose")] == ["pose: 1 gaps of more than 1 s, the longe"]
+
+
+@pytest.mark.parametrize("first", [4.0, 10.0])
+def test_pictures_outside_of_the_drive_are_passed_over_and_told(bags, tmp_path, first):
+    def late(topic, message, time):
+        return step_of(time) >= first if topic == "/panorama/compressed" else step_of(time) < 8.0
+
+    log = Log(rewrite(bags, tmp_path / "x.bag", late))
+    drive = read_drive(log, places_of(bags))
+    outside = sum(step_of(picture.time) >= 8.0 for picture in log.pictures)
+    assert len(drive.pictures) == len(log.pictures) - outside
+    told = f"/panorama/compressed: {outside} of {len(log.pictures)} pictures are passed over: before the first cell or"
+    assert [note for note in drive.notes if "picture" in note] == [f"{told} after the last pose"]
 
 
 def test_stamps_of_another_clock_give_way_to_the_recording(bags, tmp_path):
@@ -364,20 +473,67 @@ def test_blocks_after_a_damaged_one_are_kept(bags, tmp_path):
     assert f"{whole - kept} of {whole} are lost" in Log(bag).problems[0]
 
 
-def test_rows_around_a_damaged_page_are_kept(bags, tmp_path):
-    copy = tmp_path / name_of(BagFormat.ROS2)
+def damaged_page(bags, out, kind):
+    """The tour in sqlite, where the middle one of the pages of a kind is damaged."""
+    copy = out / name_of(BagFormat.ROS2)
     shutil.copytree(bags / copy.name, copy)
-    file = storage_of(tmp_path, BagFormat.ROS2)
+    file = storage_of(out, BagFormat.ROS2)
     with sqlite3.connect(file) as connection:
         (size,) = connection.execute("PRAGMA page_size").fetchone()
     data = bytearray(file.read_bytes())
-    # A leaf of the table of messages in the middle of the file: type 13, several cells.
-    leaves = [at for at in range(0, len(data), size) if data[at] == 13 and data[at + 3 : at + 5] > b"\0\2"]
-    data[leaves[len(leaves) // 2]] = 0xFF
+    pages = [at for at in range(0, len(data), size) if kind(data[at : at + size])]
+    place = pages[len(pages) // 2]
+    data[place : place + 4] = b"\xff" * 4
     file.write_bytes(data)
+    return copy
+
+
+def leaf(page):
+    """Of the table of messages: type 13, several cells."""
+    return page[0] == 13 and page[3:5] > b"\0\2"
+
+
+def overflow(page):
+    """What of a message does not fit into the table; it begins with the number of the page on which that goes on."""
+    return 0 < int.from_bytes(page[:4], "big") < 2**16
+
+
+@pytest.mark.parametrize("kind", [leaf, overflow])
+def test_rows_around_a_damaged_page_are_kept(bags, tmp_path, kind):
+    copy = damaged_page(bags, tmp_path, kind)
     kept, whole = count_of(copy), count_of(bags / copy.name)
     assert whole / 2 < kept < whole
     assert f"{whole - kept} of {whole} are lost" in Log(copy).problems[0]
+
+
+@pytest.mark.parametrize("kind", [leaf, overflow])
+def test_rows_behind_a_damaged_page_stay_in_the_order_of_time(bags, tmp_path, kind):
+    copy = damaged_page(bags, tmp_path, kind)
+    log = Log(copy)
+    moments = [message.time for message in log.bag.messages(log.bag.topics)]
+    assert moments == sorted(moments)
+    # What a map that is left shows is known from its time on, and not from the end of the drive.
+    drive, maps = read_drive(log, places_of(bags)), {message.time for message in log.read_maps()}
+    times = Log(bags / "tour.bag").bag.times["/map"]
+    steps = np.array([step for step, time in enumerate(times) if time in maps])
+    assert len(tour()) // 2 < len(steps)
+    seen = first_seen_along(WORLD, tour())
+    late = np.append(steps, NEVER_SEEN)[np.searchsorted(steps, np.where(seen == NEVER_SEEN, steps[-1] + 1, seen))]
+    path = set(drive.path)
+    for cell in np.argwhere(late != NEVER_SEEN):
+        if tuple(cell.tolist()) not in path:
+            assert drive.times[drive.first_seen[tuple(cell)]] == times[late[tuple(cell)]]
+
+
+def test_files_of_a_recording_that_was_killed_are_read_by_their_numbers(bags, tmp_path):
+    whole = Log(bags / name_of(BagFormat.ROS2)).bag.times["/map"]
+    ends = [0, whole[7], whole[14], whole[-1] + 1]
+    for number, since, until in zip((1, 2, 10), ends, ends[1:], strict=False):
+        file = tmp_path / f"tour_{number}.db3"
+        shutil.copy(storage_of(bags, BagFormat.ROS2), file)
+        with sqlite3.connect(file) as connection:
+            connection.execute("DELETE FROM messages WHERE timestamp < ? OR timestamp >= ?", (since, until))
+    assert open_bag(tmp_path).times["/map"] == whole
 
 
 def test_what_is_no_bag_is_refused(tmp_path):

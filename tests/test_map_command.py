@@ -260,6 +260,17 @@ def test_clean_writes_over_no_map(office, tmp_path):
         save_map(tmp_path / "clean", TWO_ROOMS, occupancy_map(TWO_ROOMS).frame)
 
 
+@pytest.mark.parametrize("name", ["floor #2", "a: b", "[x]", "- 2", 'the "old" \\ wing', "étage 😀"])
+def test_a_map_of_any_name_is_read_back(tmp_path, name):
+    file = tmp_path / f"{name}.yaml"
+    frame = occupancy_map(TWO_ROOMS).frame
+    image = save_map(file, TWO_ROOMS, frame)
+    read = load_map(file)
+    assert (read.settings.image, read.frame) == (image, frame)
+    # Other programs read it as plain YAML.
+    assert yaml.safe_load(file.read_text("utf-8"))["image"] == image.name
+
+
 # Label.
 
 

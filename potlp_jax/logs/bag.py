@@ -9,6 +9,7 @@ References:
 """
 
 import contextlib
+import re
 import sqlite3
 import struct
 from collections.abc import Callable, Collection, Iterator
@@ -127,13 +128,18 @@ def _files(path: Path) -> list[Path]:
         if path.suffix not in FORMATS:
             raise LogError(f"{path}: {path.suffix or 'no ending'} is no format of logs; known are {', '.join(FORMATS)}")
         return [path]
-    # Sorted by name: recordings that were split are numbered.
-    files = [file for ending in (".db3", ".mcap") for file in sorted(path.glob(f"*{ending}"))]
+    files = [file for ending in (".db3", ".mcap") for file in sorted(path.glob(f"*{ending}"), key=_numbered)]
     if not files:
         raise LogError(f"{path}: is no ROS 2 bag, for there is no .db3 or .mcap file in it")
     if len({file.suffix for file in files}) > 1:
         raise LogError(f"{path}: holds .db3 and .mcap files; give one of them")
     return files
+
+
+def _numbered(file: Path) -> list[str | int]:
+    """Sorts the files of a recording that was split by their numbers: 10 comes after 2."""
+    # Texts and numbers take turns, so that like is compared with like.
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", file.name)]
 
 
 def _count(
@@ -299,7 +305,7 @@ def _mcap_records(stream: BufferedReader | BytesIO) -> Iterator[tuple[int, bytes
 
 
 def _scan_sqlite(file: Path) -> Iterator[RawMessage]:
-    """Rows from the front until a page is damaged, then from the back."""
+    """Rows in the order of their ids: up to a damaged page, then those behind the last damaged one."""
     # As a URI, in which a question mark or a percent sign of the name must be escaped.
     connection = sqlite3.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True)
     with contextlib.closing(connection):
@@ -316,6 +322,21 @@ def _scan_sqlite(file: Path) -> Iterator[RawMessage]:
                 last = number
                 yield RawMessage(*topics[topic], time, data)
             return
-        with contextlib.suppress(sqlite3.DatabaseError):
-            for _, topic, time, data in connection.execute(f"{rows} WHERE id > ? ORDER BY id DESC", (last,)):
-                yield RawMessage(*topics[topic], time, data)
+        # A walk forward would end at the damaged page again, so that each row behind it is found by its id.
+        for number in _ids_behind(connection, last):
+            # Data may go on in other pages, of which one may be damaged too: that row alone is lost.
+            with contextlib.suppress(sqlite3.DatabaseError):
+                for _, topic, time, data in connection.execute(f"{rows} WHERE id = ?", (number,)):
+                    yield RawMessage(*topics[topic], time, data)
+
+
+def _ids_behind(connection: sqlite3.Connection, last: int) -> list[int]:
+    """Ids of the messages after one, in order, as far as they can be found from the end of the table."""
+    ids: list[int] = []
+    # Ids alone: messages in the order of the walk would be in reverse, and time with them.
+    with contextlib.suppress(sqlite3.DatabaseError):
+        for (number,) in connection.execute(
+            "SELECT id FROM messages NOT INDEXED WHERE id > ? ORDER BY id DESC", (last,)
+        ):
+            ids.append(number)
+    return ids[::-1]

@@ -124,6 +124,8 @@ def _pose_problem(log: Log) -> str | None:
 
 
 def _picture_problem(log: Log) -> str | None:
+    if not log.pictures and log.image_topic is not None:
+        return f"no picture can be read from {log.image_topic}"
     if not log.pictures:
         return f"no picture: record a topic of type {IMAGE_TYPE}"
     try:

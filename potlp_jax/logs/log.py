@@ -24,7 +24,7 @@ from potlp_jax.environments.ros.map_settings import LARGEST_NUMBER, LARGEST_PIXE
 from potlp_jax.environments.ros.occupancy_map import OCCUPIED
 from potlp_jax.errors import LogError
 from potlp_jax.files import reading, short
-from potlp_jax.images import decode_image, image_size
+from potlp_jax.images import check_whole, decode_image, image_size
 from potlp_jax.logs.bag import RawMessage, open_bag
 from potlp_jax.logs.transforms import Edge, Quaternion, Transforms, yaw_of
 
@@ -293,12 +293,19 @@ class Log:
             self.last_map = found
 
     def _keep_picture(self, message: RawMessage, fields: Any, index: int) -> None:
+        data = bytes(fields.data)
         try:
             # The header alone: sizes are wanted now, pixels later and not of all.
             with reading(self.path, LogError, "a picture"):
-                width, height = image_size(bytes(fields.data))
+                width, height = image_size(data)
         except LogError as error:
             raise _LostError(f"format {short(fields.format)} is no JPEG or PNG, or it is damaged") from error
+        try:
+            # Now and not with the pixels: a picture that is lost must be counted, and take no other one's place.
+            with reading(self.path, LogError, "a picture"):
+                check_whole(data)
+        except LogError as error:
+            raise _LostError("pictures that are cut off or damaged") from error
         time = self._time(message, fields.header.stamp)
         self.pictures.append(Picture(index, time, fields.header.frame_id.lstrip("/"), width, height))
 

@@ -61,17 +61,21 @@ def match_pictures(
     """
     # Before the robot entered its first cell, or after its last pose, there is no cell to which a picture belongs.
     taken = [picture for picture in log.pictures if times[0] <= picture.time <= poses.times[-1]]
-    if not taken:
+    if not log.pictures:
         notes.append(
             "no picture: policies that take panoramas, and datasets, need a topic of type sensor_msgs/CompressedImage"
         )
+    if len(taken) < len(log.pictures):
+        notes.append(
+            f"{log.image_topic}: {len(log.pictures) - len(taken)} of {len(log.pictures)} pictures are passed over: "
+            "before the first cell or after the last pose"
+        )
+    if not taken:
         return {}, {}
     moments = np.array([picture.time for picture in taken])
     gap = int(log.config.longest_gap * SECOND)
-    # The poses just before and just after each picture; at the ends one of them twice.
-    after = np.clip(np.searchsorted(poses.times, moments), 1, max(len(poses.times) - 1, 1))
-    around = np.stack([poses.times[after - 1], poses.times[np.minimum(after, len(poses.times) - 1)]])
-    is_near = np.min(np.abs(around - moments), axis=0) <= gap
+    # Near in each of the transforms: odometry goes on where localisation has lost the robot.
+    is_near = np.all([_distances(track, moments) <= gap for track in poses.heard], axis=0)
     if not is_near.all():
         notes.append(f"{log.image_topic}: {np.sum(~is_near)} of {len(taken)} pictures are passed over: no pose is near")
     assert log.map_frame is not None
@@ -92,6 +96,14 @@ def match_pictures(
             # Headings grow counter-clockwise with y upward, bearings clockwise with rows downward.
             bearings[step] = -(float(headings_taken[index]) - frame.yaw)
     return pictures, bearings
+
+
+def _distances(times: Int64[np.ndarray, "..."], moments: Int64[np.ndarray, "N"]) -> Int64[np.ndarray, "N"]:
+    """From each moment to the nearest of some times in order."""
+    # The times just before and just after; at the ends one of them twice.
+    after = np.clip(np.searchsorted(times, moments), 1, max(len(times) - 1, 1))
+    around = np.stack([times[after - 1], times[np.minimum(after, len(times) - 1)]])
+    return np.min(np.abs(around - moments), axis=0)
 
 
 def _headings(

@@ -13,13 +13,24 @@ from potlp_jax.logs.log import SECOND, Log
 from potlp_jax.logs.working_grid import WorkingGrid
 from potlp_jax.world.moves import Cell
 
+MOST_PAUSES = 0.1
+"""Share of a transform's intervals that may be too long, where it is published at a steady rate."""
+
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Where the robot was, in metres in the frame of the map."""
+    """Where the robot was, in metres in the frame of the map.
+
+    Attributes:
+        times: in nanoseconds.
+        points: at these times.
+        heard: when each transform that a pose is made of was published, of those that are published at a steady rate.
+            Far from any of these times there is no telling where the robot was.
+    """
 
     times: Int64[np.ndarray, "N"]
     points: Float64[np.ndarray, "N 2"]
+    heard: tuple[Int64[np.ndarray, "..."], ...]
 
 
 def read_poses(log: Log, notes: list[str]) -> Poses:
@@ -60,7 +71,43 @@ def read_poses(log: Log, notes: list[str]) -> Poses:
             f"pose: {len(long)} gaps of more than {log.config.longest_gap:g} s, the longest of {long.max():.1f} s; the "
             "path across is taken to be the shortest in the final map"
         )
-    return Poses(times, log.transforms.poses(frame, base, times)[:, :2, 3])
+    return Poses(times, log.transforms.poses(frame, base, times)[:, :2, 3], _heard(log, times, notes))
+
+
+def _heard(log: Log, times: Int64[np.ndarray, "N"], notes: list[str]) -> tuple[Int64[np.ndarray, "..."], ...]:
+    """``Poses.heard`` of poses at some times; pauses of any transform are noted."""
+    assert log.map_frame is not None
+    assert log.base_frame is not None
+    heard = []
+    for (parent, child), track in log.transforms.tracks(log.map_frame, log.base_frame).items():
+        pauses = _pauses(track, times, log.config.longest_gap)
+        # Some mapping publishes a correction only when there is a new one: its silence says that nothing has changed.
+        is_steady = len(pauses) <= MOST_PAUSES * max(len(track) - 1, 1)
+        if is_steady:
+            heard.append(track)
+        if len(pauses) and is_steady:
+            notes.append(
+                f"pose: {parent} -> {child}: {len(pauses)} gaps of more than {log.config.longest_gap:g} s, the longest "
+                f"of {pauses.max():.1f} s; the path across goes by the other transforms"
+            )
+        elif len(pauses):
+            notes.append(
+                f"pose: {parent} -> {child}: {len(track)} messages at no steady rate, with pauses of up to "
+                f"{pauses.max():.1f} s: between two it is interpolated, and nothing counts as a gap"
+            )
+    return tuple(heard)
+
+
+def _pauses(
+    track: Int64[np.ndarray, "..."], times: Int64[np.ndarray, "N"], longest: float
+) -> Float64[np.ndarray, "..."]:
+    """Seconds, above ``longest``, for which there were poses at ``times`` and none of the transform's messages."""
+    between = np.diff(times)
+    # Where there are no poses either, that is a gap of its own.
+    driven = np.where(between <= longest * SECOND, between, 0)
+    # Counted by how many of its messages were before: so it also may begin too late, or end too early.
+    seconds = np.bincount(np.searchsorted(track, times[:-1] + between // 2), weights=driven) / SECOND
+    return seconds[seconds > longest]
 
 
 def drive_path(

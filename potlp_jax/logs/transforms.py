@@ -76,12 +76,15 @@ class Transforms:
             goal = step[0][0] if step[1] else step[0][1]
         return tuple(reversed(steps))
 
+    def tracks(self, parent: str, child: str) -> dict[Edge, Int64[np.ndarray, "..."]]:
+        """When each moving edge between two frames was recorded, in order."""
+        moving = [edge for edge, _ in self.chain(parent, child) or () if edge in self._moving]
+        return {edge: np.unique(np.array(self._moving[edge].times, np.int64)) for edge in moving}
+
     def times(self, parent: str, child: str) -> Int64[np.ndarray, "N"]:
         """When the edge between two frames that was recorded most often was recorded, in order; empty if none moves."""
-        tracks = [self._moving[edge] for edge, _ in self.chain(parent, child) or () if edge in self._moving]
         # Odometry is published faster than localisation corrects it: the fastest edge has the finest times.
-        longest = max(tracks, key=lambda track: len(track.times), default=_Track())
-        return np.unique(np.array(longest.times, np.int64))
+        return max(self.tracks(parent, child).values(), key=len, default=np.array([], np.int64))
 
     def poses(self, parent: str, child: str, times: Int64[np.ndarray, "N"]) -> Float64[np.ndarray, "N 4 4"]:
         """Where one frame lies in another at some times.

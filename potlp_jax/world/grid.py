@@ -298,7 +298,7 @@ def moved_layer(
 
 def belief_from_numpy(
     cells: Num[np.ndarray, "H W"],
-    letters: Int[np.ndarray, "H W"],
+    letters: Int[np.ndarray, "..."],
     resolution: float = 1.0,
     extent: tuple[int, int] | None = None,
     propositions: Sequence[str] = (),
@@ -307,7 +307,7 @@ def belief_from_numpy(
 
     Args:
         cells: ``BeliefMap.UNKNOWN``, ``FREE`` or ``OCCUPIED`` (-1, 0, 1) in any type of number.
-        letters: the letter of each cell in any integer type, 0 where it is not observed.
+        letters: the letter of each cell in any integer type, 0 where it is not observed; of the shape of ``cells``.
         resolution: length of a cell's side in the unit of cost.
         extent: rows and columns without padding; default: those of the arrays.
         propositions: names of the bits of a letter, in order. A task of other ones is refused, so that a robot names
@@ -317,12 +317,15 @@ def belief_from_numpy(
         The belief as the planner takes it.
 
     Raises:
-        WorldError: where an entry of ``cells`` is none of the three, an unobserved cell has a letter, a letter has a
-            bit without a name, or the resolution is not positive.
+        WorldError: where the shapes disagree, an entry of ``cells`` is none of the three, an unobserved cell has a
+            letter, a letter has a bit without a name, or the resolution is not positive.
         TaskError: where the propositions are no distinct names, or too many.
     """
     names = check_propositions(propositions)
     _check_resolution(resolution)
+    # First, for letters of a row, a column or a cell would be compared with every cell, and taken for all of them.
+    if letters.shape != cells.shape or cells.ndim != 2 or cells.size == 0:
+        raise WorldError(f"cells {cells.shape} and letters {letters.shape} must have one shape [H, W], not empty")
     if not np.isin(cells, (BeliefMap.UNKNOWN, BeliefMap.FREE, BeliefMap.OCCUPIED)).all():
         raise WorldError(f"a belief's cells must be -1, 0 or 1, found {np.unique(cells).tolist()[:8]}")
     # Goals of which the robot is told beforehand would be letters of unobserved cells; the model has none.

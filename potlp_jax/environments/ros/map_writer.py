@@ -1,5 +1,6 @@
 """Writes occupancy maps in the format that `potlp_jax.environments.ros.occupancy_map` reads."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -35,9 +36,12 @@ def save_map(file: Path, free: Bool[np.ndarray, "H W"], frame: GridFrame) -> Pat
     image = file.with_suffix(".pgm")
     pixels = np.where(free, FREE_GREY, OCCUPIED_GREY).astype(np.uint8)
     image.write_bytes(f"P5\n{frame.width} {frame.height}\n255\n".encode() + pixels.tobytes())
+    # Quoted, for names may hold what YAML reads as a comment, a key or a list. A text of JSON is one of YAML too, but
+    # for characters that are escaped in halves.
+    name = json.dumps(image.name, ensure_ascii=False)
     # ``!r`` is the shortest text that reads back as the same float.
     file.write_text(
-        f"image: {image.name}\n"
+        f"image: {name}\n"
         "mode: trinary\n"
         f"resolution: {frame.resolution!r}\n"
         f"origin: [{frame.x!r}, {frame.y!r}, {frame.yaw!r}]\n"
