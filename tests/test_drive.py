@@ -9,6 +9,7 @@ import time
 
 import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -26,15 +27,17 @@ from potlp_jax.drive.driving import drive_robot
 from potlp_jax.drive.inbox import Inbox
 from potlp_jax.drive.lattice import Lattice, LatticeConfig, Scan, bucket
 from potlp_jax.drive.messages import make_path, make_pose, picture_of, pose_of, regions_of, scan_of, stamp_of
-from potlp_jax.drive.movers import Adviser
+from potlp_jax.drive.movers import Adviser, Navigator, mover_of
 from potlp_jax.drive.robot import RemoteRobot
 from potlp_jax.drive.rosbridge import RosbridgeLink, parse_url
 from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.places import Disc, Polygon
 from potlp_jax.errors import RobotError
+from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import load_trial
+from potlp_jax.trials.rules import Stop
 from potlp_jax.world.grid import BeliefMap
 
 TASK = Task.from_formula("!fire U exit", FLOOR.propositions)
@@ -326,10 +329,75 @@ def test_a_map_that_says_the_same_is_no_reason_to_give_up(seed):
     assert run_stream(seed, {})["end"] == "satisfied"
 
 
-# Drives, in the simulation's time.
+# Goals of Nav2.
 
 
 ORDINARY = Behaviour()
+
+
+class Lossy(SimulatedLink):
+    """Knows which goals were sent and taken back, and loses both while it is not connected."""
+
+    def __init__(self):
+        super().__init__(FLOOR, ORDINARY, Network(Perturbation(), np.random.default_rng(0)))
+        self.ends = {}
+
+    def send_goal(self, action, kind, goal, done):
+        if not self.is_connected:
+            done(False, "not asked: the connection is lost")
+            return ""
+        self.ends[f"goal {len(self.ends)}"] = done
+        return f"goal {len(self.ends) - 1}"
+
+    def cancel(self, action, goal):
+        if self.is_connected:
+            self.cancelled.append(goal)
+
+
+def navigator():
+    link = Lossy()
+    mover = Navigator(link, Mode.NAVIGATE)
+    mover.begin([(1.0, 0.0)], "map")
+    return link, mover
+
+
+def test_a_goal_that_was_not_sent_leaves_the_one_before_to_be_taken_back():
+    link, mover = navigator()
+    link.is_connected = False
+    mover.begin([(2.0, 0.0)], "map")
+    assert not mover.ended().succeeded
+    link.is_connected = True
+    mover.stop()
+    assert link.cancelled == ["goal 0"]
+
+
+def test_a_goal_that_could_not_be_taken_back_is_taken_back_later():
+    link, mover = navigator()
+    link.is_connected = False
+    mover.stop()
+    assert not link.cancelled
+    link.is_connected = True
+    mover.stop()
+    assert link.cancelled == ["goal 0"]
+
+
+def test_all_goals_whose_end_was_not_heard_are_taken_back_and_no_other():
+    link, mover = navigator()
+    for _ in range(3):
+        mover.begin([(2.0, 0.0)], "map")
+    link.ends["goal 1"](False, "preempted")
+    assert mover.ended() is None
+    mover.stop()
+    assert link.cancelled == ["goal 0", "goal 2", "goal 3"]
+    for name in link.cancelled:
+        link.ends[name](False, "canceled")
+    # Of what was taken back, the end concerns nobody.
+    assert mover.ended() is None
+    mover.stop()
+    assert len(link.cancelled) == 3
+
+
+# Drives, in the simulation's time.
 
 
 def begun(mode, behaviour=ORDINARY, *, before=lambda _link: None, options=None, **settings):
@@ -393,6 +461,73 @@ def test_a_robot_that_is_silent_for_good_ends_the_drive():
     (trial,), link = driven(Mode.NAVIGATE, Behaviour(silent=(2.0, math.inf)), silence=0.5, patience=5.0)
     assert trial.outcome == "unfinished"
     assert link.cancelled
+
+
+def on_the_floor(mode=Mode.NAVIGATE, behaviour=ORDINARY, **options):
+    """A robot that has been observed, where it is, its link, and what it said."""
+    config, said = dataclasses.replace(CONFIG, mode=mode, patience=5.0), []
+    link = SimulatedLink(FLOOR, behaviour, Network(Perturbation(), np.random.default_rng(0)))
+    inbox = SteppedInbox(link, config, TASK.propositions)
+    for topic, (kind, _) in inbox.handlers.items():
+        link.subscribe(topic, kind, lambda message, topic=topic: inbox.handle(topic, message))
+    mover = mover_of(config, link)
+    robot = RemoteRobot(inbox, mover, config, TASK.propositions, clock=link.clock, say=said.append, **options)
+    return robot, robot.observe()[1], link, said
+
+
+def way(cell, length):
+    """A path to the right."""
+    cells = jnp.array([[cell[0], cell[1] + number] for number in range(length + 1)], jnp.int32)
+    states, cost = jnp.zeros(length + 1, jnp.int32), jnp.float32(length)
+    return KnownPath(cells=cells, states=states, length=jnp.int32(length), cost=cost)
+
+
+# A leg ends at once, or where its path does.
+AT_ONCE, AT_THE_END = (
+    Stop(replan_distance=jnp.float32(99), budget=jnp.float32(budget), is_frontier=jnp.bool_(False))
+    for budget in (1, 99)
+)
+
+
+def test_a_robot_that_knows_no_move_stands_though_the_leg_before_left_its_goal():
+    robot, cell, link, _ = on_the_floor()
+    leg = robot.advance(way(cell, 5), AT_ONCE)
+    # On purpose: a robot does not halt for a decision.
+    assert 0 < len(leg.cells) < 5
+    assert not link.cancelled
+    _, cell = robot.observe()
+    # Of the moment in which it is stopped.
+    assert len(robot.advance(way(cell, 0), AT_THE_END).cells) <= 1
+    assert link.cancelled == ["goal 0"]
+    assert not link._way
+
+
+def test_a_goal_is_taken_back_again_when_the_robot_is_heard_again():
+    class Deaf(SimulatedLink):
+        """Loses what it is told for a while, and says nothing meanwhile."""
+
+        def cancel(self, action, goal):
+            if self.time >= self._behaviour.silent[1]:
+                super().cancel(action, goal)
+
+    config = dataclasses.replace(CONFIG, mode=Mode.NAVIGATE, silence=0.5)
+    link = Deaf(FLOOR, Behaviour(silent=(2.0, 4.0), speed=0.1), Network(Perturbation(), np.random.default_rng(0)))
+    inbox = SteppedInbox(link, config, TASK.propositions)
+    drive = drive_robot(link, TASK, "baseline", jax.random.key(0), config, inbox=inbox, clock=link.clock)
+    ways = []
+
+    def told(topic, kind, message, publish=link.publish):
+        if topic == "/potlp/state" and "heard again" in message["data"]:
+            ways.append((tuple(link.cancelled), list(link._way)))
+        publish(topic, kind, message)
+
+    link.publish = told
+    next(drive)
+    drive.close()
+    # Before the next decision.
+    assert len(ways) == 1
+    assert ways[0][0]
+    assert not ways[0][1]
 
 
 def test_a_dry_run_decides_once_and_publishes_nothing():

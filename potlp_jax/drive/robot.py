@@ -206,6 +206,8 @@ class RemoteRobot:
                 return False
             self._inbox.wait(POLL)
         if silent:
+            # The silence may have been that of the connection, over which nothing was taken back.
+            self._mover.stop()
             self._say("the robot's pose is heard again")
         return True
 
@@ -245,6 +247,8 @@ class RemoteRobot:
 
     def _await_map(self) -> Leg:
         """Stand until more or something else is known, for there is nowhere to go."""
+        # A leg that ended for a new decision has left its goal on its way.
+        self._mover.stop()
         begun, known = self._clock(), self._known()
         # A map that came anew, or turned a little, may say the same once more: what is missing may still be on its way.
         while self._clock() - begun < self._config.patience and not self._has_changed(known):
