@@ -272,6 +272,24 @@ def test_a_wheel_that_turns_is_no_pose():
     assert len(inbox.heard.poses) == poses == 1
 
 
+def test_a_silent_odometry_is_silent_whatever_slam_repeats():
+    now = [100.0]
+    inbox = Inbox(CONFIG, FLOOR.propositions, clock=lambda: now[0])
+    inbox.handle("/map", grid(1, [[0]]))
+    # Where it is on the robot does not change, and may be repeated, too.
+    inbox.handle("/tf_static", {"transforms": [transform(0, "base_footprint", "base_link", 0.0)]})
+    inbox.handle("/tf", {"transforms": [transform(1, "odom", "base_footprint", 1.0)]})
+    for second in range(1, 30):
+        now[0] = 100.0 + second
+        inbox.handle("/tf", {"transforms": [transform(1 + second, "map", "odom", 0.1 * second)]})
+        inbox.handle("/tf_static", {"transforms": [transform(1 + second, "base_footprint", "base_link", 0.0)]})
+        # The correction itself is not lost.
+        assert inbox.heard.pose[0] == pytest.approx(1.0 + 0.1 * second)
+    assert now[0] - inbox.heard.heard == 29
+    inbox.handle("/tf", {"transforms": [transform(31, "odom", "base_footprint", 2.0)]})
+    assert now[0] == inbox.heard.heard
+
+
 def test_what_cannot_be_read_is_counted_and_changes_nothing():
     inbox = Inbox(CONFIG, FLOOR.propositions)
     before = inbox.heard
