@@ -1,6 +1,7 @@
 """A robot behind rosbridge: maps on one lattice, messages in any order, advice, navigation, silence, another task."""
 
 import base64
+import contextlib
 import dataclasses
 import json
 import math
@@ -21,6 +22,7 @@ from eval.live.simulator import FLOOR, Behaviour, SimulatedLink, SteppedInbox
 from potlp_jax.cli import app
 from potlp_jax.cli.drive import _interruption, _write
 from potlp_jax.cli.inputs import RECORD
+from potlp_jax.cli.output import FAILED
 from potlp_jax.cli.view import PAGE
 from potlp_jax.drive.config import DriveConfig, Mode, Topics
 from potlp_jax.drive.driving import drive_robot
@@ -583,14 +585,46 @@ def test_a_formula_that_comes_while_somebody_has_the_record_is_the_next_task():
     assert [trial.task_text for trial in drive] == ["!fire U exit"]
 
 
+def interrupted_drive(when, behaviour=ORDINARY, *, before=lambda _link: None, **settings):
+    """Trials of a drive that is interrupted when a condition on the link and the decisions holds, and the link."""
+    decisions = []
+    options = {"interrupted": lambda: when(link, decisions), "listener": lambda *decision: decisions.append(decision)}
+    drive, link = begun(Mode.NAVIGATE, behaviour, before=before, options=options, **settings)
+    return list(drive), link
+
+
 def test_who_interrupts_a_drive_has_its_record():
-    asked = iter(range(1000))
-    drive, link = begun(Mode.NAVIGATE, options={"interrupted": lambda: next(asked) > 0})
-    link.ask_for("F exit")
-    (trial,) = drive
+    (trial,), link = interrupted_drive(lambda link, _: bool(link.goals))
     assert trial.outcome == "unfinished"
     assert trial.decisions
-    assert link.cancelled
+    assert link.cancelled == link.goals == ["goal 0"]
+
+
+def test_after_an_interruption_no_goal_is_sent():
+    # Nor is the task begun that is asked for.
+    (trial,), link = interrupted_drive(lambda _, decisions: bool(decisions), before=lambda link: link.ask_for("F exit"))
+    assert trial.outcome == "unfinished"
+    assert len(trial.decisions) == 1
+    assert not link.goals
+
+
+def test_before_the_first_decision_an_interruption_ends_the_drive_without_a_record():
+    # Without a map, and where the map has no cell for the robot.
+    trials, link = interrupted_drive(lambda link, _: link.time > 1.0, topics=Topics(map="/other"), patience=20.0)
+    assert not trials
+    assert link.time < 2.0
+    trials, link = interrupted_drive(lambda link, _: link.time > 1.0, patience=20.0, radius=1.5)
+    assert not trials
+    assert link.time < 2.0
+
+
+def test_who_waits_for_a_silent_robot_may_interrupt():
+    (trial,), link = interrupted_drive(
+        lambda link, _: link.time > 6.0, behaviour=Behaviour(silent=(2.0, math.inf)), silence=0.5, patience=100.0
+    )
+    assert trial.outcome == "unfinished"
+    assert "no pose" in trial.decisions[-1].failure
+    assert link.time < 7.0
 
 
 def test_ctrl_c_is_asked_for_and_a_second_one_ends_at_once():
@@ -661,6 +695,16 @@ def test_a_goal_is_not_kept_for_later_while_the_connection_is_lost(server):
     )
     assert told == [(False, "/follow_path was not asked: the connection is lost")]
     link.cancel("/follow_path", goal)
+
+
+def test_the_command_says_that_it_was_interrupted_before_the_first_decision(server, tmp_path, monkeypatch):
+    pytest.importorskip("roslibpy")
+    monkeypatch.setattr("potlp_jax.cli.drive._interruption", lambda: contextlib.nullcontext(lambda: True))
+    asked = ["--task", TASK.text, "--propositions", ",".join(FLOOR.propositions), "--out", str(tmp_path / "drive")]
+    result = CliRunner().invoke(app, ["drive", f"127.0.0.1:{server.port}", *asked])
+    assert result.exit_code == FAILED
+    assert "interrupted before the first decision" in result.output
+    assert not list(tmp_path.rglob(RECORD))
 
 
 @pytest.mark.parametrize("broken", [False, True])

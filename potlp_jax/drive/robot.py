@@ -39,6 +39,10 @@ ASTRAY: int = 2
 """Cells from the path from which on a robot that somebody else drives goes elsewhere, and is advised anew."""
 
 
+class InterruptionError(Exception):
+    """Whoever drives has ended the drive before its first decision: there is nothing to record."""
+
+
 class RemoteRobot:
     """A ``GrowingRobot`` behind an inbox. Where it was last observed is where it is until the next leg."""
 
@@ -52,6 +56,7 @@ class RemoteRobot:
         places: Places | None = None,
         camera: CameraConfig = CameraConfig(),
         interrupted: Callable[[], bool] = lambda: False,
+        replaced: Callable[[], bool] = lambda: False,
         say: Callable[[str], None] = lambda _text: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -65,15 +70,17 @@ class RemoteRobot:
             places: where propositions hold that are known beforehand.
             camera: of the estimator.
             interrupted: whether the drive shall end; asked again and again.
+            replaced: whether another task is wanted, to which a trial gives way that has begun; asked likewise.
             say: told in words what a person should know.
             clock: seconds.
 
         Raises:
+            InterruptionError: ``interrupted`` before map and pose had come.
             RobotError: no map or no pose within ``config.patience``, or the robot is not on its map.
         """
         self._inbox, self._mover, self._config = inbox, mover, config
         self._propositions, self._places, self._camera = tuple(propositions), places, camera
-        self._interrupted, self._say, self._clock = interrupted, say, clock
+        self._interrupted, self._replaced, self._say, self._clock = interrupted, replaced, say, clock
         heard = self._await_first()
         assert heard.scan is not None
         self._lattice = Lattice(
@@ -140,7 +147,12 @@ class RemoteRobot:
         row, column = self._reported
         cells = [as_cell(cell) for cell in np.asarray(path.cells)[: int(path.length) + 1]]
         planned = [(there[0] + row, there[1] + column) for there in cells]
-        leg = self._await_map() if len(planned) == 1 else self._travel(planned, stop)
+        if self._gives_way():
+            # No goal is sent any more; what was driven while it was decided is known.
+            self._follow(self._inbox.take_poses())
+            leg = self._halt()
+        else:
+            leg = self._await_map() if len(planned) == 1 else self._travel(planned, stop)
         return Leg(tuple((r - row, c - column) for r, c in leg.cells), leg.ended, leg.failure)
 
     def _travel(self, planned: list[Cell], stop: Stop) -> Leg:
@@ -157,14 +169,22 @@ class RemoteRobot:
             heard = self._inbox.heard
             self._follow(self._inbox.take_poses())
             leg = tuple(self._entered)
-            if self._interrupted():
-                self._mover.stop()
-                return Leg(leg, ended=True)
+            if self._gives_way():
+                return self._halt()
             if failure := self._failure(heard, len(planned), begun, bool(leg)):
                 self._mover.stop()
                 return Leg(leg, ended=not self._is_heard_again(heard), failure=failure)
             if self._is_over(heard, planned, leg, before, stop):
                 return Leg(leg)
+
+    def _gives_way(self) -> bool:
+        """Whether the trial ends here, whatever is left of its task."""
+        return self._interrupted() or self._replaced()
+
+    def _halt(self) -> Leg:
+        """Stop, and move no more; the cells of the leg are on the lattice."""
+        self._mover.stop()
+        return Leg(tuple(self._entered), ended=True)
 
     def _ahead(self, planned: list[Cell]) -> list[Cell]:
         """What of a path on the lattice is left to a robot that drove on while it was decided."""
@@ -196,13 +216,13 @@ class RemoteRobot:
         return heard.heard >= self._end_noticed + SETTLED
 
     def _is_heard_again(self, heard: Heard) -> bool:
-        """Whether poses come, now or within the time that one is patient."""
+        """Whether poses come, now or within the time that one is patient and does not interrupt."""
         begun = self._clock()
         silent = begun - heard.heard > self._config.silence
         if silent:
             self._say("stopped: nothing is heard of the robot's pose")
         while self._clock() - self._inbox.heard.heard > self._config.silence:
-            if self._clock() - begun > self._config.patience:
+            if self._interrupted() or self._clock() - begun > self._config.patience:
                 return False
             self._inbox.wait(POLL)
         if silent:
@@ -238,8 +258,13 @@ class RemoteRobot:
                     f"{'published' if heard.scan is None else topics.pose or topics.tf + ' published'}, and "
                     f"{self._config.base_frame!r} the robot's frame? {self._refused()}"
                 )
-            self._inbox.wait(POLL)
+            self._wait_for_the_first()
         return heard
+
+    def _wait_for_the_first(self) -> None:
+        if self._interrupted():
+            raise InterruptionError
+        self._inbox.wait(POLL)
 
     def _refused(self) -> str:
         refused = self._inbox.refused.most_common(3)
@@ -252,8 +277,8 @@ class RemoteRobot:
         begun, known = self._clock(), self._known()
         # A map that came anew, or turned a little, may say the same once more: what is missing may still be on its way.
         while self._clock() - begun < self._config.patience and not self._has_changed(known):
-            if self._interrupted():
-                return Leg((), ended=True)
+            if self._gives_way():
+                return self._halt()
             self._inbox.wait(POLL)
             self._follow(self._inbox.take_poses())
             # Somebody may carry it on.
@@ -285,7 +310,7 @@ class RemoteRobot:
                     f"within {FARTHEST_SNAP:g} cells: is it localised, and is the radius of {self._config.radius:g} m "
                     "right?"
                 )
-            self._inbox.wait(POLL)
+            self._wait_for_the_first()
 
     def _follow(self, poses: Sequence[Pose]) -> None:
         """Enter the cells that the poses lie in; between cells that are no neighbours, along the shortest path."""
