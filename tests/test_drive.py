@@ -30,10 +30,10 @@ from potlp_jax.drive.inbox import Inbox
 from potlp_jax.drive.lattice import Lattice, LatticeConfig, Scan, bucket
 from potlp_jax.drive.messages import make_path, make_pose, picture_of, pose_of, regions_of, scan_of, stamp_of
 from potlp_jax.drive.movers import Adviser, Navigator, mover_of
-from potlp_jax.drive.robot import RemoteRobot
+from potlp_jax.drive.robot import REASONS, RemoteRobot
 from potlp_jax.drive.rosbridge import RosbridgeLink, parse_url
 from potlp_jax.environments.ros.grid_frame import GridFrame
-from potlp_jax.environments.ros.places import Disc, Polygon
+from potlp_jax.environments.ros.places import Disc, Places, Polygon
 from potlp_jax.errors import RobotError
 from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.task.task import Task
@@ -194,6 +194,30 @@ def test_pictures_raw_and_compressed():
         picture_of({**raw, "encoding": "yuv", "data": ""})
 
 
+def test_a_picture_of_more_than_a_half_circle_is_refused():
+    topic = "/panorama/compressed"
+    inbox = Inbox(dataclasses.replace(CONFIG, topics=Topics(image=topic)), FLOOR.propositions)
+
+    def show(seconds, height):
+        data = base64.b64encode(cv2.imencode(".png", np.zeros((height, 8, 3), np.uint8))[1].tobytes()).decode()
+        inbox.handle(topic, {"header": header(seconds), "data": data, "format": "png"})
+
+    show(1, 4)
+    show(2, 5)
+    assert inbox.heard.picture.shape == (4, 8, 3)
+    (refused,) = inbox.refused
+    assert refused.startswith(f"{topic}: a picture of 8 x 5 pixels")
+
+
+@pytest.mark.parametrize(
+    "setting", [{"radius": math.inf}, {"radius": math.nan}, {"radius": -0.1}, {"camera_yaw": math.nan}]
+)
+def test_settings_that_are_no_numbers_are_refused(setting):
+    (name,) = setting
+    with pytest.raises(RobotError, match=f"{name} is .*; give a"):
+        DriveConfig(**setting)
+
+
 def test_places_are_regions_of_known_propositions():
     text = {"exit": [{"point": [1, 2], "radius": 0.5}, {"polygon": [[0, 0], [1, 0], [1, 1]]}]}
     found = regions_of({"data": json.dumps(text)}, ("fire", "exit"))
@@ -305,14 +329,19 @@ def test_what_cannot_be_read_is_counted_and_changes_nothing():
 # Where places are.
 
 
-def letters_of(rows, exit_at):
-    """Where a robot takes the exit to be, in text: on a map of ``#`` walls, ``.`` floor and ``?`` unseen cells."""
-    inbox, said = Inbox(CONFIG, FLOOR.propositions), []
+def robot_on(rows, seen, **options):
+    """A robot on a map of ``#`` walls, ``.`` floor and ``?`` unseen cells, which has seen places."""
+    inbox = Inbox(CONFIG, FLOOR.propositions)
     inbox.handle("/map", grid(1, [[{"#": 100, ".": 0, "?": -1}[cell] for cell in row] for row in rows]))
     inbox.handle("/tf", {"transforms": [transform(1, "map", "base_link", 0.6)]})
-    place = {"exit": [{"point": list(exit_at), "radius": 0.1}]}
-    inbox.handle("/potlp/places", {"data": json.dumps(place)})
-    robot = RemoteRobot(inbox, Adviser(), CONFIG, FLOOR.propositions, say=said.append)
+    inbox.handle("/potlp/places", {"data": json.dumps(seen)})
+    return RemoteRobot(inbox, Adviser(), CONFIG, FLOOR.propositions, **options)
+
+
+def letters_of(rows, exit_at):
+    """Where a robot takes the exit to be, in text, and what it said."""
+    said = []
+    robot = robot_on(rows, {"exit": [{"point": list(exit_at), "radius": 0.1}]}, say=said.append)
     belief, _ = robot.observe()
     belief, _ = robot.observe()
     assert list(robot.noticed) == said
@@ -331,11 +360,44 @@ def test_a_place_in_a_wall_is_beside_it_and_that_is_said_once():
     ]
 
 
-@pytest.mark.parametrize("rows", [["......", "......", ".##?##", "......"], ["####", "####", "####", "...."]])
-def test_a_place_in_what_is_unseen_or_deep_in_a_wall_is_nowhere(rows):
-    found, said = letters_of(rows, (1.4, 0.65) if "?" in rows[2] else (1.0, 1.4))
+def test_a_place_in_what_is_unseen_is_nowhere_yet():
+    found, said = letters_of(["......", "......", ".##?##", "......"], (1.4, 0.65))
     assert not any("e" in line for line in found)
     assert not said
+
+
+def test_a_place_deep_in_a_wall_is_nowhere_and_that_is_said_once():
+    found, said = letters_of(["####", "####", "####", "...."], (1.0, 1.4))
+    assert not any("e" in line for line in found)
+    assert said == [
+        "exit: point [1.00, 1.40] with radius 0.1 lies in obstacles of the map, no free cell touches it: it is nowhere"
+    ]
+
+
+def test_a_region_without_the_centre_of_a_cell_is_told():
+    # Between the centres of two cells of 0.4 m; a larger one beside it, and one that is not on the map yet.
+    between, beside = [[0.25, 0.25], [0.55, 0.25], [0.55, 0.35]], [[0.25, 0.25], [0.95, 0.25], [0.95, 0.95]]
+    far = [[90.1, 90.1], [93.1, 90.1], [93.1, 93.1]]
+    told = []
+    for polygon in (between, beside, far):
+        place = {"exit": [{"polygon": polygon}]}
+        robot = robot_on(["......"] * 4, place)
+        robot.observe()
+        robot.observe()
+        told.append(robot.noticed)
+    assert told[0] == (
+        "exit: polygon [0.25, 0.25], [0.55, 0.25], [0.55, 0.35] holds the centre of no cell of 0.4 m, and is nowhere: "
+        "make it larger",
+    )
+    assert told[1:] == [(), ()]
+
+
+def test_labels_of_what_the_task_lacks_are_told():
+    region = Disc((0.6, 0.6), 0.1)
+    places = Places((("fir", (region,)), ("exit", (region,)), ("door", (region,))), source="office.yaml")
+    robot = robot_on(["......"] * 4, {}, places=places)
+    assert robot.noticed == ("office.yaml: not used are the places of fir, door: the propositions are fire, exit",)
+    assert np.asarray(robot.observe()[0].letters).max() == 2
 
 
 def test_a_place_that_a_turned_map_walls_in_is_reached():
@@ -459,6 +521,28 @@ def test_advice_is_published_and_nothing_is_commanded():
     assert [(point["x"], point["y"]) for point in exits] == [pytest.approx(FLOOR.frame.cell_to_metres(5, 13))]
 
 
+def test_a_message_that_is_refused_is_told_once_and_counted():
+    def misspell(link):
+        for seconds in (0.0, 5.0):
+            link._network.send(seconds, "/potlp/places", {"data": json.dumps({"fir": [], "exit": []})})
+
+    (trial,), link = driven(Mode.ADVISE, before=misspell)
+    wrong = "/potlp/places: places of 'fir', which is none of fire, exit"
+    assert trial.outcome == "satisfied"
+    assert trial.notes == (f"refused: {wrong} (2 times)",)
+    states = [json.loads(message["data"])["text"] for message in published(link, "/potlp/state")]
+    assert states == [f"refused: {wrong}"]
+
+
+def test_of_many_reasons_for_refusal_some_are_told():
+    robot, _, link, said = on_the_floor(Mode.ADVISE)
+    for number in range(50):
+        link._network.send(link.time, "/potlp/places", {"data": json.dumps({f"fir{number}": []})})
+    link.step(1.0)
+    robot.observe()
+    assert len(said) == len(robot.noticed) == REASONS
+
+
 @pytest.mark.parametrize("mode", [Mode.NAVIGATE, Mode.FOLLOW])
 def test_navigation_is_commanded_and_failures_are_set_aside(mode):
     (trial,), link = driven(mode, Behaviour(failures=3))
@@ -548,6 +632,47 @@ def test_a_goal_is_taken_back_again_when_the_robot_is_heard_again():
     assert len(ways) == 1
     assert ways[0][0]
     assert not ways[0][1]
+
+
+def absurd_map(link):
+    """A map that lies 100 km away."""
+    link._network.send(link.time, "/map", grid(86_400 + link.time, [[0, 0]], x=1e5))
+
+
+def test_a_map_that_cannot_be_laid_is_left_out():
+    robot, cell, link, said = on_the_floor()
+    before, _ = robot.observe()
+    absurd_map(link)
+    link.step(0.1)
+    now, here = robot.observe()
+    assert np.array_equal(now.cells, before.cells)
+    assert here == cell
+    (told,) = said
+    assert told.startswith("a map is left out, and the one before stays: the map needs")
+    assert robot.noticed == (told,)
+    # The next one is right, and what is wrong later is not what was wrong before.
+    link.step(1.0)
+    assert robot.advance(way(cell, 3), AT_THE_END).cells
+    link.step(20.0)
+    robot.observe()
+
+
+def test_a_map_that_cannot_be_laid_for_long_ends_the_drive():
+    robot, _, link, _ = on_the_floor()
+    link._tell_map = lambda header: None
+    absurd_map(link)
+    link.step(0.1)
+    robot.observe()
+    link.step(4.0)
+    robot.observe()
+    link.step(2.0)
+    with pytest.raises(RobotError, match="no map of use for 6 s: the map needs"):
+        robot.observe()
+
+
+def test_a_first_map_that_cannot_be_laid_is_an_error():
+    with pytest.raises(RobotError, match="more than 4096"):
+        robot_on(["." * 5000], {})
 
 
 def test_a_dry_run_decides_once_and_publishes_nothing():

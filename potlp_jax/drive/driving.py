@@ -54,7 +54,8 @@ def drive_robot(
         config: who moves the robot, and how it is listened to.
         trial_config: settings of the decisions.
         setbacks: what to do after legs that failed.
-        places: where propositions hold that are known beforehand.
+        places: where propositions hold that are known beforehand; of those that the task lacks it is said that they are
+            not used.
         estimator: what the policy asks.
         name: of the robot, for the records.
         listener: is told each decision before it is carried out.
@@ -70,7 +71,7 @@ def drive_robot(
     Raises:
         RobotError: nothing is heard of the robot, or it broke the contract; once the drive has begun, a
             ``BrokenDriveError``, which has the record.
-        PropositionsError: task, places and estimator are not over the same propositions.
+        PropositionsError: task and estimator are not over the same propositions.
     """
     inbox = Inbox(config, task.propositions) if inbox is None else inbox
     for topic, (kind, _) in inbox.handlers.items():

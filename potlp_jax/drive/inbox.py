@@ -84,7 +84,7 @@ class Inbox:
         self._static: set[Edge] = set()
         # When each that moves was last heard.
         self._edge_heard: dict[Edge, float] = {}
-        self.refused: Counter[str] = Counter()
+        self._refused = Counter[str]()
         topics = config.topics
         # What is not subscribed has no name here, and no message.
         self.handlers: dict[str, tuple[str, Callable[[Message], Heard | None]]] = {
@@ -108,13 +108,19 @@ class Inbox:
         with self._changed:
             return self._heard
 
+    @property
+    def refused(self) -> Counter[str]:
+        """How many messages were refused, by their topic and what is wrong with them."""
+        with self._changed:
+            return self._refused.copy()
+
     def handle(self, topic: str, message: Message) -> None:
         """Take a message. One that is not what its type says is counted, named by its topic, and nothing else."""
         with self._changed:
             try:
                 found = self.handlers[topic][1](message)
             except RobotError as error:
-                self.refused[f"{topic}: {error}"] += 1
+                self._refused[f"{topic}: {error}"] += 1
                 return
             if found is not None:
                 self._heard = found
@@ -230,8 +236,14 @@ class Inbox:
         return matrix, edges
 
     def _picture(self, message: Message) -> Heard | None:
-        stamp = stamp_of(message)
-        return replace(self._heard, picture=picture_of(message)) if self._is_new("picture", stamp) else None
+        stamp, picture = stamp_of(message), picture_of(message)
+        height, width, _ = picture.shape
+        if 2 * height > width:
+            raise RobotError(
+                f"a picture of {width} x {height} pixels is not equirectangular with square pixels, for it would reach "
+                "over more than a half circle: publish pictures at most half as high as they are wide"
+            )
+        return replace(self._heard, picture=picture) if self._is_new("picture", stamp) else None
 
     def _places(self, message: Message) -> Heard | None:
         regions = regions_of(message, self._propositions)
