@@ -30,6 +30,7 @@ def is_whole(value: object) -> bool:
 COUNT: Kind = Kind(lambda value: is_whole(value) and value >= 1, "a whole number of at least 1")
 AT_LEAST_ONE: Kind = Kind(lambda value: value >= 1, "at least 1")
 POSITIVE: Kind = Kind(lambda value: math.isfinite(value) and value > 0, "a positive number")
+FINITE: Kind = Kind(math.isfinite, "a finite number")
 NOT_NEGATIVE: Kind = Kind(lambda value: math.isfinite(value) and value >= 0, "a number from 0")
 LIMIT: Kind = Kind(lambda value: value > 0, "a positive number, or infinity for none")
 SHARE: Kind = Kind(lambda value: 0 <= value <= 1, "a number from 0 to 1")

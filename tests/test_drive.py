@@ -1,6 +1,7 @@
 """A robot behind rosbridge: maps on one lattice, messages in any order, advice, navigation, silence, another task."""
 
 import base64
+import contextlib
 import dataclasses
 import json
 import math
@@ -9,6 +10,7 @@ import time
 
 import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -20,21 +22,24 @@ from eval.live.simulator import FLOOR, Behaviour, SimulatedLink, SteppedInbox
 from potlp_jax.cli import app
 from potlp_jax.cli.drive import _interruption, _write
 from potlp_jax.cli.inputs import RECORD
+from potlp_jax.cli.output import FAILED
 from potlp_jax.cli.view import PAGE
 from potlp_jax.drive.config import DriveConfig, Mode, Topics
 from potlp_jax.drive.driving import drive_robot
 from potlp_jax.drive.inbox import Inbox
 from potlp_jax.drive.lattice import Lattice, LatticeConfig, Scan, bucket
 from potlp_jax.drive.messages import make_path, make_pose, picture_of, pose_of, regions_of, scan_of, stamp_of
-from potlp_jax.drive.movers import Adviser
-from potlp_jax.drive.robot import RemoteRobot
+from potlp_jax.drive.movers import Adviser, Navigator, mover_of
+from potlp_jax.drive.robot import REASONS, RemoteRobot
 from potlp_jax.drive.rosbridge import RosbridgeLink, parse_url
 from potlp_jax.environments.ros.grid_frame import GridFrame
-from potlp_jax.environments.ros.places import Disc, Polygon
+from potlp_jax.environments.ros.places import Disc, Places, Polygon
 from potlp_jax.errors import RobotError
+from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import load_trial
+from potlp_jax.trials.rules import Stop
 from potlp_jax.world.grid import BeliefMap
 
 TASK = Task.from_formula("!fire U exit", FLOOR.propositions)
@@ -189,6 +194,30 @@ def test_pictures_raw_and_compressed():
         picture_of({**raw, "encoding": "yuv", "data": ""})
 
 
+def test_a_picture_of_more_than_a_half_circle_is_refused():
+    topic = "/panorama/compressed"
+    inbox = Inbox(dataclasses.replace(CONFIG, topics=Topics(image=topic)), FLOOR.propositions)
+
+    def show(seconds, height):
+        data = base64.b64encode(cv2.imencode(".png", np.zeros((height, 8, 3), np.uint8))[1].tobytes()).decode()
+        inbox.handle(topic, {"header": header(seconds), "data": data, "format": "png"})
+
+    show(1, 4)
+    show(2, 5)
+    assert inbox.heard.picture.shape == (4, 8, 3)
+    (refused,) = inbox.refused
+    assert refused.startswith(f"{topic}: a picture of 8 x 5 pixels")
+
+
+@pytest.mark.parametrize(
+    "setting", [{"radius": math.inf}, {"radius": math.nan}, {"radius": -0.1}, {"camera_yaw": math.nan}]
+)
+def test_settings_that_are_no_numbers_are_refused(setting):
+    (name,) = setting
+    with pytest.raises(RobotError, match=f"{name} is .*; give a"):
+        DriveConfig(**setting)
+
+
 def test_places_are_regions_of_known_propositions():
     text = {"exit": [{"point": [1, 2], "radius": 0.5}, {"polygon": [[0, 0], [1, 0], [1, 1]]}]}
     found = regions_of({"data": json.dumps(text)}, ("fire", "exit"))
@@ -269,6 +298,24 @@ def test_a_wheel_that_turns_is_no_pose():
     assert len(inbox.heard.poses) == poses == 1
 
 
+def test_a_silent_odometry_is_silent_whatever_slam_repeats():
+    now = [100.0]
+    inbox = Inbox(CONFIG, FLOOR.propositions, clock=lambda: now[0])
+    inbox.handle("/map", grid(1, [[0]]))
+    # Where it is on the robot does not change, and may be repeated, too.
+    inbox.handle("/tf_static", {"transforms": [transform(0, "base_footprint", "base_link", 0.0)]})
+    inbox.handle("/tf", {"transforms": [transform(1, "odom", "base_footprint", 1.0)]})
+    for second in range(1, 30):
+        now[0] = 100.0 + second
+        inbox.handle("/tf", {"transforms": [transform(1 + second, "map", "odom", 0.1 * second)]})
+        inbox.handle("/tf_static", {"transforms": [transform(1 + second, "base_footprint", "base_link", 0.0)]})
+        # The correction itself is not lost.
+        assert inbox.heard.pose[0] == pytest.approx(1.0 + 0.1 * second)
+    assert now[0] - inbox.heard.heard == 29
+    inbox.handle("/tf", {"transforms": [transform(31, "odom", "base_footprint", 2.0)]})
+    assert now[0] == inbox.heard.heard
+
+
 def test_what_cannot_be_read_is_counted_and_changes_nothing():
     inbox = Inbox(CONFIG, FLOOR.propositions)
     before = inbox.heard
@@ -282,14 +329,19 @@ def test_what_cannot_be_read_is_counted_and_changes_nothing():
 # Where places are.
 
 
-def letters_of(rows, exit_at):
-    """Where a robot takes the exit to be, in text: on a map of ``#`` walls, ``.`` floor and ``?`` unseen cells."""
-    inbox, said = Inbox(CONFIG, FLOOR.propositions), []
+def robot_on(rows, seen, **options):
+    """A robot on a map of ``#`` walls, ``.`` floor and ``?`` unseen cells, which has seen places."""
+    inbox = Inbox(CONFIG, FLOOR.propositions)
     inbox.handle("/map", grid(1, [[{"#": 100, ".": 0, "?": -1}[cell] for cell in row] for row in rows]))
     inbox.handle("/tf", {"transforms": [transform(1, "map", "base_link", 0.6)]})
-    place = {"exit": [{"point": list(exit_at), "radius": 0.1}]}
-    inbox.handle("/potlp/places", {"data": json.dumps(place)})
-    robot = RemoteRobot(inbox, Adviser(), CONFIG, FLOOR.propositions, say=said.append)
+    inbox.handle("/potlp/places", {"data": json.dumps(seen)})
+    return RemoteRobot(inbox, Adviser(), CONFIG, FLOOR.propositions, **options)
+
+
+def letters_of(rows, exit_at):
+    """Where a robot takes the exit to be, in text, and what it said."""
+    said = []
+    robot = robot_on(rows, {"exit": [{"point": list(exit_at), "radius": 0.1}]}, say=said.append)
     belief, _ = robot.observe()
     belief, _ = robot.observe()
     assert list(robot.noticed) == said
@@ -308,11 +360,44 @@ def test_a_place_in_a_wall_is_beside_it_and_that_is_said_once():
     ]
 
 
-@pytest.mark.parametrize("rows", [["......", "......", ".##?##", "......"], ["####", "####", "####", "...."]])
-def test_a_place_in_what_is_unseen_or_deep_in_a_wall_is_nowhere(rows):
-    found, said = letters_of(rows, (1.4, 0.65) if "?" in rows[2] else (1.0, 1.4))
+def test_a_place_in_what_is_unseen_is_nowhere_yet():
+    found, said = letters_of(["......", "......", ".##?##", "......"], (1.4, 0.65))
     assert not any("e" in line for line in found)
     assert not said
+
+
+def test_a_place_deep_in_a_wall_is_nowhere_and_that_is_said_once():
+    found, said = letters_of(["####", "####", "####", "...."], (1.0, 1.4))
+    assert not any("e" in line for line in found)
+    assert said == [
+        "exit: point [1.00, 1.40] with radius 0.1 lies in obstacles of the map, no free cell touches it: it is nowhere"
+    ]
+
+
+def test_a_region_without_the_centre_of_a_cell_is_told():
+    # Between the centres of two cells of 0.4 m; a larger one beside it, and one that is not on the map yet.
+    between, beside = [[0.25, 0.25], [0.55, 0.25], [0.55, 0.35]], [[0.25, 0.25], [0.95, 0.25], [0.95, 0.95]]
+    far = [[90.1, 90.1], [93.1, 90.1], [93.1, 93.1]]
+    told = []
+    for polygon in (between, beside, far):
+        place = {"exit": [{"polygon": polygon}]}
+        robot = robot_on(["......"] * 4, place)
+        robot.observe()
+        robot.observe()
+        told.append(robot.noticed)
+    assert told[0] == (
+        "exit: polygon [0.25, 0.25], [0.55, 0.25], [0.55, 0.35] holds the centre of no cell of 0.4 m, and is nowhere: "
+        "make it larger",
+    )
+    assert told[1:] == [(), ()]
+
+
+def test_labels_of_what_the_task_lacks_are_told():
+    region = Disc((0.6, 0.6), 0.1)
+    places = Places((("fir", (region,)), ("exit", (region,)), ("door", (region,))), source="office.yaml")
+    robot = robot_on(["......"] * 4, {}, places=places)
+    assert robot.noticed == ("office.yaml: not used are the places of fir, door: the propositions are fire, exit",)
+    assert np.asarray(robot.observe()[0].letters).max() == 2
 
 
 def test_a_place_that_a_turned_map_walls_in_is_reached():
@@ -326,10 +411,75 @@ def test_a_map_that_says_the_same_is_no_reason_to_give_up(seed):
     assert run_stream(seed, {})["end"] == "satisfied"
 
 
-# Drives, in the simulation's time.
+# Goals of Nav2.
 
 
 ORDINARY = Behaviour()
+
+
+class Lossy(SimulatedLink):
+    """Knows which goals were sent and taken back, and loses both while it is not connected."""
+
+    def __init__(self):
+        super().__init__(FLOOR, ORDINARY, Network(Perturbation(), np.random.default_rng(0)))
+        self.ends = {}
+
+    def send_goal(self, action, kind, goal, done):
+        if not self.is_connected:
+            done(False, "not asked: the connection is lost")
+            return ""
+        self.ends[f"goal {len(self.ends)}"] = done
+        return f"goal {len(self.ends) - 1}"
+
+    def cancel(self, action, goal):
+        if self.is_connected:
+            self.cancelled.append(goal)
+
+
+def navigator():
+    link = Lossy()
+    mover = Navigator(link, Mode.NAVIGATE)
+    mover.begin([(1.0, 0.0)], "map")
+    return link, mover
+
+
+def test_a_goal_that_was_not_sent_leaves_the_one_before_to_be_taken_back():
+    link, mover = navigator()
+    link.is_connected = False
+    mover.begin([(2.0, 0.0)], "map")
+    assert not mover.ended().succeeded
+    link.is_connected = True
+    mover.stop()
+    assert link.cancelled == ["goal 0"]
+
+
+def test_a_goal_that_could_not_be_taken_back_is_taken_back_later():
+    link, mover = navigator()
+    link.is_connected = False
+    mover.stop()
+    assert not link.cancelled
+    link.is_connected = True
+    mover.stop()
+    assert link.cancelled == ["goal 0"]
+
+
+def test_all_goals_whose_end_was_not_heard_are_taken_back_and_no_other():
+    link, mover = navigator()
+    for _ in range(3):
+        mover.begin([(2.0, 0.0)], "map")
+    link.ends["goal 1"](False, "preempted")
+    assert mover.ended() is None
+    mover.stop()
+    assert link.cancelled == ["goal 0", "goal 2", "goal 3"]
+    for name in link.cancelled:
+        link.ends[name](False, "canceled")
+    # Of what was taken back, the end concerns nobody.
+    assert mover.ended() is None
+    mover.stop()
+    assert len(link.cancelled) == 3
+
+
+# Drives, in the simulation's time.
 
 
 def begun(mode, behaviour=ORDINARY, *, before=lambda _link: None, options=None, **settings):
@@ -371,6 +521,28 @@ def test_advice_is_published_and_nothing_is_commanded():
     assert [(point["x"], point["y"]) for point in exits] == [pytest.approx(FLOOR.frame.cell_to_metres(5, 13))]
 
 
+def test_a_message_that_is_refused_is_told_once_and_counted():
+    def misspell(link):
+        for seconds in (0.0, 5.0):
+            link._network.send(seconds, "/potlp/places", {"data": json.dumps({"fir": [], "exit": []})})
+
+    (trial,), link = driven(Mode.ADVISE, before=misspell)
+    wrong = "/potlp/places: places of 'fir', which is none of fire, exit"
+    assert trial.outcome == "satisfied"
+    assert trial.notes == (f"refused: {wrong} (2 times)",)
+    states = [json.loads(message["data"])["text"] for message in published(link, "/potlp/state")]
+    assert states == [f"refused: {wrong}"]
+
+
+def test_of_many_reasons_for_refusal_some_are_told():
+    robot, _, link, said = on_the_floor(Mode.ADVISE)
+    for number in range(50):
+        link._network.send(link.time, "/potlp/places", {"data": json.dumps({f"fir{number}": []})})
+    link.step(1.0)
+    robot.observe()
+    assert len(said) == len(robot.noticed) == REASONS
+
+
 @pytest.mark.parametrize("mode", [Mode.NAVIGATE, Mode.FOLLOW])
 def test_navigation_is_commanded_and_failures_are_set_aside(mode):
     (trial,), link = driven(mode, Behaviour(failures=3))
@@ -393,6 +565,114 @@ def test_a_robot_that_is_silent_for_good_ends_the_drive():
     (trial,), link = driven(Mode.NAVIGATE, Behaviour(silent=(2.0, math.inf)), silence=0.5, patience=5.0)
     assert trial.outcome == "unfinished"
     assert link.cancelled
+
+
+def on_the_floor(mode=Mode.NAVIGATE, behaviour=ORDINARY, **options):
+    """A robot that has been observed, where it is, its link, and what it said."""
+    config, said = dataclasses.replace(CONFIG, mode=mode, patience=5.0), []
+    link = SimulatedLink(FLOOR, behaviour, Network(Perturbation(), np.random.default_rng(0)))
+    inbox = SteppedInbox(link, config, TASK.propositions)
+    for topic, (kind, _) in inbox.handlers.items():
+        link.subscribe(topic, kind, lambda message, topic=topic: inbox.handle(topic, message))
+    mover = mover_of(config, link)
+    robot = RemoteRobot(inbox, mover, config, TASK.propositions, clock=link.clock, say=said.append, **options)
+    return robot, robot.observe()[1], link, said
+
+
+def way(cell, length):
+    """A path to the right."""
+    cells = jnp.array([[cell[0], cell[1] + number] for number in range(length + 1)], jnp.int32)
+    states, cost = jnp.zeros(length + 1, jnp.int32), jnp.float32(length)
+    return KnownPath(cells=cells, states=states, length=jnp.int32(length), cost=cost)
+
+
+# A leg ends at once, or where its path does.
+AT_ONCE, AT_THE_END = (
+    Stop(replan_distance=jnp.float32(99), budget=jnp.float32(budget), is_frontier=jnp.bool_(False))
+    for budget in (1, 99)
+)
+
+
+def test_a_robot_that_knows_no_move_stands_though_the_leg_before_left_its_goal():
+    robot, cell, link, _ = on_the_floor()
+    leg = robot.advance(way(cell, 5), AT_ONCE)
+    # On purpose: a robot does not halt for a decision.
+    assert 0 < len(leg.cells) < 5
+    assert not link.cancelled
+    _, cell = robot.observe()
+    # Of the moment in which it is stopped.
+    assert len(robot.advance(way(cell, 0), AT_THE_END).cells) <= 1
+    assert link.cancelled == ["goal 0"]
+    assert not link._way
+
+
+def test_a_goal_is_taken_back_again_when_the_robot_is_heard_again():
+    class Deaf(SimulatedLink):
+        """Loses what it is told for a while, and says nothing meanwhile."""
+
+        def cancel(self, action, goal):
+            if self.time >= self._behaviour.silent[1]:
+                super().cancel(action, goal)
+
+    config = dataclasses.replace(CONFIG, mode=Mode.NAVIGATE, silence=0.5)
+    link = Deaf(FLOOR, Behaviour(silent=(2.0, 4.0), speed=0.1), Network(Perturbation(), np.random.default_rng(0)))
+    inbox = SteppedInbox(link, config, TASK.propositions)
+    drive = drive_robot(link, TASK, "baseline", jax.random.key(0), config, inbox=inbox, clock=link.clock)
+    ways = []
+
+    def told(topic, kind, message, publish=link.publish):
+        if topic == "/potlp/state" and "heard again" in message["data"]:
+            ways.append((tuple(link.cancelled), list(link._way)))
+        publish(topic, kind, message)
+
+    link.publish = told
+    next(drive)
+    drive.close()
+    # Before the next decision.
+    assert len(ways) == 1
+    assert ways[0][0]
+    assert not ways[0][1]
+
+
+def absurd_map(link):
+    """A map that lies 100 km away."""
+    link._network.send(link.time, "/map", grid(86_400 + link.time, [[0, 0]], x=1e5))
+
+
+def test_a_map_that_cannot_be_laid_is_left_out():
+    robot, cell, link, said = on_the_floor()
+    before, _ = robot.observe()
+    absurd_map(link)
+    link.step(0.1)
+    now, here = robot.observe()
+    assert np.array_equal(now.cells, before.cells)
+    assert here == cell
+    (told,) = said
+    assert told.startswith("a map is left out, and the one before stays: the map needs")
+    assert robot.noticed == (told,)
+    # The next one is right, and what is wrong later is not what was wrong before.
+    link.step(1.0)
+    assert robot.advance(way(cell, 3), AT_THE_END).cells
+    link.step(20.0)
+    robot.observe()
+
+
+def test_a_map_that_cannot_be_laid_for_long_ends_the_drive():
+    robot, _, link, _ = on_the_floor()
+    link._tell_map = lambda header: None
+    absurd_map(link)
+    link.step(0.1)
+    robot.observe()
+    link.step(4.0)
+    robot.observe()
+    link.step(2.0)
+    with pytest.raises(RobotError, match="no map of use for 6 s: the map needs"):
+        robot.observe()
+
+
+def test_a_first_map_that_cannot_be_laid_is_an_error():
+    with pytest.raises(RobotError, match="more than 4096"):
+        robot_on(["." * 5000], {})
 
 
 def test_a_dry_run_decides_once_and_publishes_nothing():
@@ -430,14 +710,46 @@ def test_a_formula_that_comes_while_somebody_has_the_record_is_the_next_task():
     assert [trial.task_text for trial in drive] == ["!fire U exit"]
 
 
+def interrupted_drive(when, behaviour=ORDINARY, *, before=lambda _link: None, **settings):
+    """Trials of a drive that is interrupted when a condition on the link and the decisions holds, and the link."""
+    decisions = []
+    options = {"interrupted": lambda: when(link, decisions), "listener": lambda *decision: decisions.append(decision)}
+    drive, link = begun(Mode.NAVIGATE, behaviour, before=before, options=options, **settings)
+    return list(drive), link
+
+
 def test_who_interrupts_a_drive_has_its_record():
-    asked = iter(range(1000))
-    drive, link = begun(Mode.NAVIGATE, options={"interrupted": lambda: next(asked) > 0})
-    link.ask_for("F exit")
-    (trial,) = drive
+    (trial,), link = interrupted_drive(lambda link, _: bool(link.goals))
     assert trial.outcome == "unfinished"
     assert trial.decisions
-    assert link.cancelled
+    assert link.cancelled == link.goals == ["goal 0"]
+
+
+def test_after_an_interruption_no_goal_is_sent():
+    # Nor is the task begun that is asked for.
+    (trial,), link = interrupted_drive(lambda _, decisions: bool(decisions), before=lambda link: link.ask_for("F exit"))
+    assert trial.outcome == "unfinished"
+    assert len(trial.decisions) == 1
+    assert not link.goals
+
+
+def test_before_the_first_decision_an_interruption_ends_the_drive_without_a_record():
+    # Without a map, and where the map has no cell for the robot.
+    trials, link = interrupted_drive(lambda link, _: link.time > 1.0, topics=Topics(map="/other"), patience=20.0)
+    assert not trials
+    assert link.time < 2.0
+    trials, link = interrupted_drive(lambda link, _: link.time > 1.0, patience=20.0, radius=1.5)
+    assert not trials
+    assert link.time < 2.0
+
+
+def test_who_waits_for_a_silent_robot_may_interrupt():
+    (trial,), link = interrupted_drive(
+        lambda link, _: link.time > 6.0, behaviour=Behaviour(silent=(2.0, math.inf)), silence=0.5, patience=100.0
+    )
+    assert trial.outcome == "unfinished"
+    assert "no pose" in trial.decisions[-1].failure
+    assert link.time < 7.0
 
 
 def test_ctrl_c_is_asked_for_and_a_second_one_ends_at_once():
@@ -508,6 +820,16 @@ def test_a_goal_is_not_kept_for_later_while_the_connection_is_lost(server):
     )
     assert told == [(False, "/follow_path was not asked: the connection is lost")]
     link.cancel("/follow_path", goal)
+
+
+def test_the_command_says_that_it_was_interrupted_before_the_first_decision(server, tmp_path, monkeypatch):
+    pytest.importorskip("roslibpy")
+    monkeypatch.setattr("potlp_jax.cli.drive._interruption", lambda: contextlib.nullcontext(lambda: True))
+    asked = ["--task", TASK.text, "--propositions", ",".join(FLOOR.propositions), "--out", str(tmp_path / "drive")]
+    result = CliRunner().invoke(app, ["drive", f"127.0.0.1:{server.port}", *asked])
+    assert result.exit_code == FAILED
+    assert "interrupted before the first decision" in result.output
+    assert not list(tmp_path.rglob(RECORD))
 
 
 @pytest.mark.parametrize("broken", [False, True])

@@ -98,7 +98,8 @@ def test_what_is_driven_while_it_is_decided_is_not_driven_twice(there, first):
     inbox.handle("/tf", pose(0.25))
     inbox.handle("/potlp/places", {"data": json.dumps({})})
     config = DriveConfig(resolution=0.5, radius=0.0)
-    robot = RemoteRobot(inbox, mover, config, ("exit",), interrupted=lambda: True)
+    # Once its goal is sent.
+    robot = RemoteRobot(inbox, mover, config, ("exit",), interrupted=lambda: bool(mover.begun))
     _, (row, column) = robot.observe()
     for x in np.arange(0.75, there + 0.1, 0.5):
         inbox.handle("/tf", pose(float(x)))

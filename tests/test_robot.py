@@ -11,6 +11,7 @@ from flax import struct
 import potlp_jax
 from potlp_jax.errors import RobotError
 from potlp_jax.learning.labels import TrueMapEstimator
+from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import BrokenDriveError
 from potlp_jax.trials.record import BeliefMap, load_trial
@@ -315,6 +316,14 @@ def test_a_door_that_stays_shut_ends_the_trial_as_stuck():
     assert sum(bool(decision.failure) for decision in trial.decisions) >= 5
 
 
+def leg_of(cells, **others):
+    """A leg as somebody's program makes it, where nothing checks types."""
+    leg = Leg(cells=())
+    for name, value in {"cells": cells, **others}.items():
+        object.__setattr__(leg, name, value)
+    return leg
+
+
 class Breaks(Rover):
     """Breaks the contract in one way, on its second leg."""
 
@@ -333,6 +342,14 @@ class Breaks(Rover):
             self.cell = leg.cells[0]
         if self.legs == 2 and self.fault == "no leg":
             return leg.cells
+        if self.legs == 2 and self.fault == "fractions":
+            return leg_of([(row + 0.5, column) for row, column in leg.cells])
+        if self.legs == 2 and self.fault == "flat":
+            return leg_of([5])
+        if self.legs == 2 and self.fault == "no cells":
+            return leg_of(None)
+        if self.legs == 2 and self.fault == "no words":
+            return leg_of(leg.cells, failure=3)
         return leg
 
     def observe(self):
@@ -350,24 +367,47 @@ class Breaks(Rover):
             names = ("exit", "fire")
         if self.fault == "nothing":
             return None
+        if self.fault == "number":
+            return super().observe()[0], 5
+        if self.fault == "floats":
+            return super().observe()[0], tuple(map(float, self.cell))
+        if self.fault == "ragged":
+            return super().observe()[0], ((1, 2), 3)
+        if self.fault == "damaged map":
+            belief, cell = super().observe()
+            # Nothing checks types where somebody else makes it.
+            object.__setattr__(belief, "cells", None)
+            return belief, cell
+        if self.fault == "no map":
+            cells[:] = 7
         resolution = 0.5 if self.fault == "resolution" else 1.0
         return belief_from_numpy(cells, letters, resolution, propositions=names), self.cell
 
 
-@pytest.mark.parametrize(
-    ("fault", "said"),
-    [
-        ("jumps", "no neighbour"),
-        ("elsewhere", "says that it is in cell"),
-        ("no leg", "returns a Leg"),
-        ("blocked", "not free in the map"),
-        ("outside", "says that it is in cell \\(99, 0\\)"),
-        ("grows", "GrowingRobot"),
-        ("names", "propositions"),
-        ("resolution", "onto one grid"),
-        ("nothing", "observe\\(\\) returns"),
-    ],
+FAULTS = (
+    ("jumps", "no neighbour"),
+    ("elsewhere", "says that it is in cell"),
+    ("no leg", "returns a Leg"),
+    ("blocked", "not free in the map"),
+    ("outside", "says that it is in cell \\(99, 0\\)"),
+    ("grows", "GrowingRobot"),
+    ("names", "propositions"),
+    ("resolution", "onto one grid"),
+    ("nothing", "observe\\(\\) returns"),
+    ("number", "the cell that observe\\(\\) returns is a pair \\(row, column\\), found 5"),
+    ("floats", "of whole numbers, found"),
+    ("ragged", "found \\(\\(1, 2\\), 3\\)"),
+    ("damaged map", "the map that observe\\(\\) returned raised AttributeError"),
+    ("no map", "observe\\(\\) of the robot raised WorldError"),
+    ("fractions", "each cell of a leg is a pair \\(row, column\\) of whole numbers, found"),
+    ("flat", "each cell of a leg is a pair \\(row, column\\), found 5"),
+    ("no cells", "the cells of the leg raised TypeError"),
+    ("no words", "in words, found 3"),
 )
+"""Of ``Breaks``, and what is said of each."""
+
+
+@pytest.mark.parametrize(("fault", "said"), FAULTS)
 def test_a_broken_contract_is_named(fault, said):
     with pytest.raises(RobotError, match=said):
         driven(Breaks(fault))
@@ -382,7 +422,7 @@ def broken_off(robot):
     return caught.value.trial, str(caught.value), maps
 
 
-@pytest.mark.parametrize("fault", ["jumps", "elsewhere", "blocked", "grows", "nothing"])
+@pytest.mark.parametrize("fault", [fault for fault, _ in FAULTS])
 def test_a_drive_that_breaks_off_leaves_its_record(fault, tmp_path):
     whole, _ = driven(Rover())
     trial, error, maps = broken_off(Breaks(fault))
@@ -395,6 +435,37 @@ def test_a_drive_that_breaks_off_leaves_its_record(fault, tmp_path):
     again = load_trial(tmp_path / "trial.json")
     for decision, belief in zip(again.decisions, maps, strict=True):
         assert_same_map(again.planned_on(decision), belief)
+
+
+@pytest.mark.parametrize(
+    ("cells", "cell"), [(list, tuple), (list, list), (np.array, np.array), (tuple, lambda cell: tuple(np.array(cell)))]
+)
+def test_cells_of_any_whole_numbers_decide_alike(cells, cell):
+    class Converts(Rover):
+        def observe(self):
+            belief, here = super().observe()
+            return belief, cell(here)
+
+        def advance(self, path, stop):
+            return leg_of(cells([cell(there) for there in super().advance(path, stop).cells]))
+
+    # What was chosen counts for the next choice, if the robot went there.
+    config = TrialConfig(decision=DecisionConfig(commitment=3.0))
+    wanted, found = (
+        potlp_jax.run_robot(looking(robot), TASK, "potlp", KEY, config, estimator=Footprints.of_shape(FLOOR.shape))
+        for robot in (Rover, Converts)
+    )
+    assert found.decisions == wanted.decisions
+    assert found.path == wanted.path
+
+
+def test_a_remark_that_cannot_be_had_costs_no_record():
+    class Mute(Rover):
+        @property
+        def noticed(self):
+            raise OSError("no voice")
+
+    assert driven(Mute())[0].notes == ("noticed of the robot raised OSError: no voice",)
 
 
 def test_a_growing_map_that_breaks_off_leaves_the_record_on_the_map_before():

@@ -196,6 +196,8 @@ def drive(
         link.close()
     if json:
         print_json([trial.summary() for trial in trials])
+    if not trials:
+        fail("interrupted before the first decision: there is nothing to record", FAILED)
     # A dry run has done what it was to do; a task that gave way to another was not to be satisfied.
     if chosen[0] is not Mode.DRY and trials[-1].outcome is not Outcome.SATISFIED:
         raise typer.Exit(FAILED)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-from potlp_jax.checks import POSITIVE, require_fields
+from potlp_jax.checks import FINITE, NOT_NEGATIVE, POSITIVE, require_fields
 from potlp_jax.errors import RobotError
 
 
@@ -81,8 +81,8 @@ class DriveConfig:
 
     def __post_init__(self) -> None:
         require_fields(self, ("resolution", "silence", "patience", "seconds_per_cell"), POSITIVE, RobotError)
-        if not self.radius >= 0:
-            raise RobotError(f"radius is {self.radius}; give metres, 0 or more")
+        require_fields(self, ("radius",), NOT_NEGATIVE, RobotError)
+        require_fields(self, ("camera_yaw",), FINITE, RobotError)
         if not 0 <= self.free < self.occupied <= 100:
             raise RobotError(
                 f"thresholds are percent with 0 <= free < occupied <= 100, found {self.free} and {self.occupied}"

@@ -11,7 +11,7 @@ from potlp_jax.drive.config import DriveConfig, Mode
 from potlp_jax.drive.inbox import Inbox
 from potlp_jax.drive.link import Link
 from potlp_jax.drive.movers import Mover, mover_of
-from potlp_jax.drive.robot import RemoteRobot
+from potlp_jax.drive.robot import InterruptionError, RemoteRobot
 from potlp_jax.environments.ros.places import Places
 from potlp_jax.errors import PotlpError
 from potlp_jax.learning.estimator import TrainedEstimator
@@ -54,12 +54,14 @@ def drive_robot(
         config: who moves the robot, and how it is listened to.
         trial_config: settings of the decisions.
         setbacks: what to do after legs that failed.
-        places: where propositions hold that are known beforehand.
+        places: where propositions hold that are known beforehand; of those that the task lacks it is said that they are
+            not used.
         estimator: what the policy asks.
         name: of the robot, for the records.
         listener: is told each decision before it is carried out.
         inbox: what hears the robot; by default one that waits for the network.
-        interrupted: whether the drive shall end; asked again and again. The trial ends ``unfinished``, and is the last.
+        interrupted: whether the drive shall end; asked again and again. No goal is sent then. The trial ends
+            ``unfinished``, and is the last; before its first decision there is none.
         clock: seconds, of the same kind as the inbox's.
 
     Yields:
@@ -69,7 +71,7 @@ def drive_robot(
     Raises:
         RobotError: nothing is heard of the robot, or it broke the contract; once the drive has begun, a
             ``BrokenDriveError``, which has the record.
-        PropositionsError: task, places and estimator are not over the same propositions.
+        PropositionsError: task and estimator are not over the same propositions.
     """
     inbox = Inbox(config, task.propositions) if inbox is None else inbox
     for topic, (kind, _) in inbox.handlers.items():
@@ -97,6 +99,8 @@ def drive_robot(
             # A trial may end on the way to a goal; whoever has the record may take long with it.
             mover.stop()
             yield trial
+    except InterruptionError:
+        return
     finally:
         # However it ends: nobody is left driving.
         mover.stop()
@@ -129,7 +133,8 @@ def _robot(
         task.propositions,
         places=places,
         camera=(TrialConfig() if trial_config is None else trial_config).camera,
-        interrupted=lambda: interrupted() or desk.has_another(),
+        interrupted=interrupted,
+        replaced=desk.has_another,
         say=say,
         clock=clock,
     )

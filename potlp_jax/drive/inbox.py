@@ -37,6 +37,9 @@ RESTART: int = 5_000_000_000
 Pose = tuple[float, float, float]
 """x, y and yaw in metres and radians of the map's frame."""
 
+Edge = tuple[str, str]
+"""Parent and child of a transform."""
+
 
 @dataclass(frozen=True, eq=False)
 class Heard:
@@ -48,7 +51,8 @@ class Heard:
         maps: how many maps and updates changed it.
         poses: those of the robot since they were last taken, in order.
         pose: the newest one.
-        heard: when a pose was last heard, by the clock of this program.
+        heard: when a pose was last heard, by the clock of this program; of transforms, when that of the robot's body
+            in its odometry was, whatever localisation says meanwhile.
         picture: the newest one, RGB.
         regions: where propositions hold by what the robot sees.
         task: a formula that was asked for and not taken yet.
@@ -76,8 +80,11 @@ class Inbox:
         self._heard = Heard(heard=clock())
         self._newest: dict[str, int] = {}
         self._pixel_stamps: Int64[np.ndarray, "H W"] | None = None
-        self._transforms: dict[tuple[str, str], Float64[np.ndarray, "4 4"]] = {}
-        self.refused: Counter[str] = Counter()
+        self._transforms: dict[Edge, Float64[np.ndarray, "4 4"]] = {}
+        self._static: set[Edge] = set()
+        # When each that moves was last heard.
+        self._edge_heard: dict[Edge, float] = {}
+        self._refused = Counter[str]()
         topics = config.topics
         # What is not subscribed has no name here, and no message.
         self.handlers: dict[str, tuple[str, Callable[[Message], Heard | None]]] = {
@@ -87,7 +94,7 @@ class Inbox:
                 (topics.map_updates, "map_msgs/OccupancyGridUpdate", self._update),
                 (topics.pose, "geometry_msgs/PoseStamped", self._pose),
                 ("" if topics.pose else topics.tf, "tf2_msgs/TFMessage", self._transform),
-                ("" if topics.pose else topics.tf_static, "tf2_msgs/TFMessage", self._transform),
+                ("" if topics.pose else topics.tf_static, "tf2_msgs/TFMessage", self._static_transform),
                 (topics.image, _image_type(topics.image), self._picture),
                 (topics.places, "std_msgs/String", self._places),
                 (topics.task, "std_msgs/String", self._task),
@@ -101,13 +108,19 @@ class Inbox:
         with self._changed:
             return self._heard
 
+    @property
+    def refused(self) -> Counter[str]:
+        """How many messages were refused, by their topic and what is wrong with them."""
+        with self._changed:
+            return self._refused.copy()
+
     def handle(self, topic: str, message: Message) -> None:
         """Take a message. One that is not what its type says is counted, named by its topic, and nothing else."""
         with self._changed:
             try:
                 found = self.handlers[topic][1](message)
             except RobotError as error:
-                self.refused[f"{topic}: {error}"] += 1
+                self._refused[f"{topic}: {error}"] += 1
                 return
             if found is not None:
                 self._heard = found
@@ -178,40 +191,59 @@ class Inbox:
 
     def _pose(self, message: Message) -> Heard | None:
         pose, stamp = pose_of(message), stamp_of(message)
-        return self._with_pose(pose) if self._is_new("pose", stamp) else None
+        return self._with_pose(pose, self._clock()) if self._is_new("pose", stamp) else None
+
+    def _static_transform(self, message: Message) -> Heard | None:
+        self._static |= {(parent, child) for parent, child, _, _ in transforms_of(message)}
+        return self._transform(message)
 
     def _transform(self, message: Message) -> Heard | None:
-        changed = set[tuple[str, str]]()
+        changed, now = set[Edge](), self._clock()
         for parent, child, stamp, matrix in transforms_of(message):
             if self._is_new(f"{parent} to {child}", stamp):
-                self._transforms[(parent, child)] = matrix
+                self._transforms[(parent, child)], self._edge_heard[(parent, child)] = matrix, now
                 changed.add((parent, child))
         matrix, edges = self._chain()
         # A wheel that turns says nothing of where the robot is, and must not pass for a pose.
-        if matrix is None or not changed & edges:
+        if matrix is None or not changed & set(edges):
             return None
         yaw = float(np.arctan2(matrix[1, 0], matrix[0, 0]))
-        return self._with_pose((float(matrix[0, 3]), float(matrix[1, 3]), yaw))
+        return self._with_pose((float(matrix[0, 3]), float(matrix[1, 3]), yaw), self._body_heard(edges))
 
-    def _with_pose(self, pose: Pose) -> Heard:
-        return replace(self._heard, pose=pose, poses=(*self._heard.poses, pose), heard=self._clock())
+    def _body_heard(self, edges: Sequence[Edge]) -> float:
+        """When it was last heard that the robot's body moved, or stood.
 
-    def _chain(self) -> tuple[Float64[np.ndarray, "4 4"] | None, set[tuple[str, str]]]:
-        """From the robot's frame upwards to the map's, and the edges; None where nothing connects them."""
+        SLAM publishes its correction of the odometry by a timer, also where the odometry has been silent for long.
+        """
+        moving = next((edge for edge in edges if edge not in self._static), None)
+        # Where nothing moves, as in a simulation that places the robot, a static transform is all that is to be heard.
+        return self._clock() if moving is None else self._edge_heard[moving]
+
+    def _with_pose(self, pose: Pose, heard: float) -> Heard:
+        return replace(self._heard, pose=pose, poses=(*self._heard.poses, pose), heard=heard)
+
+    def _chain(self) -> tuple[Float64[np.ndarray, "4 4"] | None, list[Edge]]:
+        """From the robot's frame upwards to the map's, and the edges in order; None where nothing connects them."""
         parents = {child: (parent, matrix) for (parent, child), matrix in self._transforms.items()}
-        frame, matrix, edges = self._config.base_frame, np.eye(4), set[tuple[str, str]]()
+        frame, matrix, edges = self._config.base_frame, np.eye(4), list[Edge]()
         while frame != self._heard.frame_id:
             # A ring of transforms is a fault of the robot's, and would never end.
             if frame not in parents or (parents[frame][0], frame) in edges:
                 return None, edges
-            edges.add((parents[frame][0], frame))
+            edges.append((parents[frame][0], frame))
             frame, above = parents[frame]
             matrix = above @ matrix
         return matrix, edges
 
     def _picture(self, message: Message) -> Heard | None:
-        stamp = stamp_of(message)
-        return replace(self._heard, picture=picture_of(message)) if self._is_new("picture", stamp) else None
+        stamp, picture = stamp_of(message), picture_of(message)
+        height, width, _ = picture.shape
+        if 2 * height > width:
+            raise RobotError(
+                f"a picture of {width} x {height} pixels is not equirectangular with square pixels, for it would reach "
+                "over more than a half circle: publish pictures at most half as high as they are wide"
+            )
+        return replace(self._heard, picture=picture) if self._is_new("picture", stamp) else None
 
     def _places(self, message: Message) -> Heard | None:
         regions = regions_of(message, self._propositions)

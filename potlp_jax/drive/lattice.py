@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float64, Int8, Int64
 
 from potlp_jax.environments.ros.cleaning import inflate
 from potlp_jax.environments.ros.grid_frame import GridFrame
+from potlp_jax.environments.ros.places import Disc, Region
 from potlp_jax.errors import RobotError
 from potlp_jax.world.grid import BeliefMap
 from potlp_jax.world.moves import Cell
@@ -27,6 +28,9 @@ MARGIN: int = 8
 
 LARGEST: int = 4096
 """Rows or columns of a window, at most: beyond that a map is an error."""
+
+_SMALL: int = 10_000
+"""Cells of a box around a region, at most, for it to be asked whether it is too small."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +118,18 @@ class Lattice:
         """Rows and columns, with their parts, from the anchor; the centre of cell (0, 0) is at (0.5, 0.5)."""
         across, up = self._anchor.to_grid(np.array([[x, y]], dtype=np.float64))[0]
         return -float(up), float(across)
+
+    def has_centre_in(self, region: Region) -> bool:
+        """Whether a region covers a cell, were all of them free."""
+        # A point's own cell counts, however small its radius is.
+        if isinstance(region, Disc):
+            return True
+        rows, columns = zip(*(self.cell_of(x, y) for x, y in region.vertices), strict=True)
+        height, width = max(rows) - min(rows) + 1, max(columns) - min(columns) + 1
+        if height * width > _SMALL:
+            return True
+        frame = self._anchor.window(min(rows), min(columns), height, width)
+        return bool(region.covers(np.ones((height, width), bool), frame).any())
 
     def lay(self, scan: Scan) -> Int8[np.ndarray, "H W"]:
         """A map on the window, which grows where it must: values of ``BeliefMap.cells``."""

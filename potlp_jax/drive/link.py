@@ -45,7 +45,7 @@ class Link(Protocol):
         ...
 
     def cancel(self, action: str, goal: str) -> None:
-        """Take a goal back."""
+        """Take a goal back, where the robot can be reached; one that has ended is left alone."""
         ...
 
     @property

@@ -38,7 +38,7 @@ class Mover(Protocol):
         ...
 
     def stop(self) -> None:
-        """Stop where the robot is."""
+        """Stop where the robot is; asked once more where it may not have been heard."""
         ...
 
 
@@ -67,17 +67,22 @@ class Navigator:
         self._link, self._mode = link, mode
         self._action = action or ("/follow_path" if mode is Mode.FOLLOW else "/navigate_to_pose")
         self._lock, self._numbers = threading.Lock(), itertools.count()
-        self._goal: str | None = None
         self._current = -1
         self._end: Ended | None = None
+        # Goals whose end was not heard, by number: the robot may still drive to any of them.
+        self._sent: dict[int, str] = {}
 
     def begin(self, points: Points, frame_id: str) -> None:
         """Send a goal. Nav2 gives up the one before for it, without a halt between them."""
         with self._lock:
             number = self._current = next(self._numbers)
             self._end = None
-        kind, goal = self._goal_message(points, frame_id)
-        self._goal = self._link.send_goal(self._action, kind, goal, lambda ok, words: self._done(number, ok, words))
+        kind, message = self._goal_message(points, frame_id)
+        goal = self._link.send_goal(self._action, kind, message, lambda ok, words: self._done(number, ok, words))
+        with self._lock:
+            # It may have ended already, also because it was not sent; the goal before is then still on its way.
+            if goal and self._end is None:
+                self._sent[number] = goal
 
     def ended(self) -> Ended | None:
         """How the last goal ended."""
@@ -85,16 +90,22 @@ class Navigator:
             return self._end
 
     def stop(self) -> None:
-        """Take back the goal that is on its way."""
-        if self._goal is not None and self.ended() is None:
-            self._link.cancel(self._action, self._goal)
-        self._goal = None
+        """Take back every goal that may be on its way.
+
+        One is forgotten when its end is heard, and not before: while the connection is lost nothing is taken back, nor
+        is it where the connection is lost without a sign. To take back what has ended does no harm.
+        """
         with self._lock:
             self._current = -1
+            goals = tuple(self._sent.values())
+        # Without the lock, for the end may be told at once.
+        for goal in goals:
+            self._link.cancel(self._action, goal)
 
     def _done(self, number: int, succeeded: bool, words: str) -> None:
-        # Of a goal that was taken back, the end comes late and concerns nobody.
         with self._lock:
+            self._sent.pop(number, None)
+            # Of a goal that was taken back, the end comes late and concerns nobody.
             if number == self._current:
                 self._end = Ended(succeeded, words)
 

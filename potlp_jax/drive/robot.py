@@ -35,8 +35,15 @@ HYSTERESIS: float = 0.1
 SETTLED: float = 1.0
 """Seconds after the end of a navigation for which its last poses may still be on their way."""
 
+REASONS: int = 20
+"""Reasons for which messages were refused that are told, at most: of damaged messages each may have its own."""
+
 ASTRAY: int = 2
 """Cells from the path from which on a robot that somebody else drives goes elsewhere, and is advised anew."""
+
+
+class InterruptionError(Exception):
+    """Whoever drives has ended the drive before its first decision: there is nothing to record."""
 
 
 class RemoteRobot:
@@ -52,6 +59,7 @@ class RemoteRobot:
         places: Places | None = None,
         camera: CameraConfig = CameraConfig(),
         interrupted: Callable[[], bool] = lambda: False,
+        replaced: Callable[[], bool] = lambda: False,
         say: Callable[[str], None] = lambda _text: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -65,15 +73,20 @@ class RemoteRobot:
             places: where propositions hold that are known beforehand.
             camera: of the estimator.
             interrupted: whether the drive shall end; asked again and again.
+            replaced: whether another task is wanted, to which a trial gives way that has begun; asked likewise.
             say: told in words what a person should know.
             clock: seconds.
 
         Raises:
+            InterruptionError: ``interrupted`` before map and pose had come.
             RobotError: no map or no pose within ``config.patience``, or the robot is not on its map.
         """
         self._inbox, self._mover, self._config = inbox, mover, config
         self._propositions, self._places, self._camera = tuple(propositions), places, camera
-        self._interrupted, self._say, self._clock = interrupted, say, clock
+        self._interrupted, self._replaced, self._say, self._clock = interrupted, replaced, say, clock
+        self._noticed: list[str] = []
+        self._told = set[str]()
+        self._notice_unused_places()
         heard = self._await_first()
         assert heard.scan is not None
         self._lattice = Lattice(
@@ -84,7 +97,9 @@ class RemoteRobot:
         self._entered: list[Cell] = []
         self._sure: list[Cell] = []
         self._laid = -1
-        self._noticed: list[str] = []
+        # Since when no map could be laid, and why.
+        self._useless_since, self._useless = math.inf, ""
+        self._checked = set[Region]()
         self._cell = self._first_cell()
         self._sure.append(self._cell)
         self._inbox.take_poses()
@@ -98,8 +113,8 @@ class RemoteRobot:
 
     @property
     def noticed(self) -> tuple[str, ...]:
-        """What was doubtful about its map and places, in words."""
-        return tuple(self._noticed)
+        """What was doubtful about its map, its places and its messages, in words."""
+        return (*self._noticed, *(f"refused: {reason}" for reason in self._refusals(REASONS)))
 
     @property
     def frame(self) -> GridFrame:
@@ -113,6 +128,7 @@ class RemoteRobot:
 
     def observe(self) -> tuple[BeliefMap, Cell]:
         """The newest map, and the cell where the last leg ended."""
+        self._tell_refused()
         self._lay(self._inbox.heard)
         self._reported = self._lattice.origin
         belief = self._belief()
@@ -125,13 +141,14 @@ class RemoteRobot:
         if heard.picture is None or heard.pose is None:
             raise RobotError(
                 f"no picture was heard on {self._config.topics.image or 'any topic'}: this policy looks at panoramas; "
-                "name their topic, or choose the policy baseline"
+                f"name their topic, or choose the policy baseline. {self._refused()}"
             )
         height, width, _ = heard.picture.shape
         # Headings grow counter-clockwise with y upward, bearings clockwise with rows downward.
         looks = heard.pose[2] + math.radians(self._config.camera_yaw) - self._lattice.frame.yaw
-        field = min(2 * math.pi * height / width, math.pi)
-        return jnp.asarray(from_equirectangular(heard.picture, self._camera, -looks, field))
+        # Pixels are square; what reaches over more than a half circle is refused when it is heard.
+        field = 2 * math.pi * height / width
+        return jnp.asarray(from_equirectangular(heard.picture, self._camera, -looks, min(field, math.pi)))
 
     def advance(self, path: KnownPath, stop: Stop) -> Leg:
         """See the robot along a path, until it has arrived, a new decision is due, or it cannot go on."""
@@ -140,7 +157,12 @@ class RemoteRobot:
         row, column = self._reported
         cells = [as_cell(cell) for cell in np.asarray(path.cells)[: int(path.length) + 1]]
         planned = [(there[0] + row, there[1] + column) for there in cells]
-        leg = self._await_map() if len(planned) == 1 else self._travel(planned, stop)
+        if self._gives_way():
+            # No goal is sent any more; what was driven while it was decided is known.
+            self._follow(self._inbox.take_poses())
+            leg = self._halt()
+        else:
+            leg = self._await_map() if len(planned) == 1 else self._travel(planned, stop)
         return Leg(tuple((r - row, c - column) for r, c in leg.cells), leg.ended, leg.failure)
 
     def _travel(self, planned: list[Cell], stop: Stop) -> Leg:
@@ -153,18 +175,26 @@ class RemoteRobot:
             return Leg(tuple(self._entered))
         self._mover.begin([self._metres(cell) for cell in ahead], self.frame_id)
         while True:
-            self._inbox.wait(POLL)
+            self._wait()
             heard = self._inbox.heard
             self._follow(self._inbox.take_poses())
             leg = tuple(self._entered)
-            if self._interrupted():
-                self._mover.stop()
-                return Leg(leg, ended=True)
+            if self._gives_way():
+                return self._halt()
             if failure := self._failure(heard, len(planned), begun, bool(leg)):
                 self._mover.stop()
                 return Leg(leg, ended=not self._is_heard_again(heard), failure=failure)
             if self._is_over(heard, planned, leg, before, stop):
                 return Leg(leg)
+
+    def _gives_way(self) -> bool:
+        """Whether the trial ends here, whatever is left of its task."""
+        return self._interrupted() or self._replaced()
+
+    def _halt(self) -> Leg:
+        """Stop, and move no more; the cells of the leg are on the lattice."""
+        self._mover.stop()
+        return Leg(tuple(self._entered), ended=True)
 
     def _ahead(self, planned: list[Cell]) -> list[Cell]:
         """What of a path on the lattice is left to a robot that drove on while it was decided."""
@@ -196,16 +226,18 @@ class RemoteRobot:
         return heard.heard >= self._end_noticed + SETTLED
 
     def _is_heard_again(self, heard: Heard) -> bool:
-        """Whether poses come, now or within the time that one is patient."""
+        """Whether poses come, now or within the time that one is patient and does not interrupt."""
         begun = self._clock()
         silent = begun - heard.heard > self._config.silence
         if silent:
             self._say("stopped: nothing is heard of the robot's pose")
         while self._clock() - self._inbox.heard.heard > self._config.silence:
-            if self._clock() - begun > self._config.patience:
+            if self._interrupted() or self._clock() - begun > self._config.patience:
                 return False
-            self._inbox.wait(POLL)
+            self._wait()
         if silent:
+            # The silence may have been that of the connection, over which nothing was taken back.
+            self._mover.stop()
             self._say("the robot's pose is heard again")
         return True
 
@@ -236,21 +268,46 @@ class RemoteRobot:
                     f"{'published' if heard.scan is None else topics.pose or topics.tf + ' published'}, and "
                     f"{self._config.base_frame!r} the robot's frame? {self._refused()}"
                 )
-            self._inbox.wait(POLL)
+            self._wait_for_the_first()
         return heard
 
+    def _wait_for_the_first(self) -> None:
+        if self._interrupted():
+            raise InterruptionError
+        self._wait()
+
+    def _wait(self) -> None:
+        """Let a moment pass, or less where something is heard, and say what was refused."""
+        self._inbox.wait(POLL)
+        self._tell_refused()
+
+    def _tell_refused(self) -> None:
+        """Say each new reason for which messages are refused, once; how often is in ``noticed``."""
+        # A message of which one word is misspelt is left out as a whole, and nothing else would tell.
+        new = [reason for reason in self._inbox.refused if reason not in self._told]
+        for reason in new[: REASONS - len(self._told)]:
+            self._told.add(reason)
+            self._say(f"refused: {reason}")
+
+    def _refusals(self, most: int) -> list[str]:
+        """Reasons for which messages were refused, the most frequent ones, and how often."""
+        refused = self._inbox.refused.most_common(most)
+        return [f"{reason} ({'once' if count == 1 else f'{count} times'})" for reason, count in refused]
+
     def _refused(self) -> str:
-        refused = self._inbox.refused.most_common(3)
-        return "Refused: " + "; ".join(f"{text} ({count} times)" for text, count in refused) if refused else ""
+        refused = self._refusals(3)
+        return "Refused: " + "; ".join(refused) if refused else ""
 
     def _await_map(self) -> Leg:
         """Stand until more or something else is known, for there is nowhere to go."""
+        # A leg that ended for a new decision has left its goal on its way.
+        self._mover.stop()
         begun, known = self._clock(), self._known()
         # A map that came anew, or turned a little, may say the same once more: what is missing may still be on its way.
         while self._clock() - begun < self._config.patience and not self._has_changed(known):
-            if self._interrupted():
-                return Leg((), ended=True)
-            self._inbox.wait(POLL)
+            if self._gives_way():
+                return self._halt()
+            self._wait()
             self._follow(self._inbox.take_poses())
             # Somebody may carry it on.
             if self._entered:
@@ -281,7 +338,7 @@ class RemoteRobot:
                     f"within {FARTHEST_SNAP:g} cells: is it localised, and is the radius of {self._config.radius:g} m "
                     "right?"
                 )
-            self._inbox.wait(POLL)
+            self._wait_for_the_first()
 
     def _follow(self, poses: Sequence[Pose]) -> None:
         """Enter the cells that the poses lie in; between cells that are no neighbours, along the shortest path."""
@@ -323,13 +380,36 @@ class RemoteRobot:
         return None if found is None else (found[1] + top, found[2] + left)
 
     def _lay(self, heard: Heard) -> bool:
-        """Take the newest map; returns whether it is another than before."""
+        """Take the newest map and places; returns whether any came. Raises RobotError."""
         if self._laid == heard.maps:
+            # The last map that came was of no use, and no other follows.
+            self._check_patience()
             return False
         assert heard.scan is not None
-        self._values, self._laid = self._lattice.lay(heard.scan), heard.maps
         self._regions = heard.regions
+        try:
+            self._values = self._lattice.lay(heard.scan)
+            self._useless_since = math.inf
+        except RobotError as error:
+            self._leave_out(error)
+        self._laid = heard.maps
+        self._check_patience()
         return True
+
+    def _leave_out(self, error: RobotError) -> None:
+        """Keep the map before, where there is one: the next may be right. Raises RobotError where there is none."""
+        if self._laid < 0:
+            raise error
+        if self._useless_since == math.inf:
+            self._useless_since = self._clock()
+            self._notice(f"a map is left out, and the one before stays: {error}")
+        self._useless = str(error)
+
+    def _check_patience(self) -> None:
+        """Raise RobotError where the map has been of no use for long."""
+        since = self._clock() - self._useless_since
+        if since > self._config.patience:
+            raise RobotError(f"no map of use for {since:.0f} s: {self._useless}")
 
     def _free(self) -> Bool[np.ndarray, "H W"]:
         return self._shown() == BeliefMap.FREE
@@ -350,6 +430,7 @@ class RemoteRobot:
         for name, region in (*self._known_regions(), *self._regions):
             covered = region.covers(free, self._lattice.frame)
             if not covered.any():
+                self._notice_if_tiny(name, region)
                 covered = self._moved(name, region, values)
             letters[covered] |= 1 << self._propositions.index(name)
         return letters
@@ -358,12 +439,34 @@ class RemoteRobot:
         """The cell beside a place that lies in obstacles, where there is one, and a word on it."""
         free, obstacle = values == BeliefMap.FREE, values == BeliefMap.OCCUPIED
         cell, covered = free_cell_beside(region, free, obstacle, self._lattice.frame), np.zeros_like(free)
-        if cell is not None:
+        if cell is None:
+            own = region.covers(np.ones_like(free), self._lattice.frame)
+            if own.any() and obstacle[own].all():
+                self._notice(f"{name}: {region} lies in obstacles of the map, no free cell touches it: it is nowhere")
+        else:
             covered[cell] = True
             x, y = self._lattice.frame.cell_to_metres(*cell)
             # Places keep their metres where a map that turns does not: one that was nowhere would end the task.
             self._notice(f"{name}: {region} lies in an obstacle of the map; it is taken to be at [{x:.2f}, {y:.2f}]")
         return covered
+
+    def _notice_if_tiny(self, name: str, region: Region) -> None:
+        if region not in self._checked:
+            self._checked.add(region)
+            if not self._lattice.has_centre_in(region):
+                size = self._config.resolution
+                self._notice(
+                    f"{name}: {region} holds the centre of no cell of {size:g} m, and is nowhere: make it larger"
+                )
+
+    def _notice_unused_places(self) -> None:
+        """Labels may be of more than a task is about; a name that is misspelt looks the same."""
+        unused = () if self._places is None else [name for name in self._places.names if name not in self._propositions]
+        if self._places is not None and unused:
+            self._notice(
+                f"{self._places.source}: not used are the places of {', '.join(unused)}: the propositions are "
+                f"{', '.join(self._propositions)}"
+            )
 
     def _notice(self, text: str) -> None:
         """Say something doubtful, once."""

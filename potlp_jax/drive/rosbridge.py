@@ -97,7 +97,7 @@ class RosbridgeLink:
         return client.send_goal(self._library.Goal(goal), ended, lambda _feedback: None, ended)
 
     def cancel(self, action: str, goal: str) -> None:
-        """Take a goal back."""
+        """Take a goal back; while the connection is lost nothing is sent."""
         if self.is_connected and action in self._actions:
             self._actions[action].cancel_goal(goal)
 

@@ -5,6 +5,7 @@ follows would be a wrong automaton's state and a wrong record, found late or nev
 compared with the contract (``trials.robot``), and an error says what was wrong and what is right.
 """
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,7 +13,8 @@ from contextlib import contextmanager
 import numpy as np
 from jaxtyping import Array, Int32, UInt8
 
-from potlp_jax.errors import PotlpError, RobotError
+from potlp_jax.errors import RobotError
+from potlp_jax.files import short
 from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.trials.record import NEVER_SEEN, Correction, belief_seen_by
 from potlp_jax.trials.robot import GrowingRobot, Leg, NoticesDoubts, RemembersItsWay, Robot
@@ -56,7 +58,7 @@ class WatchedRobot:
     @property
     def notes(self) -> tuple[str, ...]:
         """What was noticed, here and by the robot itself."""
-        return (*self._late, *(self._robot.noticed if isinstance(self._robot, NoticesDoubts) else ()))
+        return (*self._late, *self._noticed())
 
     @property
     def last_map(self) -> BeliefMap:
@@ -72,41 +74,44 @@ class WatchedRobot:
     @property
     def origin(self) -> Cell:
         """That of the robot."""
-        return self._robot.origin if isinstance(self._robot, GrowingRobot) else (0, 0)
+        with _its_own("origin of the robot"):
+            origin = self._robot.origin if isinstance(self._robot, GrowingRobot) else (0, 0)
+        return _as_cell(origin, "the origin of a robot's map")
 
     def observe(self) -> tuple[BeliefMap, Cell]:
         """The map and the robot's cell."""
-        with _its_own("observe"):
+        with _its_own("observe() of the robot"):
             observed = self._robot.observe()
         if not (isinstance(observed, tuple) and len(observed) == 2 and isinstance(observed[0], BeliefMap)):
             raise RobotError(f"observe() returns a BeliefMap and a cell (row, column), found {type(observed).__name__}")
-        belief, cell = observed
-        self._check_map(belief)
-        self._check_cell(belief, cell)
+        belief, cell = observed[0], _as_cell(observed[1], "the cell that observe() returns")
+        # A map may be one that nothing can be compared with.
+        with _its_own("the check of the map that observe() returned"):
+            self._check_map(belief)
+            self._check_cell(belief, cell)
+            self.history.add(belief, self.origin, len(self._leg))
         self._belief, self._last_origin = belief, self.origin
-        self.history.add(belief, self.origin, len(self._leg))
         self._leg = ()
         return belief, cell
 
     def panorama(self) -> UInt8[Array, "rows columns 3"]:
         """What the robot's camera sees."""
-        with _its_own("panorama"):
+        with _its_own("panorama() of the robot"):
             return self._robot.panorama()
 
     def panorama_before(self, back: int) -> UInt8[Array, "rows columns 3"] | None:
         """What the robot's camera saw on its way, where it remembers that."""
-        with _its_own("panorama_before"):
+        with _its_own("panorama_before() of the robot"):
             return self._robot.panorama_before(back) if isinstance(self._robot, RemembersItsWay) else None
 
     def advance(self, path: KnownPath, stop: Stop) -> Leg:
         """Follow a path."""
         row, column = self.origin
         begun = self._clock()
-        with _its_own("advance"):
+        with _its_own("advance() of the robot"):
             leg = self._robot.advance(path, stop)
         seconds = self._clock() - begun
-        if not isinstance(leg, Leg):
-            raise RobotError(f"advance() returns a Leg, found {type(leg).__name__}")
+        leg = _as_leg(leg)
         start = tuple(int(entry) for entry in np.asarray(path.cells)[0])
         self._check_leg(leg, (start[0], start[1]))
         self._leg = tuple((row + there[0], column + there[1]) for there in leg.cells)
@@ -149,7 +154,7 @@ class WatchedRobot:
 
     def _check_cell(self, belief: BeliefMap, cell: Cell) -> None:
         height, width = belief.cells.shape
-        if not (len(cell) == 2 and 0 <= cell[0] < height and 0 <= cell[1] < width):
+        if not (0 <= cell[0] < height and 0 <= cell[1] < width):
             raise RobotError(f"the robot says that it is in cell {cell}, and its map has {_size(belief)} cells")
         row, column = self.origin
         cells = np.asarray(belief.cells)
@@ -178,6 +183,13 @@ class WatchedRobot:
                 )
             before = cell
 
+    def _noticed(self) -> tuple[str, ...]:
+        # At the end of a drive, whose record shall not be lost for a remark.
+        try:
+            return tuple(map(str, self._robot.noticed)) if isinstance(self._robot, NoticesDoubts) else ()
+        except Exception as error:
+            return (f"noticed of the robot raised {type(error).__name__}: {error}",)
+
     def _note_late(self, seconds: float, length: int) -> None:
         limit = None if self._seconds_per_cell is None else self._seconds_per_cell * max(length, 1)
         if limit is not None and seconds > limit:
@@ -187,14 +199,39 @@ class WatchedRobot:
 
 
 @contextmanager
-def _its_own(method: str) -> Iterator[None]:
+def _its_own(what: str) -> Iterator[None]:
     """Whatever somebody else's method raises is the robot's error, so that the record of the drive is kept."""
     try:
         yield
-    except PotlpError:
+    except RobotError:
         raise
+    # Errors of this library, too: a map that could not be made is one of ``WorldError``.
     except Exception as error:
-        raise RobotError(f"{method}() of the robot raised {type(error).__name__}: {error}") from error
+        raise RobotError(f"{what} raised {type(error).__name__}: {error}") from error
+
+
+def _as_cell(value: object, what: str) -> Cell:
+    """Row and column as Python's numbers, whatever pair of whole numbers they are. Raises RobotError."""
+    try:
+        found = np.asarray(value)
+        row, column = found.tolist()
+    # It has no order, other entries than numbers, or more or fewer than two.
+    except Exception as error:
+        raise RobotError(f"{what} is a pair (row, column), found {short(value)}") from error
+    if found.dtype.kind not in "iu" or found.ndim != 1:
+        raise RobotError(f"{what} is a pair (row, column) of whole numbers, found {short(value)}")
+    return row, column
+
+
+def _as_leg(leg: object) -> Leg:
+    """A leg with a tuple of Python's cells: the loop compares them with those of the path. Raises RobotError."""
+    if not isinstance(leg, Leg):
+        raise RobotError(f"advance() returns a Leg, found {type(leg).__name__}")
+    if not isinstance(leg.failure, str):
+        raise RobotError(f"the failure of a leg is in words, found {short(leg.failure)}")
+    with _its_own("the check of the cells of the leg"):
+        cells = tuple(_as_cell(cell, "each cell of a leg") for cell in leg.cells)
+    return dataclasses.replace(leg, cells=cells)
 
 
 class MapHistory:
@@ -210,10 +247,11 @@ class MapHistory:
 
     def add(self, belief: BeliefMap, origin: Cell, moved: int) -> None:
         """An observation, made after so many cells were entered since the one before."""
+        # First what may fail: one that was not taken leaves what was known before.
+        (rows, columns), changes = np.asarray(belief.extent).tolist(), self._changes_of(belief, origin)
         self._steps.append(moved + (self._steps[-1] if self._steps else 0))
-        rows, columns = np.asarray(belief.extent).tolist()
         self._extents.append((rows, columns))
-        self._changes.append(self._changes_of(belief, origin))
+        self._changes.append(changes)
         self._shown |= self._changes[-1]
         self._last = belief, origin
 
