@@ -468,6 +468,17 @@ def test_a_remark_that_cannot_be_had_costs_no_record():
     assert driven(Mute())[0].notes == ("noticed of the robot raised OSError: no voice",)
 
 
+def test_a_listener_that_fails_leaves_the_record():
+    def fails(decision, belief):
+        if decision.index == 2:
+            raise BrokenPipeError("nobody reads")
+
+    with pytest.raises(BrokenDriveError, match="the listener raised BrokenPipeError: nobody reads") as caught:
+        potlp_jax.run_robot(Rover(), TASK, "baseline", KEY, listener=fails)
+    assert caught.value.trial is not None
+    assert len(caught.value.trial.decisions) == 3
+
+
 def test_a_growing_map_that_breaks_off_leaves_the_record_on_the_map_before():
     class Fails(GrowingRover):
         def __init__(self, legs):

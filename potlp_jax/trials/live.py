@@ -14,11 +14,11 @@ from potlp_jax.precision import in_32_bits
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import BrokenDriveError, Listener, drive, make_trial, shifted_cells, shifted_decision
-from potlp_jax.trials.record import ROBOT_PREFIX, RunRecord, Trial
+from potlp_jax.trials.record import ROBOT_PREFIX, Decision, RunRecord, Trial
 from potlp_jax.trials.robot import Robot
 from potlp_jax.trials.rules import estimator_of
 from potlp_jax.trials.setbacks import SetbackConfig
-from potlp_jax.trials.watching import WatchedRobot
+from potlp_jax.trials.watching import WatchedRobot, its_own
 from potlp_jax.world.grid import BeliefMap, World, make_world
 
 
@@ -63,8 +63,8 @@ def run_robot(
         The record, as of a trial in simulation.
 
     Raises:
-        RobotError: the robot broke its side of the contract. After its first observation it is a ``BrokenDriveError``,
-            which has the record until then as ``trial``: ``unfinished``, and the error is its last note.
+        RobotError: the robot broke its side of the contract, or it or the listener raised something else. After the
+            first observation it is a ``BrokenDriveError``, which has the record until then as ``trial``: ``unfinished``, and the error is its last note.
         PropositionsError: the robot's map, task, estimator and ``world`` are not over the same propositions.
         EstimatorError: no estimator is shipped for the task's propositions in such a world.
         PotlpError: the policy is ``oracle`` and there is no ``world``.
@@ -80,6 +80,11 @@ def run_robot(
         trial = _recorded(run, watched, task, policy, config, asked)
         return dataclasses.replace(trial, environment=f"{ROBOT_PREFIX}{name}")
 
+    def tell(decision: Decision, belief: BeliefMap) -> None:
+        with its_own("the listener"):
+            if listener is not None:
+                listener(decision, belief)
+
     try:
         run = drive(
             watched,
@@ -91,7 +96,7 @@ def run_robot(
             estimator=estimator,
             world=world,
             setbacks=setbacks,
-            listener=listener,
+            listener=tell,
         )
     except BrokenDriveError as error:
         trial = record(error.run)

@@ -74,19 +74,19 @@ class WatchedRobot:
     @property
     def origin(self) -> Cell:
         """That of the robot."""
-        with _its_own("origin of the robot"):
+        with its_own("origin of the robot"):
             origin = self._robot.origin if isinstance(self._robot, GrowingRobot) else (0, 0)
         return _as_cell(origin, "the origin of a robot's map")
 
     def observe(self) -> tuple[BeliefMap, Cell]:
         """The map and the robot's cell."""
-        with _its_own("observe() of the robot"):
+        with its_own("observe() of the robot"):
             observed = self._robot.observe()
         if not (isinstance(observed, tuple) and len(observed) == 2 and isinstance(observed[0], BeliefMap)):
             raise RobotError(f"observe() returns a BeliefMap and a cell (row, column), found {type(observed).__name__}")
         belief, cell = observed[0], _as_cell(observed[1], "the cell that observe() returns")
         # A map may be one that nothing can be compared with.
-        with _its_own("the check of the map that observe() returned"):
+        with its_own("the check of the map that observe() returned"):
             self._check_map(belief)
             self._check_cell(belief, cell)
             self.history.add(belief, self.origin, len(self._leg))
@@ -96,19 +96,19 @@ class WatchedRobot:
 
     def panorama(self) -> UInt8[Array, "rows columns 3"]:
         """What the robot's camera sees."""
-        with _its_own("panorama() of the robot"):
+        with its_own("panorama() of the robot"):
             return self._robot.panorama()
 
     def panorama_before(self, back: int) -> UInt8[Array, "rows columns 3"] | None:
         """What the robot's camera saw on its way, where it remembers that."""
-        with _its_own("panorama_before() of the robot"):
+        with its_own("panorama_before() of the robot"):
             return self._robot.panorama_before(back) if isinstance(self._robot, RemembersItsWay) else None
 
     def advance(self, path: KnownPath, stop: Stop) -> Leg:
         """Follow a path."""
         row, column = self.origin
         begun = self._clock()
-        with _its_own("advance() of the robot"):
+        with its_own("advance() of the robot"):
             leg = self._robot.advance(path, stop)
         seconds = self._clock() - begun
         leg = _as_leg(leg)
@@ -199,7 +199,7 @@ class WatchedRobot:
 
 
 @contextmanager
-def _its_own(what: str) -> Iterator[None]:
+def its_own(what: str) -> Iterator[None]:
     """Whatever somebody else's method raises is the robot's error, so that the record of the drive is kept."""
     try:
         yield
@@ -229,7 +229,7 @@ def _as_leg(leg: object) -> Leg:
         raise RobotError(f"advance() returns a Leg, found {type(leg).__name__}")
     if not isinstance(leg.failure, str):
         raise RobotError(f"the failure of a leg is in words, found {short(leg.failure)}")
-    with _its_own("the check of the cells of the leg"):
+    with its_own("the check of the cells of the leg"):
         cells = tuple(_as_cell(cell, "each cell of a leg") for cell in leg.cells)
     return dataclasses.replace(leg, cells=cells)
 
