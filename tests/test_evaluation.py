@@ -378,6 +378,29 @@ def test_an_estimator_is_evaluated_on_data_of_its_own_kind_only():
         check_fit(CONFIG, learned, dataclasses.replace(samples, images=[]), "net", "data")
 
 
+def _labelled(collection) -> dict:
+    return {"data": {"collection": collection}}
+
+
+def test_an_estimator_is_evaluated_on_labels_of_its_own_kind_only():
+    samples = make_samples(1, 5, 11)
+    near = dataclasses.replace(samples, metadata=dataclasses.replace(METADATA, collection={"nearest": True}))
+    for data, made in (
+        (samples, _labelled({"nearest": False})),
+        (samples, _labelled({})),
+        (near, _labelled({"nearest": True})),
+        # A file that does not say how its labels were made may be of either kind.
+        (near, {"data": None}),
+        (near, {}),
+    ):
+        check_fit(CONFIG, METADATA.domain, data, "net", "data", made)
+    with pytest.raises(EvaluationError, match="data does not ask what net answers: .* collect with --set nearest=true"):
+        check_fit(CONFIG, METADATA.domain, samples, "net", "data", _labelled({"nearest": True}))
+    # Data sets of before could be labelled in one way alone.
+    with pytest.raises(EvaluationError, match="collect with --set nearest=false"):
+        check_fit(CONFIG, METADATA.domain, near, "net", "data", _labelled({}))
+
+
 def test_the_most_confident_right_and_wrong_answers_are_found():
     samples, predictions = make_samples(12, 200, 12), make_predictions(200, 12, decimals=6)
     chosen = most_confident(samples, predictions, 3)
@@ -558,6 +581,8 @@ def test_bad_input_is_one_clear_message(estimator, dataset, tmp_path, monkeypatc
     other = tmp_path / "other.npz"
     config = dataclasses.replace(CONFIG, propositions=("goal",))
     save_estimator(other, EstimatorNetwork(config).init(jax.random.key(0)), config, METADATA.domain, {})
+    near = tmp_path / "near.npz"
+    save_estimator(near, NETWORK.init(jax.random.key(0)), CONFIG, METADATA.domain, _labelled({"nearest": True}))
     broken = tmp_path / "broken.npz"
     broken.write_bytes(estimator.read_bytes()[:500])
     for arguments, part in (
@@ -566,6 +591,7 @@ def test_bad_input_is_one_clear_message(estimator, dataset, tmp_path, monkeypatc
         (("evaluate", broken, folder), "damaged"),
         (("evaluate", estimator, tmp_path), "there is no dataset"),
         (("evaluate", other, folder), "has the propositions (fire, alarm, exit)"),
+        (("evaluate", near, folder), "collect with --set nearest=true"),
         (("evaluate", estimator, folder, "--ablate", "sound"), "unknown ablation 'sound'"),
     ):
         result = _potlp(*arguments)

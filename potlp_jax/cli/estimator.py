@@ -84,7 +84,7 @@ def evaluate_estimator(
     params, config, domain, metadata = load_estimator(estimator)
     samples = read_dataset(dataset)
     # An estimator asked about propositions that it does not know would answer without meaning.
-    check_fit(config, domain, samples, str(estimator), str(dataset))
+    check_fit(config, domain, samples, str(estimator), str(dataset), metadata)
     _warn(metadata, samples)
     folder = None if out is None else make_folder(out)
     learner = learner_of(config)

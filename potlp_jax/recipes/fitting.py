@@ -34,6 +34,7 @@ from potlp_jax.learning.estimator import TrainedEstimator, read_estimator
 from potlp_jax.learning.learner import Learner
 from potlp_jax.learning.learners import learner_of
 from potlp_jax.learning.loss import DataScale
+from potlp_jax.learning.made_from import nearest_misfit
 from potlp_jax.learning.network import parameter_count, require_propositions
 from potlp_jax.learning.panorama_learner import PanoramaOptions
 from potlp_jax.learning.serialization import save_estimator
@@ -148,13 +149,17 @@ def learner_after(begin: TrainedEstimator, training: Samples, network: BuildingO
 
     Raises:
         PropositionsError: it was made for other propositions than those of the data.
-        TrainingError: its costs are in another unit, or, of a panorama network, its pictures are of another camera.
+        TrainingError: its costs are in another unit, its labels of another kind, or, of a panorama network, its
+            pictures are of another camera.
     """
     known = begin.config
     misfits = begin.domain.measure_misfits(training.metadata.domain)
     # Whoever reads maps that are painted takes another painter; whoever reads pictures has to learn anew.
     if misfits and (begin.domain.unit != training.metadata.unit or not isinstance(known, BuildingConfig)):
         raise TrainingError(f"{begin.name} cannot go on with these data: {'; '.join(misfits)}. Train from nothing")
+    mixed = nearest_misfit(begin.metadata, training.metadata.nearest)
+    if mixed is not None:
+        raise TrainingError(f"{begin.name} cannot go on with the training data: {mixed}, or train from nothing")
     require_propositions(known.propositions, training.metadata.propositions, begin.name, asker="the training data")
     # The scales of costs are the estimator's own: with others its parameters would mean other costs. Its maps are
     # painted as those from which it learns now, by the same camera, and have their cells.
