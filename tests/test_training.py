@@ -359,6 +359,27 @@ def test_a_time_budget_ends_training_with_an_evaluation():
     assert np.isfinite(done.best_loss)
 
 
+def test_a_training_whose_time_is_over_before_its_first_evaluation_goes_on_to_one(tmp_path):
+    class Killed(Exception):
+        pass
+
+    def kill(step, loss):
+        if step == 3:
+            raise Killed
+
+    samples = synthetic(16, 4, 9)
+    network, config = _learner(samples, TINY), _config(8, checkpoint_steps=2)
+    with pytest.raises(Killed):
+        train(network, samples, samples, config, folder=tmp_path, on_step=kill)
+    assert checkpoint_steps(tmp_path) == [2]
+    # What the checkpoint has as the best are parameters that learned nothing.
+    done = train(network, samples, samples, config, folder=tmp_path, budget_seconds=0.001)
+    assert (done.reason, done.steps, done.best_step) == ("time", 3, 3)
+    assert np.isfinite(done.best_loss)
+    first = initial_state(network, config).params
+    assert not all(map(np.array_equal, jax.tree.leaves(done.params), jax.tree.leaves(first)))
+
+
 @pytest.mark.parametrize(
     "changes",
     [

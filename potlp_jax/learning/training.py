@@ -346,13 +346,12 @@ class _Loop:
         """Why training is over, or None."""
         if self.steps_done >= self._config.steps:
             return "planned"
-        # However short the time, parameters that learned nothing are no estimator.
-        if self.steps_done == 0:
-            return None
         # After the plan, which is the usual end: its name says that the schedule was completed.
         if self._config.patience and int(self._state.evaluations_since_best) >= self._config.patience:
             return "patience"
-        return "time" if self.out_of_time else None
+        # However short the time: until the first evaluation the best parameters are those that learned nothing. A
+        # training that was killed before it goes on to one.
+        return "time" if self.out_of_time and np.isfinite(float(self._state.best_loss)) else None
 
     def result(self) -> Trained:
         """The best parameters so far."""

@@ -5,7 +5,9 @@ The folder of a fit then holds ``estimator.npz`` (the best parameters by validat
 also by SIGKILL, resumes and ends with the same parameters, bit for bit, as without the interruption.
 
 With a time to keep, the speed is measured first, and as many steps are planned as fit, at most ``epochs``; the learning
-rate's schedule ends with the plan. The plan is written once, so that a resumed training follows it.
+rate's schedule ends with the plan. The plan is written once, so that a resumed training follows it. Where training is
+slower than measured and is cut short (``ended_by`` in the file is ``time``), the clock decides after which step: two
+such fits differ, and so does one that was interrupted. However a fit ended, the same command again gives the same file.
 
 Several processes may share a fit (``learning.devices``): all of them call ``fit`` with one
 folder, to which the first one writes.
@@ -21,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from potlp_jax.checks import AT_LEAST_ONE, require_fields
+from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, require_fields
 from potlp_jax.codec import differences
 from potlp_jax.errors import TrainingError
 from potlp_jax.files import MOST_TEXT, read_json, reading
@@ -104,13 +106,8 @@ def fit(
     learner = config.network.learner(training) if begin is None else learner_after(begin, training, config.network)
     _tell_of_changes(begin, learner, display)
     _tell_of_what_is_shared(training, validation, display)
-    # Measuring counts: the time asked for is that of the whole command.
-    began = time.perf_counter()
-    plan = _plan(learner, training, out, config)
+    plan, budget = _plan(learner, training, out, config)
     journal = _begin_journal(training, plan, out, config, display) if is_first() else None
-    budget = float("inf")
-    if config.minutes is not None:
-        budget = config.minutes * 60 * _OVERRUN - (time.perf_counter() - began)
     observers: dict[str, Any] = {} if journal is None else journal.observers()
     # The journal is closed whatever happens, so that TensorBoard's file is whole.
     try:
@@ -192,19 +189,29 @@ def _tell_of_what_is_shared(training: Samples, validation: Samples, display: Dis
         )
 
 
-def _plan(learner: Learner, training: Samples, out: Path, config: FitConfig) -> TrainingConfig:
-    """How to train, and for how many steps."""
+def _plan(learner: Learner, training: Samples, out: Path, config: FitConfig) -> tuple[TrainingConfig, float]:
+    """How to train, for how many steps, and for how many seconds at most."""
     # Not ``asdict``, which would also take nested options apart.
     options = {field.name: getattr(config.training, field.name) for field in dataclasses.fields(config.training)}
     # The number of steps changes neither the batches nor the time of a step, so any serves to find it out.
     one = TrainingConfig(steps=1, **options)
-    steps = planned_steps(
+    planned = planned_steps(
         out, steps_per_epoch(learner, training, one), config, lambda: seconds_per_step(learner, training, one)
     )
-    return TrainingConfig(steps=steps, **options)
+    # Measuring counts: the time asked for is that of the whole command.
+    budget = float("inf") if config.minutes is None else config.minutes * 60 * _OVERRUN - planned.measuring
+    return TrainingConfig(steps=planned.steps, **options), budget
 
 
-def planned_steps(folder: Path, epoch: int, config: FitConfig, measure: Callable[[], float]) -> int:
+@dataclasses.dataclass(frozen=True)
+class Planned:
+    """How many steps are planned, and the seconds that were spent to find it out: at the first start alone."""
+
+    steps: int
+    measuring: float = 0.0
+
+
+def planned_steps(folder: Path, epoch: int, config: FitConfig, measure: Callable[[], float]) -> Planned:
     """Steps to plan; where there is a plan already, what it says. The first process's plan is that of all.
 
     Args:
@@ -214,7 +221,8 @@ def planned_steps(folder: Path, epoch: int, config: FitConfig, measure: Callable
         measure: gives the seconds that a step takes; called, by all processes, where a plan must be made for a time.
 
     Returns:
-        The number of steps. A resumed training must not measure again: another number would be another schedule.
+        The plan. A resumed training must not measure again: another number would be another schedule, and another time
+        spent on it would leave another rest for the training.
 
     Raises:
         TrainingError: there is a plan for other options.
@@ -222,33 +230,43 @@ def planned_steps(folder: Path, epoch: int, config: FitConfig, measure: Callable
     # What the number of steps follows from. Other options are compared with the checkpoint.
     asked = {"epochs": config.epochs, "minutes": config.minutes, "seed": config.training.seed}
     path = folder / "plan.json"
-    written = int(agreed(np.int32(_written_steps(path, asked) if is_first() and path.exists() else 0)))
-    if written:
+    written = _agreed(_written_plan(path, asked) if is_first() and path.exists() else Planned(0))
+    if written.steps:
         return written
     plan: dict[str, Any] = {"asked": asked, "steps": config.epochs * epoch}
+    measuring = 0.0
     if config.minutes is not None:
+        began = time.perf_counter()
         plan["seconds_per_step"] = float(agreed(np.float32(measure())))
+        measuring = time.perf_counter() - began
         # At least one step, however short the time: the estimator is then poor, but there is one.
         fitting = int(config.minutes * 60 * (1 - _RESERVE) / plan["seconds_per_step"])
         plan["steps"] = max(1, min(plan["steps"], fitting))
+    made = _agreed(Planned(plan["steps"], measuring))
     if is_first():
         folder.mkdir(parents=True, exist_ok=True)
         # Renamed when it is whole: half a plan would stop every resumption.
         temporary = path.with_suffix(".json.tmp")
-        temporary.write_text(json.dumps(plan))
+        temporary.write_text(json.dumps(plan | {"measuring": made.measuring}))
         temporary.replace(path)
-    return int(plan["steps"])
+    return made
 
 
-def _written_steps(path: Path, asked: dict[str, Any]) -> int:
+def _agreed(plan: Planned) -> Planned:
+    """The first process's plan, with its seconds in the precision in which the others learn them."""
+    return Planned(int(agreed(np.int32(plan.steps))), float(agreed(np.float32(plan.measuring))))
+
+
+def _written_plan(path: Path, asked: dict[str, Any]) -> Planned:
     plan = read_json(path, TrainingError, "the plan of a training", MOST_TEXT)
     with reading(path, TrainingError, "the plan of a training"):
-        found, steps = differences(plan["asked"], asked), int(plan["steps"])
+        # Plans of before do not say how long it took to make them.
+        found, steps, measuring = differences(plan["asked"], asked), int(plan["steps"]), float(plan.get("measuring", 0))
     if found:
         raise TrainingError(f"{path} was made for another training ({'; '.join(found)}): choose another folder")
-    if steps < 1:
-        raise TrainingError(f"{path} plans {steps} steps: delete it to plan again")
-    return steps
+    if steps < 1 or not NOT_NEGATIVE.allows(measuring):
+        raise TrainingError(f"{path} plans {steps} steps after {measuring} seconds: delete it to plan again")
+    return Planned(steps, measuring)
 
 
 def _metadata(training: Samples, plan: TrainingConfig, trained: Trained, journal: Journal) -> dict[str, Any]:

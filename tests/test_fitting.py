@@ -1,0 +1,58 @@
+"""Fits on disk: what a second start does, what is refused, and what an estimator's file says of how it was made."""
+
+import dataclasses
+import json
+import types
+
+import pytest
+
+from potlp_jax.learning.panorama_learner import PanoramaOptions
+from potlp_jax.learning.training_options import TrainingOptions
+from potlp_jax.recipes import fitting
+from potlp_jax.recipes.fitting import ESTIMATOR, FitConfig, fit, planned_steps
+from tests.test_training import synthetic
+
+SMALL = FitConfig(
+    epochs=3,
+    network=PanoramaOptions(second_widths=(3,) * 8),
+    training=TrainingOptions(views_per_batch=4, samples_per_view=4, patience=0),
+)
+
+
+def _clock_that_measuring_moves(monkeypatch, seconds):
+    """Measuring the speed takes so many seconds, by a clock of its own; a step takes next to none."""
+    passed = [0.0]
+
+    def seconds_per_step(*arguments):
+        passed[0] += seconds
+        return 1e-4
+
+    monkeypatch.setattr(fitting, "seconds_per_step", seconds_per_step)
+    monkeypatch.setattr(fitting, "time", types.SimpleNamespace(perf_counter=lambda: passed[0]))
+
+
+def test_a_fit_that_its_time_ended_gives_the_same_file_again(tmp_path, monkeypatch):
+    # 72 seconds, of which measuring leaves nothing: one step is made.
+    _clock_that_measuring_moves(monkeypatch, 71.9999)
+    config = dataclasses.replace(SMALL, minutes=1.0)
+    samples, found = synthetic(8, 4, 0), []
+    for _ in range(2):
+        ended = fit(samples, samples, tmp_path, config)
+        found.append((ended.reason, ended.steps, (tmp_path / ESTIMATOR).read_bytes()))
+    assert found[0][:2] == ("time", 1)
+    assert found[0] == found[1]
+
+
+def test_a_plan_of_before_does_not_say_how_long_measuring_took(tmp_path):
+    config = FitConfig(epochs=2, minutes=3.0)
+    made = planned_steps(tmp_path, 5, config, lambda: 1.0)
+    assert (made.steps, made.measuring) == (10, pytest.approx(0, abs=1))
+    file = tmp_path / "plan.json"
+    plan = json.loads(file.read_text())
+    del plan["measuring"]
+    file.write_text(json.dumps(plan))
+    assert planned_steps(tmp_path, 5, config, _never) == fitting.Planned(10)
+
+
+def _never():
+    raise AssertionError("a resumed training must not measure again")
