@@ -6,6 +6,7 @@ import types
 
 import pytest
 
+from potlp_jax.errors import TrainingError
 from potlp_jax.learning.panorama_learner import PanoramaOptions
 from potlp_jax.learning.training_options import TrainingOptions
 from potlp_jax.recipes import fitting
@@ -52,6 +53,45 @@ def test_a_plan_of_before_does_not_say_how_long_measuring_took(tmp_path):
     del plan["measuring"]
     file.write_text(json.dumps(plan))
     assert planned_steps(tmp_path, 5, config, _never) == fitting.Planned(10)
+
+
+class Stopped(Exception):
+    pass
+
+
+def _stop(*arguments, **options):
+    raise Stopped
+
+
+@pytest.mark.parametrize("minutes", [None, 3.0])
+def test_a_plan_is_of_one_training_before_there_is_a_checkpoint(tmp_path, monkeypatch, minutes):
+    monkeypatch.setattr(fitting, "train", _stop)
+    monkeypatch.setattr(fitting, "seconds_per_step", lambda *arguments: 0.5)
+    config = dataclasses.replace(SMALL, minutes=minutes)
+    samples = synthetic(8, 4, 0)
+    for _ in range(2):
+        with pytest.raises(Stopped):
+            fit(samples, samples, tmp_path, config)
+    with pytest.raises(TrainingError, match="steps_per_epoch was 2, is 10"):
+        fit(synthetic(40, 4, 0), samples, tmp_path, config)
+    larger = dataclasses.replace(config.training, views_per_batch=8)
+    with pytest.raises(TrainingError, match="views_per_batch was 4, is 8"):
+        fit(samples, samples, tmp_path, dataclasses.replace(config, training=larger))
+    # What a step takes depends on the network; how many steps an epoch has does not.
+    wider = dataclasses.replace(config, network=PanoramaOptions(second_widths=(5,) * 8))
+    with pytest.raises(Stopped) if minutes is None else pytest.raises(TrainingError, match=r"network\.second_widths was"):
+        fit(samples, samples, tmp_path, wider)
+
+
+@pytest.mark.parametrize(("minutes", "steps", "epoch"), [(None, 20, 10), (3.0, 20, 10), (3.0, 7, 10)])
+def test_a_plan_of_before_is_followed_where_it_agrees(tmp_path, minutes, steps, epoch):
+    asked = {"epochs": 2, "minutes": minutes, "seed": 0}
+    (tmp_path / "plan.json").write_text(json.dumps({"asked": asked, "steps": steps}))
+    config = FitConfig(epochs=2, minutes=minutes)
+    assert planned_steps(tmp_path, epoch, config, _never).steps == steps
+    # Of fewer data, or larger batches.
+    with pytest.raises(TrainingError, match=f"steps was {steps}, is 4"):
+        planned_steps(tmp_path, 2, config, _never)
 
 
 def _never():

@@ -16,15 +16,16 @@ folder, to which the first one writes.
 import dataclasses
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, require_fields
-from potlp_jax.codec import differences
+from potlp_jax.codec import differences, json_copy
 from potlp_jax.errors import TrainingError
 from potlp_jax.files import MOST_TEXT, read_json, reading
 from potlp_jax.learning.building_config import BuildingConfig
@@ -196,7 +197,11 @@ def _plan(learner: Learner, training: Samples, out: Path, config: FitConfig) -> 
     # The number of steps changes neither the batches nor the time of a step, so any serves to find it out.
     one = TrainingConfig(steps=1, **options)
     planned = planned_steps(
-        out, steps_per_epoch(learner, training, one), config, lambda: seconds_per_step(learner, training, one)
+        out,
+        steps_per_epoch(learner, training, one),
+        config,
+        lambda: seconds_per_step(learner, training, one),
+        dataclasses.asdict(learner.config),
     )
     # Measuring counts: the time asked for is that of the whole command.
     budget = float("inf") if config.minutes is None else config.minutes * 60 * _OVERRUN - planned.measuring
@@ -211,7 +216,9 @@ class Planned:
     measuring: float = 0.0
 
 
-def planned_steps(folder: Path, epoch: int, config: FitConfig, measure: Callable[[], float]) -> Planned:
+def planned_steps(
+    folder: Path, epoch: int, config: FitConfig, measure: Callable[[], float], network: Mapping[str, Any] = MappingProxyType({})
+) -> Planned:
     """Steps to plan; where there is a plan already, what it says. The first process's plan is that of all.
 
     Args:
@@ -219,16 +226,16 @@ def planned_steps(folder: Path, epoch: int, config: FitConfig, measure: Callable
         epoch: steps in an epoch.
         config: how many epochs and how much time.
         measure: gives the seconds that a step takes; called, by all processes, where a plan must be made for a time.
+        network: its configuration, which decides what is measured.
 
     Returns:
         The plan. A resumed training must not measure again: another number would be another schedule, and another time
         spent on it would leave another rest for the training.
 
     Raises:
-        TrainingError: there is a plan for other options.
+        TrainingError: there is a plan for other options, or other data.
     """
-    # What the number of steps follows from. Other options are compared with the checkpoint.
-    asked = {"epochs": config.epochs, "minutes": config.minutes, "seed": config.training.seed}
+    asked = _asked(epoch, config, network)
     path = folder / "plan.json"
     written = _agreed(_written_plan(path, asked) if is_first() and path.exists() else Planned(0))
     if written.steps:
@@ -252,6 +259,15 @@ def planned_steps(folder: Path, epoch: int, config: FitConfig, measure: Callable
     return made
 
 
+def _asked(epoch: int, config: FitConfig, network: Mapping[str, Any]) -> dict[str, Any]:
+    """What the number of steps follows from. Other options are compared with the checkpoint, once there is one."""
+    asked = {"epochs": config.epochs, "minutes": config.minutes, "seed": config.training.seed}
+    asked |= {"steps_per_epoch": epoch}
+    asked |= {name: getattr(config.training, name) for name in ("views_per_batch", "samples_per_view")}
+    # What takes no time to measure is planned the same for all networks.
+    return asked if config.minutes is None else asked | {"network": json_copy(network)}
+
+
 def _agreed(plan: Planned) -> Planned:
     """The first process's plan, with its seconds in the precision in which the others learn them."""
     return Planned(int(agreed(np.int32(plan.steps))), float(agreed(np.float32(plan.measuring))))
@@ -261,12 +277,25 @@ def _written_plan(path: Path, asked: dict[str, Any]) -> Planned:
     plan = read_json(path, TrainingError, "the plan of a training", MOST_TEXT)
     with reading(path, TrainingError, "the plan of a training"):
         # Plans of before do not say how long it took to make them.
-        found, steps, measuring = differences(plan["asked"], asked), int(plan["steps"]), float(plan.get("measuring", 0))
+        steps, measuring = int(plan["steps"]), float(plan.get("measuring", 0))
+        found = _plan_differences(plan["asked"], steps, asked)
     if found:
         raise TrainingError(f"{path} was made for another training ({'; '.join(found)}): choose another folder")
     if steps < 1 or not NOT_NEGATIVE.allows(measuring):
         raise TrainingError(f"{path} plans {steps} steps after {measuring} seconds: delete it to plan again")
     return Planned(steps, measuring)
+
+
+def _plan_differences(before: Mapping[str, Any], steps: int, asked: Mapping[str, Any]) -> list[str]:
+    """How what a plan was made for differs from what is asked for now."""
+    if "steps_per_epoch" in before:
+        return differences(before, asked)
+    # Plans of before say neither data nor batches, but no plan has more steps than its epochs, and without a time to
+    # keep it has as many.
+    most = asked["epochs"] * asked["steps_per_epoch"]
+    fits = steps <= most if asked["minutes"] else steps == most
+    found = differences(before, {name: asked[name] for name in ("epochs", "minutes", "seed")})
+    return found if found or fits else [f"steps was {steps}, is {most}"]
 
 
 def _metadata(training: Samples, plan: TrainingConfig, trained: Trained, journal: Journal) -> dict[str, Any]:
