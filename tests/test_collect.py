@@ -235,6 +235,16 @@ def test_an_environment_of_ones_own_is_collected(tmp_path):
     assert decode(samples.images[0]).shape == (64, 128, 3)
 
 
+def test_the_wandering_robot_senses_as_in_trials():
+    class NearSighted(Corridor):
+        settings = Settings({"sensor": {"range_cells": 7.0}})
+
+    assert collection_of(NearSighted()).explorer.sensor == SensorConfig(range_cells=7.0)
+    # As it was recorded for the shipped estimators, whose families name no sensor.
+    for name in ("firefighting", "delivery", "parcels", "campus-small", "campus-medium-parcels", "toy"):
+        assert collection_of(make(name)).explorer.sensor == ExplorerConfig().sensor
+
+
 def test_a_collection_does_not_go_on_after_its_environment_has_changed(tmp_path, monkeypatch):
     class Mine(Corridor):
         pass

@@ -27,6 +27,7 @@ from potlp_jax.recipes.journal import Display
 from potlp_jax.recipes.recipe import PACKAGE, _stages, follow, read_recipe
 from potlp_jax.recipes.times import TIMES
 from potlp_jax.trials.config import trial_config_for
+from potlp_jax.world.settings import Settings
 
 SHIPPED = ("delivery", "firefighting", "firefighting-panorama", "parcels")
 
@@ -291,6 +292,21 @@ def test_other_families_look_alike_and_have_subgoals_as_in_their_trials(tmp_path
     (tmp_path / "mine.yaml").write_text(json.dumps({**given, "beside": [{"environment": "campus-small", "share": 0}]}))
     with pytest.raises(ConfigurationError, match="share is 0"):
         read_recipe(tmp_path / "mine.yaml")
+
+
+@pytest.mark.parametrize("named", [None, 30.0])
+def test_other_families_are_sensed_as_in_their_trials_unless_the_recipe_names_a_sensor(monkeypatch, tmp_path, named):
+    class NearSighted(type(make("toy"))):
+        settings = Settings({"sensor": {"range_cells": 7.0}})
+
+    monkeypatch.setattr(recipes, "make", lambda name: NearSighted() if name == "near" else make(name))
+    collect = {**SMALL["collect"], **({} if named is None else {"explorer": {"sensor": {"range_cells": named}}})}
+    given = {**SMALL, "collect": collect, "beside": [{"environment": "near", "share": 1}]}
+    (tmp_path / "mine.yaml").write_text(json.dumps(given))
+    own, _, other = next(_stages(read_recipe(tmp_path / "mine.yaml"), [tmp_path])).parts
+    usual = trial_config_for(make("toy")).sensor.range_cells
+    sensed = [part.config.explorer.sensor.range_cells for part in (own, other)]
+    assert sensed == ([usual, 7.0] if named is None else [named, named])
 
 
 def _potlp(*arguments):

@@ -128,10 +128,11 @@ class _Job:
 
 
 def collection_of(generator: Generator) -> CollectConfig:
-    """What to record in worlds of a family: subgoals and panoramas as its trials have them, and never the formulas it
-    holds out.
+    """What to record in worlds of a family: subgoals, panoramas and what the robot senses as its trials have them, and
+    never the formulas it holds out.
     """
-    # The estimator is asked about the subgoals of trials and looks through their camera, so it must learn from these.
+    # The estimator is asked about the subgoals of trials, on maps that their sensor made, and looks through their camera,
+    # so it must learn from these.
     trials = trial_config_for(generator)
     frontiers = trials.decision.frontiers
     return CollectConfig(
@@ -139,7 +140,7 @@ def collection_of(generator: Generator) -> CollectConfig:
         camera=trials.camera,
         disturbance=trials.disturbance,
         look_every=trials.look_every,
-        explorer=ExplorerConfig(frontiers=frontiers),
+        explorer=ExplorerConfig(frontiers=frontiers, sensor=trials.sensor),
         # An estimator of one family serves all that look like it, so that it must not know their formulas either.
         held_out=HELD_OUT.get(generator.family or generator.name, ()),
     )

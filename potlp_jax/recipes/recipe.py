@@ -260,6 +260,7 @@ class _Parts:
 
     def __init__(self, recipe: Recipe) -> None:
         self._recipe = recipe
+        self._usual_sensor = collection_of(make(recipe.environment)).explorer.sensor
         self._taken: Counter[tuple[str, Split]] = Counter()
 
     def of_own(self, name: str, split: Split, worlds: int, config: CollectConfig) -> _Part:
@@ -269,10 +270,12 @@ class _Parts:
     def of_others(self, name: str, worlds: int, config: CollectConfig) -> Iterator[_Part]:
         """Training worlds of the families beside it, where there are so many of its own."""
         for chosen in self._recipe.beside:
-            # Subgoals as the trials of the family have them.
-            frontiers = collection_of(make(chosen.environment)).frontiers
-            explorer = dataclasses.replace(config.explorer, frontiers=frontiers)
-            own = dataclasses.replace(config, frontiers=frontiers, explorer=explorer)
+            # Subgoals and the sensor as the trials of the family have them; a sensor that the recipe names is for all.
+            usual = collection_of(make(chosen.environment))
+            named = config.explorer.sensor != self._usual_sensor
+            sensor = config.explorer.sensor if named else usual.explorer.sensor
+            explorer = dataclasses.replace(config.explorer, frontiers=usual.frontiers, sensor=sensor)
+            own = dataclasses.replace(config, frontiers=usual.frontiers, explorer=explorer)
             count = chosen.worlds(worlds, config.worlds_per_shard)
             yield self._part(f"{name}-{chosen.environment}", chosen.environment, Split.TRAINING, count, own)
 
