@@ -5,6 +5,7 @@ import json
 from collections import Counter
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -291,6 +292,23 @@ def test_other_families_look_alike_and_have_subgoals_as_in_their_trials(tmp_path
         read_recipe(tmp_path / "mine.yaml")
     (tmp_path / "mine.yaml").write_text(json.dumps({**given, "beside": [{"environment": "campus-small", "share": 0}]}))
     with pytest.raises(ConfigurationError, match="share is 0"):
+        read_recipe(tmp_path / "mine.yaml")
+
+
+def test_families_that_cannot_be_joined_are_named_before_anything_is_collected(monkeypatch, tmp_path):
+    class Fine(type(make("toy"))):
+        """Of the same family and propositions, in metres."""
+
+        def draw(self, key):
+            return dataclasses.replace(super().draw(key), resolution=jnp.float32(0.25))
+
+    monkeypatch.setattr(recipes, "make", lambda name: Fine() if name == "fine" else make(name))
+    (tmp_path / "mine.yaml").write_text(json.dumps({**SMALL, "beside": [{"environment": "fine", "share": 1}]}))
+    with pytest.raises(ConfigurationError, match=r"fine cannot stand beside toy: its cells measure 0\.25 metres.*1 cells"):
+        read_recipe(tmp_path / "mine.yaml")
+    beside = [{"environment": "toy", "share": share} for share in (0.5, 1.0)]
+    (tmp_path / "mine.yaml").write_text(json.dumps({**SMALL, "beside": beside}))
+    with pytest.raises(ConfigurationError, match="toy stands beside toy twice: give one share for both"):
         read_recipe(tmp_path / "mine.yaml")
 
 
