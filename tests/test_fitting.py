@@ -4,13 +4,16 @@ import dataclasses
 import json
 import types
 
+import numpy as np
 import pytest
 
 from potlp_jax.errors import TrainingError
+from potlp_jax.learning.estimator import read_estimator
 from potlp_jax.learning.panorama_learner import PanoramaOptions
 from potlp_jax.learning.training_options import TrainingOptions
 from potlp_jax.recipes import fitting
 from potlp_jax.recipes.fitting import ESTIMATOR, FitConfig, fit, planned_steps
+from potlp_jax.recipes.journal import Display
 from tests.test_training import synthetic
 
 SMALL = FitConfig(
@@ -53,6 +56,17 @@ def test_a_plan_of_before_does_not_say_how_long_measuring_took(tmp_path):
     del plan["measuring"]
     file.write_text(json.dumps(plan))
     assert planned_steps(tmp_path, 5, config, _never) == fitting.Planned(10)
+
+
+def test_a_file_counts_what_was_learned_from(tmp_path):
+    samples, lines = synthetic(8, 6, 0), []
+    # The panorama shows every success, and some failures.
+    samples.in_view[:] = (samples.success > 0) | (np.arange(48) % 3 == 0)
+    fit(samples, samples, tmp_path, dataclasses.replace(SMALL, epochs=1), Display(say=lines.append))
+    metadata = read_estimator(tmp_path / ESTIMATOR).metadata
+    assert metadata["prior"] == np.mean(samples.success[samples.in_view], dtype=np.float64) != samples.success.mean()
+    assert metadata["samples"] == samples.in_view.sum() < 48
+    assert f"a panorama network; 8 views, {metadata['samples']} samples; 2 steps" in "\n".join(lines)
 
 
 class Stopped(Exception):

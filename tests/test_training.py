@@ -23,6 +23,7 @@ from potlp_jax.errors import CheckpointError, TrainingError
 from potlp_jax.learning.augmentation import Augmentation
 from potlp_jax.learning.batches import Batch, Batches, Share
 from potlp_jax.learning.checkpoints import checkpoint_steps
+from potlp_jax.learning.data_figures import cost_scales
 from potlp_jax.learning.dataset import Samples, encode
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.dataset_reading import joined
@@ -32,7 +33,8 @@ from potlp_jax.learning.loss import DataScale, evaluation_of, loss_sums, total_l
 from potlp_jax.learning.network import Answers
 from potlp_jax.learning.panorama_learner import PanoramaLearner, PanoramaOptions
 from potlp_jax.learning.serialization import load_estimator, save_estimator
-from potlp_jax.learning.training import batches_of, check_data, train
+from potlp_jax.learning.predictions import part_of
+from potlp_jax.learning.training import batches_of, check_data, scale_of, train
 from potlp_jax.learning.training_options import TrainingConfig
 from potlp_jax.learning.training_steps import initial_state, learning_rate_schedule, make_train_step, shared_sums
 from potlp_jax.recipes.fitting import _tell_of_what_is_shared
@@ -254,6 +256,11 @@ def test_a_panorama_network_learns_from_the_subgoals_in_view_alone():
     batch = batches.training_batch(0)
     asked = np.asarray(batch.inputs.distance)[np.asarray(batch.mask)]
     assert sorted(asked.tolist()) == list(range(1, 18, 2))
+    # And so are the figures of the loss, and the scales of costs.
+    seen = part_of(samples, samples.in_view)
+    assert scale_of(learner, samples) == DataScale.of(seen) != DataScale.of(samples)
+    assert learner.config == PanoramaOptions().learner(seen).config
+    assert cost_scales(seen) != cost_scales(samples)
 
 
 def test_the_order_is_a_function_of_seed_and_step_and_covers_an_epoch():

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from potlp_jax.errors import TrainingError
 from potlp_jax.learning.dataset import Samples, decode
@@ -17,10 +18,17 @@ def image_shape(samples: Samples) -> tuple[int, int]:
     return rows, columns
 
 
-def cost_scales(samples: Samples) -> dict[str, Any]:
-    """``success_cost_scale``, ``failure_cost_scale``: each cost's spread where it counts in the loss; and ``step``."""
+def cost_scales(samples: Samples, usable: Bool[np.ndarray, "N"] | None = None) -> dict[str, Any]:
+    """``success_cost_scale``, ``failure_cost_scale``: each cost's spread where it counts in the loss; and ``step``.
+
+    Args:
+        samples: the training data.
+        usable: those that are learned from; all by default.
+    """
     step = float(samples.metadata.resolution)
     succeeded, failed = samples.success > 0, (samples.success < 1) & np.isfinite(samples.failure_cost)
+    if usable is not None:
+        succeeded, failed = succeeded & usable, failed & usable
     # Scales are rounded nowhere: they are part of what the network answers and stored with it.
     return {
         "success_cost_scale": spread(samples.success_cost[succeeded], step),

@@ -28,6 +28,7 @@ from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, require_fields
 from potlp_jax.codec import differences, json_copy
 from potlp_jax.errors import TrainingError
 from potlp_jax.files import MOST_TEXT, read_json, reading
+from potlp_jax.learning.architectures import architecture_of
 from potlp_jax.learning.building_config import BuildingConfig
 from potlp_jax.learning.building_learner import BuildingOptions
 from potlp_jax.learning.data_figures import camera_geometry, image_shape
@@ -36,12 +37,11 @@ from potlp_jax.learning.devices import agreed, is_first, mesh
 from potlp_jax.learning.estimator import TrainedEstimator, read_estimator
 from potlp_jax.learning.learner import Learner
 from potlp_jax.learning.learners import learner_of
-from potlp_jax.learning.loss import DataScale
 from potlp_jax.learning.made_from import nearest_misfit
 from potlp_jax.learning.network import parameter_count, require_propositions
 from potlp_jax.learning.panorama_learner import PanoramaOptions
 from potlp_jax.learning.serialization import save_estimator
-from potlp_jax.learning.training import Trained, provenance, seconds_per_step, steps_per_epoch, train
+from potlp_jax.learning.training import Trained, provenance, scale_of, seconds_per_step, steps_per_epoch, train
 from potlp_jax.learning.training_options import TrainingConfig, TrainingOptions
 from potlp_jax.recipes.journal import Display, Journal
 
@@ -108,7 +108,7 @@ def fit(
     _tell_of_changes(begin, learner, display)
     _tell_of_what_is_shared(training, validation, display)
     plan, budget = _plan(learner, training, out, config)
-    journal = _begin_journal(training, plan, out, config, display) if is_first() else None
+    journal = _begin_journal(learner, training, plan, out, config, display) if is_first() else None
     observers: dict[str, Any] = {} if journal is None else journal.observers()
     # The journal is closed whatever happens, so that TensorBoard's file is whole.
     try:
@@ -127,17 +127,19 @@ def fit(
             journal.close()
     if journal is not None:
         # Whoever has the file alone can still say how it was made.
-        metadata = provenance(training, validation, begin) | _metadata(training, plan, trained, journal)
+        metadata = provenance(training, validation, begin) | _metadata(learner, training, plan, trained, journal)
         save_estimator(out / ESTIMATOR, trained.params, learner.config, training.metadata.domain, metadata)
     return trained
 
 
-def _begin_journal(training: Samples, plan: TrainingConfig, out: Path, config: FitConfig, display: Display) -> Journal:
+def _begin_journal(
+    learner: Learner, training: Samples, plan: TrainingConfig, out: Path, config: FitConfig, display: Display
+) -> Journal:
     devices = mesh().size
     shared = f"; shared by {devices} devices" if devices > 1 else ""
     display.say(
-        f"a {config.network.kind} network; {len(training.images)} views, {len(training.success)} samples; {plan.steps} "
-        f"steps in at most {config.epochs} epochs{shared}"
+        f"a {architecture_of(learner.config).name} network; {len(training.images)} views, "
+        f"{learner.usable(training).sum()} samples; {plan.steps} steps in at most {config.epochs} epochs{shared}"
     )
     return Journal(out, plan.steps, display)
 
@@ -298,14 +300,16 @@ def _plan_differences(before: Mapping[str, Any], steps: int, asked: Mapping[str,
     return found if found or fits else [f"steps was {steps}, is {most}"]
 
 
-def _metadata(training: Samples, plan: TrainingConfig, trained: Trained, journal: Journal) -> dict[str, Any]:
+def _metadata(
+    learner: Learner, training: Samples, plan: TrainingConfig, trained: Trained, journal: Journal
+) -> dict[str, Any]:
     """What an estimator's file says of how it was made, beside what it was made from."""
     return {
         "training": dataclasses.asdict(plan),
         "data": dataclasses.asdict(training.metadata),
         "panoramas": len(training.images),
-        "samples": len(training.success),
-        "prior": DataScale.of(training).prior,
+        "samples": int(learner.usable(training).sum()),
+        "prior": scale_of(learner, training).prior,
         "parameters": parameter_count(trained.params),
         "steps": trained.steps,
         "best_step": trained.best_step,
