@@ -537,6 +537,11 @@ def test_evaluate_prints_tables_and_warns_of_worlds_it_was_trained_on(estimator,
     result = _potlp("evaluate", own, dataset[0])
     assert "trained on synthetic/validation" in result.stderr
     assert "the mean P_S of these samples" in result.stdout
+    # Also where the estimator that it goes on from was.
+    source = {"environment": "synthetic", "split": "validation"}
+    metadata = {"training_data": {"0": {**source, "split": "training"}}, "earlier_data": {"0": source}}
+    save_estimator(own, NETWORK.init(jax.random.key(2)), CONFIG, METADATA.domain, metadata)
+    assert "trained on synthetic/validation" in _potlp("evaluate", own, dataset[0]).stderr
 
 
 def test_info_shows_what_the_file_says(estimator):

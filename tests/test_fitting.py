@@ -6,9 +6,13 @@ import types
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from potlp_jax.cli import app
 from potlp_jax.errors import TrainingError
+from potlp_jax.learning.dataset_reading import joined
 from potlp_jax.learning.estimator import read_estimator
+from potlp_jax.learning.made_from import trained_before_on
 from potlp_jax.learning.panorama_learner import PanoramaOptions
 from potlp_jax.learning.training_options import TrainingOptions
 from potlp_jax.recipes import fitting
@@ -67,6 +71,61 @@ def test_a_file_counts_what_was_learned_from(tmp_path):
     assert metadata["prior"] == np.mean(samples.success[samples.in_view], dtype=np.float64) != samples.success.mean()
     assert metadata["samples"] == samples.in_view.sum() < 48
     assert f"a panorama network; 8 views, {metadata['samples']} samples; 2 steps" in "\n".join(lines)
+
+
+def _of_worlds(seed, first, split="training", environment="synthetic"):
+    """A data set of one world, with this number."""
+    samples = synthetic(8, 4, seed)
+    metadata = dataclasses.replace(
+        samples.metadata, collection={"first_world": first}, split=split, environment=environment
+    )
+    return dataclasses.replace(samples, metadata=metadata)
+
+
+@pytest.mark.parametrize(
+    ("validation", "said"),
+    [
+        # Recorded otherwise, in the world that is learned from.
+        (_of_worlds(1, 5), True),
+        (_of_worlds(1, 6), False),
+        (_of_worlds(1, 5, split="validation"), False),
+        (_of_worlds(1, 5, environment="another"), False),
+        # Robots' logs have no numbers.
+        (_of_worlds(1, None), False),
+    ],
+)
+def test_validation_worlds_that_are_learned_from_are_said(validation, said):
+    lines = []
+    fitting._tell_of_what_is_shared(_of_worlds(0, 5), validation, Display(say=lines.append))
+    assert [line.split(": ")[0] for line in lines] == (
+        ["the validation data have worlds that are learned from, or were before (synthetic/training, 1 from 5)"]
+        if said
+        else []
+    )
+
+
+def test_a_file_names_what_the_estimators_before_it_were_fitted_to(tmp_path):
+    first, second, third = (_of_worlds(seed, 10 * seed) for seed in range(3))
+    validation, once = _of_worlds(9, 0, "validation"), dataclasses.replace(SMALL, epochs=1)
+    for name, training, before in (
+        ("a", first, None),
+        ("b", joined([first, second]), "a"),
+        ("c", third, "b"),
+        ("d", second, "c"),
+    ):
+        initial = None if before is None else tmp_path / before / ESTIMATOR
+        fit(training, validation, tmp_path / name, once, initial=initial)
+    found = {name: read_estimator(tmp_path / name / ESTIMATOR).metadata for name in "abcd"}
+    # As they were where nothing is dropped: what drove with the file knows it by its digest.
+    assert not any("earlier_data" in found[name] for name in "ab")
+    worlds = {name: [source["first_world"] for source in trained_before_on(found[name])] for name in "cd"}
+    assert worlds == {"c": [0, 10], "d": [20, 0]}
+    begin, lines = read_estimator(tmp_path / "c" / ESTIMATOR), []
+    fitting._tell_of_what_is_shared(third, _of_worlds(7, 10), Display(say=lines.append), begin)
+    assert len(lines) == 1
+    shown = CliRunner().invoke(app, ["estimator", "info", str(tmp_path / "c" / ESTIMATOR)]).stdout
+    assert "before that on" in shown
+    assert shown.count("synthetic/training") == 3
 
 
 class Stopped(Exception):

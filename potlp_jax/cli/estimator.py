@@ -16,6 +16,7 @@ from rich.table import Table
 from potlp_jax.cli.group import Command, command_app
 from potlp_jax.cli.options import Json
 from potlp_jax.cli.output import FAILED, console, fail, file_console, make_folder, print_json, progress_bar, to_json
+from potlp_jax.learning.made_from import trained_before_on, trained_on
 
 if TYPE_CHECKING:
     from potlp_jax.learning.dataset import Samples
@@ -135,19 +136,14 @@ def _warn(metadata: Mapping[str, Any], samples: "Samples") -> None:
     from potlp_jax.environments.splits import Split
 
     own = (samples.metadata.environment, samples.metadata.split)
+    sources = [*trained_on(metadata), *trained_before_on(metadata)]
     # By name and split: other worlds of the same split are still worlds that training may have seen.
-    if any((source.get("environment"), source.get("split")) == own for source in _trained_on(metadata)):
+    if any((source.get("environment"), source.get("split")) == own for source in sources):
         logger.warning(
             f"the estimator was trained on {'/'.join(own)}: these figures say nothing about worlds it has not seen"
         )
     if samples.metadata.split == Split.TEST:
         warn_of_test_worlds()
-
-
-def _trained_on(metadata: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """The data sets that an estimator was fitted to."""
-    # Files of before these were listed have the metadata of one alone, and those of others may have nothing.
-    return [*metadata.get("training_data", {}).values()] or [metadata.get("data", {})]
 
 
 def _predict(
@@ -292,9 +288,9 @@ def _rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     ]
     if metadata.get("initial"):
         rows.append(("goes on from", metadata["initial"]))
-    sources = _trained_on(metadata)
-    if any(sources):
-        rows += zip(["trained on", *[""] * (len(sources) - 1)], map(_in_words, sources), strict=True)
+    for name, sources in (("trained on", trained_on(metadata)), ("before that on", trained_before_on(metadata))):
+        if sources:
+            rows += zip([name, *[""] * (len(sources) - 1)], map(_in_words, sources), strict=True)
     if "panoramas" in metadata:
         rows.append(("", f"{metadata['panoramas']:,} panoramas, {metadata.get('samples', 0):,} samples"))
     if "steps" in metadata:

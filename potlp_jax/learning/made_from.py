@@ -10,6 +10,35 @@ def mapping_in(metadata: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     return found if isinstance(found, Mapping) else {}
 
 
+def trained_on(metadata: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The data sets that an estimator was fitted to last, as ``DataSource`` describes them."""
+    listed = _mappings(metadata, "training_data")
+    # Files of before these were listed have the metadata of one alone, and those of others may have nothing.
+    data = mapping_in(metadata, "data")
+    return listed or ([data] if data else [])
+
+
+def trained_before_on(metadata: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Further data sets, that those estimators were fitted to which an estimator goes on from."""
+    return _mappings(metadata, "earlier_data")
+
+
+def _mappings(metadata: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
+    return [entry for entry in mapping_in(metadata, name).values() if isinstance(entry, Mapping)]
+
+
+def share_worlds(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two data sets are known to have simulated worlds in common: numbers of one split of one environment."""
+    if any(one.get(name) != other.get(name) for name in ("environment", "split")):
+        return False
+    bounds = [(data.get("first_world"), data.get("worlds")) for data in (one, other)]
+    # Robots' logs have no such numbers.
+    if not all(isinstance(first, int) and isinstance(count, int) for first, count in bounds):
+        return False
+    (first, count), (second, others) = bounds
+    return first < second + others and second < first + count
+
+
 def nearest_of(metadata: Mapping[str, Any]) -> bool | None:
     """Whether an estimator learned from labels by which the nearest ways alone count (``DatasetMetadata.nearest``).
 

@@ -33,11 +33,12 @@ from potlp_jax.learning.building_config import BuildingConfig
 from potlp_jax.learning.building_learner import BuildingOptions
 from potlp_jax.learning.data_figures import camera_geometry, image_shape
 from potlp_jax.learning.dataset import Samples
+from potlp_jax.learning.dataset_metadata import DataSource
 from potlp_jax.learning.devices import agreed, is_first, mesh
 from potlp_jax.learning.estimator import TrainedEstimator, read_estimator
 from potlp_jax.learning.learner import Learner
 from potlp_jax.learning.learners import learner_of
-from potlp_jax.learning.made_from import nearest_misfit
+from potlp_jax.learning.made_from import nearest_misfit, share_worlds, trained_before_on, trained_on
 from potlp_jax.learning.network import parameter_count, require_propositions
 from potlp_jax.learning.panorama_learner import PanoramaOptions
 from potlp_jax.learning.serialization import save_estimator
@@ -52,6 +53,8 @@ ESTIMATOR: str = "estimator.npz"
 _RESERVE = 0.1
 # Times the time asked for, after which a training that is slower than measured is cut short.
 _OVERRUN = 1.2
+
+_CHOSEN_BY_WHAT_WAS_LEARNED = "they choose the parameters by what was learned, and say nothing about other worlds"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -106,7 +109,7 @@ def fit(
     begin = None if initial is None else read_estimator(initial)
     learner = config.network.learner(training) if begin is None else learner_after(begin, training, config.network)
     _tell_of_changes(begin, learner, display)
-    _tell_of_what_is_shared(training, validation, display)
+    _tell_of_what_is_shared(training, validation, display, begin)
     plan, budget = _plan(learner, training, out, config)
     journal = _begin_journal(learner, training, plan, out, config, display) if is_first() else None
     observers: dict[str, Any] = {} if journal is None else journal.observers()
@@ -127,7 +130,8 @@ def fit(
             journal.close()
     if journal is not None:
         # Whoever has the file alone can still say how it was made.
-        metadata = provenance(training, validation, begin) | _metadata(learner, training, plan, trained, journal)
+        made_from = provenance(training, validation, begin) | _earlier_data(training, begin)
+        metadata = made_from | _metadata(learner, training, plan, trained, journal)
         save_estimator(out / ESTIMATOR, trained.params, learner.config, training.metadata.domain, metadata)
     return trained
 
@@ -183,13 +187,39 @@ def _tell_of_changes(begin: TrainedEstimator | None, learner: Learner, display: 
             display.say(f"{name} is {now}; {begin.name} has {before}")
 
 
-def _tell_of_what_is_shared(training: Samples, validation: Samples, display: Display) -> None:
-    """Say where the data that choose the parameters are among those that are learned from."""
-    if is_first() and set(training.sources) & set(validation.sources):
+def _tell_of_what_is_shared(
+    training: Samples, validation: Samples, display: Display, begin: TrainedEstimator | None = None
+) -> None:
+    """Say where the data that choose the parameters are of worlds that are learned from, or were before."""
+    if not is_first():
+        return
+    before = [] if begin is None else [*trained_on(begin.metadata), *trained_before_on(begin.metadata)]
+    learned = [*map(dataclasses.asdict, training.sources), *before]
+    chosen_by = list(map(dataclasses.asdict, validation.sources))
+    shared = next((one for one in chosen_by for other in learned if share_worlds(one, other)), None)
+    if set(training.sources) & set(validation.sources):
+        display.say(f"the validation data are among the training data: {_CHOSEN_BY_WHAT_WAS_LEARNED}")
+    elif shared is not None:
         display.say(
-            "the validation data are among the training data: they choose the parameters by what was learned, and say "
-            "nothing about other worlds"
+            f"the validation data have worlds that are learned from, or were before ({shared['environment']}/"
+            f"{shared['split']}, {shared['worlds']} from {shared['first_world']}): {_CHOSEN_BY_WHAT_WAS_LEARNED}"
         )
+
+
+def _earlier_data(training: Samples, begin: TrainedEstimator | None) -> dict[str, Any]:
+    """What the estimators before were fitted to and this one is not; nothing where there is no such data set."""
+    if begin is None:
+        return {}
+    names = [field.name for field in dataclasses.fields(DataSource)]
+    found = [*map(dataclasses.asdict, training.sources)]
+    own = len(found)
+    for source in [*trained_on(begin.metadata), *trained_before_on(begin.metadata)]:
+        # Files of before have all metadata of a data set.
+        said = {name: source[name] for name in names if name in source}
+        if said and said not in found:
+            found.append(said)
+    # Without an entry where there is none, so that rounds which drop nothing write the file that they wrote before.
+    return {"earlier_data": {str(number): source for number, source in enumerate(found[own:])}} if found[own:] else {}
 
 
 def _plan(learner: Learner, training: Samples, out: Path, config: FitConfig) -> tuple[TrainingConfig, float]:
