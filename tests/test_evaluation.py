@@ -556,6 +556,36 @@ def test_info_shows_what_the_file_says(estimator):
     assert data["metadata"]["figures"]["validation_success_rmse"] is None
 
 
+@pytest.mark.parametrize(
+    ("metadata", "shown"),
+    [
+        ({"steps": 5}, "5 steps\n"),
+        ({"steps": 5, "seconds": "long", "best_step": 3}, "5 steps; best at step 3"),
+        ({"steps": "many", "initial": 7, "prior": True, "panoramas": None, "samples": 12}, "12 samples"),
+        ({"training_data": [{"environment": "x"}]}, "architecture"),
+        ({"training_data": {"0": 3, "1": {"environment": "x", "worlds": 4}}}, "x/not named, 4 worlds"),
+        ({"figures": {"validation_brier": None, "validation_loss": 0.5}}, "validation loss"),
+        ({"figures": [0.5], "versions": "new"}, "architecture"),
+        ({"data": None}, "architecture"),
+        ({"data": {"shape": None, "environment": 3, "split": "training"}}, "not named/training"),
+        ({"data": {"shape": [5, "wide"]}, "earlier_data": {"0": None}}, "architecture"),
+    ],
+)
+def test_metadata_of_another_form_are_left_out(metadata, shown, dataset, tmp_path):
+    save_estimator(tmp_path / "e.npz", NETWORK.init(jax.random.key(0)), CONFIG, METADATA.domain, metadata)
+    result = _potlp("info", tmp_path / "e.npz")
+    assert result.exit_code == 0, result.exception
+    assert shown in "\n".join(line.strip() for line in result.stdout.splitlines()) + "\n"
+    assert "None" not in result.stdout
+    assert _potlp("info", tmp_path / "e.npz", "--json").exit_code == 0
+
+
+def test_an_estimator_whose_metadata_have_another_form_is_evaluated(dataset, tmp_path):
+    metadata = {"training_data": [3], "earlier_data": 4, "data": None}
+    save_estimator(tmp_path / "e.npz", NETWORK.init(jax.random.key(0)), CONFIG, METADATA.domain, metadata)
+    assert _potlp("evaluate", tmp_path / "e.npz", dataset[0]).exit_code == 0
+
+
 @pytest.mark.parametrize(("fovea", "words"), [(0, "nothing"), (5, "11 columns × 48 rows")])
 def test_info_says_how_closely_a_subgoal_is_looked_at(tmp_path, fovea, words):
     config = dataclasses.replace(CONFIG, fovea=fovea)

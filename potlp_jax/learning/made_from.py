@@ -1,13 +1,36 @@
 """What an estimator's file says of how it was made. Metadata are anybody's JSON: what has another form says nothing."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+from potlp_jax.checks import COUNT
 
 
 def mapping_in(metadata: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     """An entry that is a mapping; an empty one where there is none."""
     found = metadata.get(name)
     return found if isinstance(found, Mapping) else {}
+
+
+def number_in(metadata: Mapping[str, Any], name: str) -> int | float | None:
+    """An entry that is a finite number; None where there is none."""
+    found = metadata.get(name)
+    return found if isinstance(found, int | float) and not isinstance(found, bool) and math.isfinite(found) else None
+
+
+def text_in(metadata: Mapping[str, Any], name: str) -> str:
+    """An entry that is a text; an empty one where there is none."""
+    found = metadata.get(name)
+    return found if isinstance(found, str) else ""
+
+
+def map_shape_of(metadata: Mapping[str, Any]) -> tuple[int, int] | None:
+    """Rows and columns of the maps that an estimator learned from; None where its file does not say."""
+    shape = mapping_in(metadata, "data").get("shape")
+    if not isinstance(shape, Sequence) or len(shape) != 2 or not all(COUNT.allows(side) for side in shape):
+        return None
+    return shape[0], shape[1]
 
 
 def trained_on(metadata: Mapping[str, Any]) -> list[Mapping[str, Any]]:
