@@ -236,6 +236,11 @@ def test_a_foreign_file_has_no_metadata(tmp_path):
     [
         ("view", view_id(0, 99), "which is not in the shard"),
         ("phi_go", [1, 0], "phi_go whose length"),
+        ("phi_go", [1, 0, 7], "samples-00000.parquet, row 1: phi_go must have entries -1, 0 and 1"),
+        ("phi_stay", [-128, 0, 1], "row 1: phi_stay must have entries"),
+        ("phi_stay", [None, 0, 1], "samples-00000.parquet has missing values"),
+        ("row", 6, "samples-00000.parquet, row 1: row and column must be of a cell"),
+        ("column", -1, "row 1: row and column must be of a cell"),
         ("success_probability", 1.5, "row 1: success_probability"),
         ("failure_weight", 0.0, "row 1: failure_weight"),
         ("failure_cost", -1.0, "row 1: failure_cost"),
