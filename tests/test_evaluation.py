@@ -394,7 +394,7 @@ def test_an_estimator_is_evaluated_on_labels_of_its_own_kind_only():
         (near, {}),
     ):
         check_fit(CONFIG, METADATA.domain, data, "net", "data", made)
-    with pytest.raises(EvaluationError, match="data does not ask what net answers: .* collect with --set nearest=true"):
+    with pytest.raises(EvaluationError, match=r"data does not ask what net answers: .* --set nearest=true"):
         check_fit(CONFIG, METADATA.domain, samples, "net", "data", _labelled({"nearest": True}))
     # Data sets of before could be labelled in one way alone.
     with pytest.raises(EvaluationError, match="collect with --set nearest=false"):

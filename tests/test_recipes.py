@@ -304,7 +304,9 @@ def test_families_that_cannot_be_joined_are_named_before_anything_is_collected(m
 
     monkeypatch.setattr(recipes, "make", lambda name: Fine() if name == "fine" else make(name))
     (tmp_path / "mine.yaml").write_text(json.dumps({**SMALL, "beside": [{"environment": "fine", "share": 1}]}))
-    with pytest.raises(ConfigurationError, match=r"fine cannot stand beside toy: its cells measure 0\.25 metres.*1 cells"):
+    with pytest.raises(
+        ConfigurationError, match=r"fine cannot stand beside toy: its cells measure 0\.25 metres.*1 cells"
+    ):
         read_recipe(tmp_path / "mine.yaml")
     beside = [{"environment": "toy", "share": share} for share in (0.5, 1.0)]
     (tmp_path / "mine.yaml").write_text(json.dumps({**SMALL, "beside": beside}))

@@ -32,8 +32,8 @@ from potlp_jax.learning.estimator import read_estimator
 from potlp_jax.learning.loss import DataScale, evaluation_of, loss_sums, total_loss
 from potlp_jax.learning.network import Answers
 from potlp_jax.learning.panorama_learner import PanoramaLearner, PanoramaOptions
-from potlp_jax.learning.serialization import load_estimator, save_estimator
 from potlp_jax.learning.predictions import part_of
+from potlp_jax.learning.serialization import load_estimator, save_estimator
 from potlp_jax.learning.training import batches_of, check_data, scale_of, train
 from potlp_jax.learning.training_options import TrainingConfig
 from potlp_jax.learning.training_steps import initial_state, learning_rate_schedule, make_train_step, shared_sums
@@ -367,16 +367,16 @@ def test_a_time_budget_ends_training_with_an_evaluation():
 
 
 def test_a_training_whose_time_is_over_before_its_first_evaluation_goes_on_to_one(tmp_path):
-    class Killed(Exception):
+    class KilledError(Exception):
         pass
 
     def kill(step, loss):
         if step == 3:
-            raise Killed
+            raise KilledError
 
     samples = synthetic(16, 4, 9)
     network, config = _learner(samples, TINY), _config(8, checkpoint_steps=2)
-    with pytest.raises(Killed):
+    with pytest.raises(KilledError):
         train(network, samples, samples, config, folder=tmp_path, on_step=kill)
     assert checkpoint_steps(tmp_path) == [2]
     # What the checkpoint has as the best are parameters that learned nothing.

@@ -54,7 +54,8 @@ def excess_of(name: str, samples: Samples) -> Float64[np.ndarray, " N"]:
     """The squared distance of an estimator from each label.
 
     Raises:
-        EvaluationError: it was not trained here, or from other pictures, maps, labels or units than those of the samples.
+        EvaluationError: it was not trained here, or from other pictures, maps, labels or units than those of the
+            samples.
     """
     estimator = named_estimator(name)
     if not isinstance(estimator, TrainedEstimator):

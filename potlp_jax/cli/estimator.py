@@ -337,7 +337,9 @@ def _in_words(source: Mapping[str, Any]) -> str:
         words += f", {worlds} worlds"
     if driver := text_in(source, "driver"):
         asked = text_in(source, "estimator")
-        words += (f" from {first}" if first is not None else "") + f", by {driver}" + (f" with {asked}" if asked else "")
+        words += (
+            (f" from {first}" if first is not None else "") + f", by {driver}" + (f" with {asked}" if asked else "")
+        )
     return words
 
 

@@ -57,7 +57,7 @@ class RecordingConfig:
         tasks_per_world: drawn for the outcome classes.
         classes: outcome classes per view, at most; staying_sets: distinct sets of staying letters among them.
         image_format, quality: of the encoded images: ``jpeg`` or ``png``; quality is JPEG's.
-        frontiers: which components of the frontier are subgoals.
+        frontiers: which components of the frontier are subgoals; of more than ``max_subgoals`` the nearest are kept.
         seed: of everything but the worlds.
         held_out: formulas whose languages are never drawn.
         camera: takes the images.
@@ -162,6 +162,8 @@ class Recorder:
         self.worlds: dict[str, list[Any]] = {name: [] for name in WORLDS_SCHEMA.names}
         self.views: dict[str, list[Any]] = {name: [] for name in VIEWS_SCHEMA.names}
         self.samples: dict[str, list[Any]] = {name: [] for name in SAMPLES_SCHEMA.names}
+        self.overflowed = 0
+        """Views of maps with more subgoals than are recorded."""
 
     def add_world(self, world: World, index: int, unseen: Bool[np.ndarray, "H W"] | None = None) -> None:
         """Record a true map; the views that are added next are of it.
@@ -220,6 +222,7 @@ class Recorder:
         }
         for name, value in row.items():
             self.views[name].append(value)
+        self.overflowed += Status.SUBGOAL_OVERFLOW in Status(int(scene.subgoals.status))
         for name, values in _sample_columns(view, scene, questions, labels, weights).items():
             self.samples[name].extend(values)
 

@@ -249,7 +249,11 @@ class Planned:
 
 
 def planned_steps(
-    folder: Path, epoch: int, config: FitConfig, measure: Callable[[], float], network: Mapping[str, Any] = MappingProxyType({})
+    folder: Path,
+    epoch: int,
+    config: FitConfig,
+    measure: Callable[[], float],
+    network: Mapping[str, Any] = MappingProxyType({}),
 ) -> Planned:
     """Steps to plan; where there is a plan already, what it says. The first process's plan is that of all.
 

@@ -172,7 +172,9 @@ def _require_alike(recipe: Recipe, where: str) -> None:
     named = Counter(chosen.environment for chosen in recipe.beside)
     # Of each there is one folder in a stage.
     if twice := [environment for environment, count in named.items() if count > 1]:
-        raise ConfigurationError(f"{where}: {twice[0]} stands beside {recipe.environment} twice: give one share for both")
+        raise ConfigurationError(
+            f"{where}: {twice[0]} stands beside {recipe.environment} twice: give one share for both"
+        )
     own = make(recipe.environment)
     for chosen in recipe.beside:
         other = make(chosen.environment)
