@@ -364,6 +364,9 @@ def test_the_explorer_sees_much_of_the_building_and_walks_through_known_cells(co
         ({"views_per_world": 0}, "views_per_world is 0; give at least 1"),
         ({"spacing": (9.0, 2.0)}, "give the least and the most"),
         ({"seed": -1}, "seed is -1"),
+        ({"staying_sets": 1}, "staying_sets is 1; give at least 2"),
+        ({"image_format": "bmp"}, "image_format is 'bmp'; choose jpeg or png"),
+        ({"quality": 200}, "quality is 200; give a number from 0 to 100"),
         ({"estimator": "firefighting"}, "the driver explorer asks no estimator"),
     ],
 )

@@ -166,6 +166,12 @@ def test_a_shard_exists_when_its_samples_do(tmp_path):
     assert finished_shards(tmp_path / "nowhere") == set()
 
 
+def test_more_shards_than_five_digits_can_number_are_found(tmp_path):
+    _write(tmp_path, [7, 100_000])
+    assert finished_shards(tmp_path) == {7, 100_000}
+    assert len(read_dataset(tmp_path).images) == 6
+
+
 def test_an_empty_folder_is_no_dataset(tmp_path):
     with pytest.raises(DatasetError, match="no finished shard"):
         read_dataset(tmp_path)

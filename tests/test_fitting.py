@@ -4,16 +4,20 @@ import dataclasses
 import json
 import types
 
+import jax
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from potlp_jax.cli import app
-from potlp_jax.errors import TrainingError
+from potlp_jax.engine.writer import only_writer
+from potlp_jax.errors import DatasetError, TrainingError
 from potlp_jax.learning.dataset_reading import joined
 from potlp_jax.learning.estimator import read_estimator
 from potlp_jax.learning.made_from import trained_before_on
 from potlp_jax.learning.panorama_learner import PanoramaOptions
+from potlp_jax.learning.predictions import check_fit
+from potlp_jax.learning.serialization import save_estimator
 from potlp_jax.learning.training_options import TrainingOptions
 from potlp_jax.recipes import fitting
 from potlp_jax.recipes.fitting import ESTIMATOR, FitConfig, fit, planned_steps
@@ -126,6 +130,56 @@ def test_a_file_names_what_the_estimators_before_it_were_fitted_to(tmp_path):
     shown = CliRunner().invoke(app, ["estimator", "info", str(tmp_path / "c" / ESTIMATOR)]).stdout
     assert "before that on" in shown
     assert shown.count("synthetic/training") == 3
+
+
+def _seen_by(camera):
+    samples = synthetic(8, 4, 0)
+    return dataclasses.replace(samples, metadata=dataclasses.replace(samples.metadata, camera=camera))
+
+
+def test_data_of_a_camera_whose_geometry_is_not_known_are_fitted(tmp_path):
+    known = synthetic(1, 1, 0).metadata.camera
+    samples = _seen_by({name: value for name, value in known.items() if name not in ("horizon", "far", "fold")})
+    fit(samples, samples, tmp_path, dataclasses.replace(SMALL, epochs=1))
+    estimator = read_estimator(tmp_path / ESTIMATOR)
+    assert estimator.domain == dataclasses.replace(synthetic(1, 1, 0).metadata.domain, camera=None)
+    check_fit(estimator.config, estimator.domain, samples, "it", "the data", estimator.metadata)
+
+
+def test_a_camera_that_is_none_is_named_before_training(tmp_path, monkeypatch):
+    monkeypatch.setattr(fitting, "train", _stop)
+    samples = _seen_by({**synthetic(1, 1, 0).metadata.camera, "height": "tall"})
+    with pytest.raises(DatasetError, match=r"camera\.height: give a whole number"):
+        fit(samples, samples, tmp_path, SMALL)
+
+
+def test_the_network_that_is_fitted_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(fitting, "train", _stop)
+    samples, lines = synthetic(8, 4, 0), []
+    network = SMALL.network.learner(samples)
+    save_estimator(tmp_path / "e.npz", network.init(jax.random.key(0)), network.config, samples.metadata.domain, {})
+    # What ``config`` says of the kind counts for nothing here.
+    with pytest.raises(StoppedError):
+        fit(samples, samples, tmp_path, FitConfig(epochs=1), Display(say=lines.append), initial=tmp_path / "e.npz")
+    assert any(line.startswith("a panorama network;") for line in lines)
+
+
+def test_two_commands_do_not_fit_in_one_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(fitting, "train", _stop)
+    samples = synthetic(8, 4, 0)
+    with only_writer(tmp_path, TrainingError), pytest.raises(TrainingError, match="another command works on it"):
+        fit(samples, samples, tmp_path, SMALL)
+    assert not (tmp_path / "plan.json").exists()
+    # The folder is let go of, also by an error.
+    for _ in range(2):
+        with pytest.raises(StoppedError):
+            fit(samples, samples, tmp_path, SMALL)
+
+
+@pytest.mark.parametrize("minutes", [float("inf"), float("nan"), 0.0, -1.0])
+def test_minutes_that_are_no_time_are_named(minutes):
+    with pytest.raises(TrainingError, match=f"minutes is {minutes}; give a positive number, or null"):
+        FitConfig(minutes=minutes)
 
 
 class StoppedError(Exception):

@@ -407,6 +407,24 @@ def test_what_is_wrong_with_a_round_is_said_before_anything_is_collected(tmp_pat
     assert not list(tmp_path.glob("out/**/*.parquet"))
 
 
+@pytest.mark.parametrize("words", [("--epochs", "3"), ("--set", "epochs=3")])
+def test_epochs_are_not_of_one_stage_of_a_recipe_with_rounds_alone(tmp_path, words):
+    rounds = [{"worlds": 2, "validation_worlds": 2, "epochs": 5}]
+    (tmp_path / "small.yaml").write_text(json.dumps({**SMALL, "rounds": rounds}))
+    told = _potlp("fit", "--recipe", tmp_path / "small.yaml", "--out", tmp_path / "out", *words)
+    assert told.exit_code == 2
+    assert "change `epochs` of `fit` and of each round in a copy of its file" in " ".join(told.stderr.split())
+    assert not (tmp_path / "out").exists()
+
+
+def test_minutes_are_of_the_fit_of_every_stage(tmp_path):
+    rounds = [{"worlds": 2, "validation_worlds": 2, "epochs": 5}]
+    fit = {**SMALL["fit"], "minutes": 30}
+    (tmp_path / "small.yaml").write_text(json.dumps({**SMALL, "fit": fit, "rounds": rounds}))
+    stages = _stages(read_recipe(tmp_path / "small.yaml"), [tmp_path] * 2)
+    assert [(stage.fit.epochs, stage.fit.minutes) for stage in stages] == [(1, 30), (5, 30)]
+
+
 def test_a_recipe_that_is_not_there_is_named_beside_those_that_are(tmp_path):
     with pytest.raises(ConfigurationError, match=rf"soup: neither a file nor .*{', '.join(SHIPPED)}"):
         read_recipe("soup")

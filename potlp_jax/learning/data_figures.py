@@ -7,6 +7,7 @@ from jaxtyping import Bool
 
 from potlp_jax.errors import TrainingError
 from potlp_jax.learning.dataset import Samples, decode
+from potlp_jax.learning.domain import FLOOR
 
 
 def image_shape(samples: Samples) -> tuple[int, int]:
@@ -47,14 +48,14 @@ def camera_geometry(samples: Samples, asker: str) -> dict[str, Any]:
     Raises:
         TrainingError: the data do not say how their camera sees the floor. Real data need not.
     """
-    names, camera = ("horizon", "far", "fold"), samples.metadata.camera
-    missing = [name for name in names if name not in camera]
+    camera = samples.metadata.camera
+    missing = [name for name in FLOOR if name not in camera]
     if missing:
         raise TrainingError(
             f"{asker} needs {', '.join(missing)} of the data set's camera (docs/camera.md): collect it again, or train "
             "a panorama network without a fovea"
         )
-    return {name: float(camera[name]) for name in names}
+    return {name: float(camera[name]) for name in FLOOR}
 
 
 def spread(values: np.ndarray, least: float) -> float:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from potlp_jax import plugins
-from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, require_fields
+from potlp_jax.checks import AT_LEAST_ONE, require_fields
 from potlp_jax.codec import json_copy
 from potlp_jax.engine.engine import Broken, Engine, Here
 from potlp_jax.engine.writer import only_writer
@@ -90,11 +90,8 @@ class CollectConfig(RecordingConfig):
     posterior: int = 0
 
     def __post_init__(self) -> None:
-        names = ("views_per_world", "classes", "drives", "pursued", "tasks_per_world", "worlds_per_shard")
-        require_fields(self, names, AT_LEAST_ONE, DatasetError)
-        require_fields(self, ("seed", "look_every"), NOT_NEGATIVE, DatasetError)
-        if not 0 <= self.spacing[0] <= self.spacing[1]:
-            raise DatasetError(f"spacing is {self.spacing}: give the least and the most, in cells")
+        super().__post_init__()
+        require_fields(self, ("drives", "pursued", "worlds_per_shard"), AT_LEAST_ONE, DatasetError)
         if self.posterior < 0:
             raise DatasetError(
                 f"posterior is {self.posterior}: give a number of buildings, or 0 for the labels of the robot's own"

@@ -1,8 +1,9 @@
 """Fits an estimator to a dataset.
 
 The folder of a fit then holds ``estimator.npz`` (the best parameters by validation loss: what is shipped), ``log.csv``
-(one row an epoch), ``curves.png``, ``tensorboard/``, ``plan.json`` and ``checkpoints/``. A fit that was interrupted,
-also by SIGKILL, resumes and ends with the same parameters, bit for bit, as without the interruption.
+(one row an epoch), ``curves.png``, ``tensorboard/``, ``plan.json`` and ``checkpoints/``. One command at a time fits in
+it. A fit that was interrupted, also by SIGKILL, resumes and ends with the same parameters, bit for bit, as without the
+interruption.
 
 With a time to keep, the speed is measured first, and as many steps are planned as fit, at most ``epochs``; the learning
 rate's schedule ends with the plan. The plan is written once, so that a resumed training follows it. Where training is
@@ -24,8 +25,9 @@ from typing import Any
 
 import numpy as np
 
-from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, require_fields
+from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, require_fields
 from potlp_jax.codec import differences, json_copy
+from potlp_jax.engine.writer import only_writer
 from potlp_jax.errors import TrainingError
 from potlp_jax.files import MOST_TEXT, read_json, reading
 from potlp_jax.learning.architectures import architecture_of
@@ -75,7 +77,7 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         require_fields(self, ["epochs"], AT_LEAST_ONE, TrainingError)
-        if self.minutes is not None and not self.minutes > 0:
+        if self.minutes is not None and not POSITIVE.allows(self.minutes):
             raise TrainingError(f"minutes is {self.minutes}; give a positive number, or null for no limit")
 
 
@@ -103,13 +105,35 @@ def fit(
         The best parameters, which ``out`` / ``ESTIMATOR`` holds as well.
 
     Raises:
-        TrainingError: the data do not fit, ``out`` has a plan for something else, or the loss is not finite.
+        TrainingError: the data do not fit, ``out`` has a plan for something else, another command works on it, or the
+            loss is not finite.
+        DatasetError: the training data's camera is none.
         CheckpointError: ``out`` holds a damaged checkpoint, or one of another training.
     """
     begin = None if initial is None else read_estimator(initial)
     learner = config.network.learner(training) if begin is None else learner_after(begin, training, config.network)
     _tell_of_changes(begin, learner, display)
     _tell_of_what_is_shared(training, validation, display, begin)
+    if not is_first():
+        return _fitted(learner, training, validation, out, config, display, begin)
+    out.mkdir(parents=True, exist_ok=True)
+    # Of all processes that share the fit the first one writes.
+    with only_writer(out, TrainingError):
+        return _fitted(learner, training, validation, out, config, display, begin)
+
+
+def _fitted(
+    learner: Learner,
+    training: Samples,
+    validation: Samples,
+    out: Path,
+    config: FitConfig,
+    display: Display,
+    begin: TrainedEstimator | None,
+) -> Trained:
+    """Train, and write the estimator, in a folder that is held."""
+    # Before hours of training: the file cannot be written without it.
+    domain = training.metadata.domain
     plan, budget = _plan(learner, training, out, config)
     journal = _begin_journal(learner, training, plan, out, config, display) if is_first() else None
     observers: dict[str, Any] = {} if journal is None else journal.observers()
@@ -132,7 +156,7 @@ def fit(
         # Whoever has the file alone can still say how it was made.
         made_from = provenance(training, validation, begin) | _earlier_data(training, begin)
         metadata = made_from | _metadata(learner, training, plan, trained, journal)
-        save_estimator(out / ESTIMATOR, trained.params, learner.config, training.metadata.domain, metadata)
+        save_estimator(out / ESTIMATOR, trained.params, learner.config, domain, metadata)
     return trained
 
 
