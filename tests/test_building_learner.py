@@ -213,6 +213,15 @@ def test_an_estimator_does_not_go_on_where_its_numbers_or_pictures_mean_somethin
         assert learner_after(building, samples, SIZES).config == building.config
 
 
+def test_an_estimator_does_not_go_on_with_labels_of_another_kind(samples, params):
+    metadata = {"data": {"collection": {"nearest": True}}}
+    begin = TrainedEstimator(params, SIZES.learner(samples).config, samples.metadata.domain, metadata, "before", "0")
+    with pytest.raises(TrainingError, match=r"before cannot go on .* collect with --set nearest=true"):
+        learner_after(begin, samples, SIZES)
+    near = dataclasses.replace(samples.metadata, collection={"nearest": True, "glances": samples.metadata.glances})
+    assert learner_after(begin, dataclasses.replace(samples, metadata=near), SIZES).config == begin.config
+
+
 @pytest.mark.parametrize("own_within", [0, 2])
 def test_an_estimator_that_is_gone_on_from_has_the_paths_that_are_asked_for(samples, params, own_within):
     before = dataclasses.replace(SIZES.learner(samples).config, own_within=2 - own_within)

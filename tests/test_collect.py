@@ -29,7 +29,7 @@ from potlp_jax.learning.dataset import decode, finished_shards, read_metadata, s
 from potlp_jax.learning.dataset_reading import read_dataset
 from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.scenes import survey
-from potlp_jax.recipes.collection import CollectConfig, collect, collection_of, summary
+from potlp_jax.recipes.collection import CollectConfig, collect, collection_of, overflow_in_words, summary
 from potlp_jax.recipes.exploration import Explorer, ExplorerConfig
 from potlp_jax.task.task import Task
 from potlp_jax.world.camera import CameraConfig
@@ -235,6 +235,16 @@ def test_an_environment_of_ones_own_is_collected(tmp_path):
     assert decode(samples.images[0]).shape == (64, 128, 3)
 
 
+def test_the_wandering_robot_senses_as_in_trials():
+    class NearSighted(Corridor):
+        settings = Settings({"sensor": {"range_cells": 7.0}})
+
+    assert collection_of(NearSighted()).explorer.sensor == SensorConfig(range_cells=7.0)
+    # As it was recorded for the shipped estimators, whose families name no sensor.
+    for name in ("firefighting", "delivery", "parcels", "campus-small", "campus-medium-parcels", "toy"):
+        assert collection_of(make(name)).explorer.sensor == ExplorerConfig().sensor
+
+
 def test_a_collection_does_not_go_on_after_its_environment_has_changed(tmp_path, monkeypatch):
     class Mine(Corridor):
         pass
@@ -251,6 +261,33 @@ def test_fewer_worlds_than_there_are_is_said(tmp_path):
     collect(make("toy"), "toy", Split.VALIDATION, 2, tmp_path, config)
     with pytest.raises(DatasetError, match="holds 2 worlds, more than the 1 that are asked for"):
         collect(make("toy"), "toy", Split.VALIDATION, 1, tmp_path, config)
+
+
+def test_views_with_more_subgoals_than_are_recorded_are_counted(tmp_path):
+    told = []
+    # A room with mouths of hallways: two of its subgoals are never in sight of each other.
+    few = dataclasses.replace(CONFIG, frontiers=dataclasses.replace(CONFIG.frontiers, max_subgoals=1), held_out=())
+    collect(GENERATOR, "firefighting", Split.TRAINING, 2, tmp_path / "few", few, tell=told.append)
+    collected = told[-1]
+    assert 0 < collected.overflowed <= collected.views == len(read_dataset(tmp_path / "few").images)
+    words = overflow_in_words(collected, few)
+    assert words.startswith(
+        f"{collected.overflowed} of the {collected.views} views that were recorded now have more than 1"
+    )
+    assert "--set frontiers.max_subgoals=2" in words
+    # What is there already is not looked at again.
+    collect(GENERATOR, "firefighting", Split.TRAINING, 2, tmp_path / "few", few, tell=told.append)
+    assert (told[-1].views, overflow_in_words(told[-1], few)) == (0, "")
+    collect(GENERATOR, "firefighting", Split.TRAINING, 2, tmp_path / "all", CONFIG, tell=told.append)
+    assert told[-1].overflowed == 0 < told[-1].views
+
+
+def test_a_summary_has_the_mean_of_labels_that_are_shares(dataset):
+    samples = read_dataset(dataset)
+    shares = dataclasses.replace(samples, success=np.full_like(samples.success, 1 / 16))
+    words = summary(shares)
+    assert words.count("mean P_S 0.062") >= 2
+    assert "100.0%" not in words
 
 
 def test_worlds_fill_whole_shards(tmp_path):
@@ -327,6 +364,9 @@ def test_the_explorer_sees_much_of_the_building_and_walks_through_known_cells(co
         ({"views_per_world": 0}, "views_per_world is 0; give at least 1"),
         ({"spacing": (9.0, 2.0)}, "give the least and the most"),
         ({"seed": -1}, "seed is -1"),
+        ({"staying_sets": 1}, "staying_sets is 1; give at least 2"),
+        ({"image_format": "bmp"}, "image_format is 'bmp'; choose jpeg or png"),
+        ({"quality": 200}, "quality is 200; give a number from 0 to 100"),
         ({"estimator": "firefighting"}, "the driver explorer asks no estimator"),
     ],
 )

@@ -166,6 +166,12 @@ def test_a_shard_exists_when_its_samples_do(tmp_path):
     assert finished_shards(tmp_path / "nowhere") == set()
 
 
+def test_more_shards_than_five_digits_can_number_are_found(tmp_path):
+    _write(tmp_path, [7, 100_000])
+    assert finished_shards(tmp_path) == {7, 100_000}
+    assert len(read_dataset(tmp_path).images) == 6
+
+
 def test_an_empty_folder_is_no_dataset(tmp_path):
     with pytest.raises(DatasetError, match="no finished shard"):
         read_dataset(tmp_path)
@@ -236,6 +242,11 @@ def test_a_foreign_file_has_no_metadata(tmp_path):
     [
         ("view", view_id(0, 99), "which is not in the shard"),
         ("phi_go", [1, 0], "phi_go whose length"),
+        ("phi_go", [1, 0, 7], "samples-00000.parquet, row 1: phi_go must have entries -1, 0 and 1"),
+        ("phi_stay", [-128, 0, 1], "row 1: phi_stay must have entries"),
+        ("phi_stay", [None, 0, 1], "samples-00000.parquet has missing values"),
+        ("row", 6, "samples-00000.parquet, row 1: row and column must be of a cell"),
+        ("column", -1, "row 1: row and column must be of a cell"),
         ("success_probability", 1.5, "row 1: success_probability"),
         ("failure_weight", 0.0, "row 1: failure_weight"),
         ("failure_cost", -1.0, "row 1: failure_cost"),

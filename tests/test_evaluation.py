@@ -378,6 +378,29 @@ def test_an_estimator_is_evaluated_on_data_of_its_own_kind_only():
         check_fit(CONFIG, learned, dataclasses.replace(samples, images=[]), "net", "data")
 
 
+def _labelled(collection) -> dict:
+    return {"data": {"collection": collection}}
+
+
+def test_an_estimator_is_evaluated_on_labels_of_its_own_kind_only():
+    samples = make_samples(1, 5, 11)
+    near = dataclasses.replace(samples, metadata=dataclasses.replace(METADATA, collection={"nearest": True}))
+    for data, made in (
+        (samples, _labelled({"nearest": False})),
+        (samples, _labelled({})),
+        (near, _labelled({"nearest": True})),
+        # A file that does not say how its labels were made may be of either kind.
+        (near, {"data": None}),
+        (near, {}),
+    ):
+        check_fit(CONFIG, METADATA.domain, data, "net", "data", made)
+    with pytest.raises(EvaluationError, match=r"data does not ask what net answers: .* --set nearest=true"):
+        check_fit(CONFIG, METADATA.domain, samples, "net", "data", _labelled({"nearest": True}))
+    # Data sets of before could be labelled in one way alone.
+    with pytest.raises(EvaluationError, match="collect with --set nearest=false"):
+        check_fit(CONFIG, METADATA.domain, near, "net", "data", _labelled({}))
+
+
 def test_the_most_confident_right_and_wrong_answers_are_found():
     samples, predictions = make_samples(12, 200, 12), make_predictions(200, 12, decimals=6)
     chosen = most_confident(samples, predictions, 3)
@@ -514,6 +537,11 @@ def test_evaluate_prints_tables_and_warns_of_worlds_it_was_trained_on(estimator,
     result = _potlp("evaluate", own, dataset[0])
     assert "trained on synthetic/validation" in result.stderr
     assert "the mean P_S of these samples" in result.stdout
+    # Also where the estimator that it goes on from was.
+    source = {"environment": "synthetic", "split": "validation"}
+    metadata = {"training_data": {"0": {**source, "split": "training"}}, "earlier_data": {"0": source}}
+    save_estimator(own, NETWORK.init(jax.random.key(2)), CONFIG, METADATA.domain, metadata)
+    assert "trained on synthetic/validation" in _potlp("evaluate", own, dataset[0]).stderr
 
 
 def test_info_shows_what_the_file_says(estimator):
@@ -526,6 +554,36 @@ def test_info_shows_what_the_file_says(estimator):
     assert config_from_dict(NetworkConfig, data["network"], "network") == CONFIG
     assert data["bytes"] == estimator.stat().st_size
     assert data["metadata"]["figures"]["validation_success_rmse"] is None
+
+
+@pytest.mark.parametrize(
+    ("metadata", "shown"),
+    [
+        ({"steps": 5}, "5 steps\n"),
+        ({"steps": 5, "seconds": "long", "best_step": 3}, "5 steps; best at step 3"),
+        ({"steps": "many", "initial": 7, "prior": True, "panoramas": None, "samples": 12}, "12 samples"),
+        ({"training_data": [{"environment": "x"}]}, "architecture"),
+        ({"training_data": {"0": 3, "1": {"environment": "x", "worlds": 4}}}, "x/not named, 4 worlds"),
+        ({"figures": {"validation_brier": None, "validation_loss": 0.5}}, "validation loss"),
+        ({"figures": [0.5], "versions": "new"}, "architecture"),
+        ({"data": None}, "architecture"),
+        ({"data": {"shape": None, "environment": 3, "split": "training"}}, "not named/training"),
+        ({"data": {"shape": [5, "wide"]}, "earlier_data": {"0": None}}, "architecture"),
+    ],
+)
+def test_metadata_of_another_form_are_left_out(metadata, shown, dataset, tmp_path):
+    save_estimator(tmp_path / "e.npz", NETWORK.init(jax.random.key(0)), CONFIG, METADATA.domain, metadata)
+    result = _potlp("info", tmp_path / "e.npz")
+    assert result.exit_code == 0, result.exception
+    assert shown in "\n".join(line.strip() for line in result.stdout.splitlines()) + "\n"
+    assert "None" not in result.stdout
+    assert _potlp("info", tmp_path / "e.npz", "--json").exit_code == 0
+
+
+def test_an_estimator_whose_metadata_have_another_form_is_evaluated(dataset, tmp_path):
+    metadata = {"training_data": [3], "earlier_data": 4, "data": None}
+    save_estimator(tmp_path / "e.npz", NETWORK.init(jax.random.key(0)), CONFIG, METADATA.domain, metadata)
+    assert _potlp("evaluate", tmp_path / "e.npz", dataset[0]).exit_code == 0
 
 
 @pytest.mark.parametrize(("fovea", "words"), [(0, "nothing"), (5, "11 columns × 48 rows")])
@@ -558,6 +616,8 @@ def test_bad_input_is_one_clear_message(estimator, dataset, tmp_path, monkeypatc
     other = tmp_path / "other.npz"
     config = dataclasses.replace(CONFIG, propositions=("goal",))
     save_estimator(other, EstimatorNetwork(config).init(jax.random.key(0)), config, METADATA.domain, {})
+    near = tmp_path / "near.npz"
+    save_estimator(near, NETWORK.init(jax.random.key(0)), CONFIG, METADATA.domain, _labelled({"nearest": True}))
     broken = tmp_path / "broken.npz"
     broken.write_bytes(estimator.read_bytes()[:500])
     for arguments, part in (
@@ -566,6 +626,7 @@ def test_bad_input_is_one_clear_message(estimator, dataset, tmp_path, monkeypatc
         (("evaluate", broken, folder), "damaged"),
         (("evaluate", estimator, tmp_path), "there is no dataset"),
         (("evaluate", other, folder), "has the propositions (fire, alarm, exit)"),
+        (("evaluate", near, folder), "collect with --set nearest=true"),
         (("evaluate", estimator, folder, "--ablate", "sound"), "unknown ablation 'sound'"),
     ):
         result = _potlp(*arguments)

@@ -5,6 +5,7 @@ import json
 from collections import Counter
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -27,6 +28,7 @@ from potlp_jax.recipes.journal import Display
 from potlp_jax.recipes.recipe import PACKAGE, _stages, follow, read_recipe
 from potlp_jax.recipes.times import TIMES
 from potlp_jax.trials.config import trial_config_for
+from potlp_jax.world.settings import Settings
 
 SHIPPED = ("delivery", "firefighting", "firefighting-panorama", "parcels")
 
@@ -293,6 +295,40 @@ def test_other_families_look_alike_and_have_subgoals_as_in_their_trials(tmp_path
         read_recipe(tmp_path / "mine.yaml")
 
 
+def test_families_that_cannot_be_joined_are_named_before_anything_is_collected(monkeypatch, tmp_path):
+    class Fine(type(make("toy"))):
+        """Of the same family and propositions, in metres."""
+
+        def draw(self, key):
+            return dataclasses.replace(super().draw(key), resolution=jnp.float32(0.25))
+
+    monkeypatch.setattr(recipes, "make", lambda name: Fine() if name == "fine" else make(name))
+    (tmp_path / "mine.yaml").write_text(json.dumps({**SMALL, "beside": [{"environment": "fine", "share": 1}]}))
+    with pytest.raises(
+        ConfigurationError, match=r"fine cannot stand beside toy: its cells measure 0\.25 metres.*1 cells"
+    ):
+        read_recipe(tmp_path / "mine.yaml")
+    beside = [{"environment": "toy", "share": share} for share in (0.5, 1.0)]
+    (tmp_path / "mine.yaml").write_text(json.dumps({**SMALL, "beside": beside}))
+    with pytest.raises(ConfigurationError, match="toy stands beside toy twice: give one share for both"):
+        read_recipe(tmp_path / "mine.yaml")
+
+
+@pytest.mark.parametrize("named", [None, 30.0])
+def test_other_families_are_sensed_as_in_their_trials_unless_the_recipe_names_a_sensor(monkeypatch, tmp_path, named):
+    class NearSighted(type(make("toy"))):
+        settings = Settings({"sensor": {"range_cells": 7.0}})
+
+    monkeypatch.setattr(recipes, "make", lambda name: NearSighted() if name == "near" else make(name))
+    collect = {**SMALL["collect"], **({} if named is None else {"explorer": {"sensor": {"range_cells": named}}})}
+    given = {**SMALL, "collect": collect, "beside": [{"environment": "near", "share": 1}]}
+    (tmp_path / "mine.yaml").write_text(json.dumps(given))
+    own, _, other = next(_stages(read_recipe(tmp_path / "mine.yaml"), [tmp_path])).parts
+    usual = trial_config_for(make("toy")).sensor.range_cells
+    sensed = [part.config.explorer.sensor.range_cells for part in (own, other)]
+    assert sensed == ([usual, 7.0] if named is None else [named, named])
+
+
 def _potlp(*arguments):
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
@@ -369,6 +405,24 @@ def test_what_is_wrong_with_a_round_is_said_before_anything_is_collected(tmp_pat
     with pytest.raises(PotlpError, match=message):
         follow(read_recipe(tmp_path / "small.yaml"), tmp_path / "out")
     assert not list(tmp_path.glob("out/**/*.parquet"))
+
+
+@pytest.mark.parametrize("words", [("--epochs", "3"), ("--set", "epochs=3")])
+def test_epochs_are_not_of_one_stage_of_a_recipe_with_rounds_alone(tmp_path, words):
+    rounds = [{"worlds": 2, "validation_worlds": 2, "epochs": 5}]
+    (tmp_path / "small.yaml").write_text(json.dumps({**SMALL, "rounds": rounds}))
+    told = _potlp("fit", "--recipe", tmp_path / "small.yaml", "--out", tmp_path / "out", *words)
+    assert told.exit_code == 2
+    assert "change `epochs` of `fit` and of each round in a copy of its file" in " ".join(told.stderr.split())
+    assert not (tmp_path / "out").exists()
+
+
+def test_minutes_are_of_the_fit_of_every_stage(tmp_path):
+    rounds = [{"worlds": 2, "validation_worlds": 2, "epochs": 5}]
+    fit = {**SMALL["fit"], "minutes": 30}
+    (tmp_path / "small.yaml").write_text(json.dumps({**SMALL, "fit": fit, "rounds": rounds}))
+    stages = _stages(read_recipe(tmp_path / "small.yaml"), [tmp_path] * 2)
+    assert [(stage.fit.epochs, stage.fit.minutes) for stage in stages] == [(1, 30), (5, 30)]
 
 
 def test_a_recipe_that_is_not_there_is_named_beside_those_that_are(tmp_path):

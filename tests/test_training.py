@@ -23,6 +23,7 @@ from potlp_jax.errors import CheckpointError, TrainingError
 from potlp_jax.learning.augmentation import Augmentation
 from potlp_jax.learning.batches import Batch, Batches, Share
 from potlp_jax.learning.checkpoints import checkpoint_steps
+from potlp_jax.learning.data_figures import cost_scales
 from potlp_jax.learning.dataset import Samples, encode
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
 from potlp_jax.learning.dataset_reading import joined
@@ -31,8 +32,9 @@ from potlp_jax.learning.estimator import read_estimator
 from potlp_jax.learning.loss import DataScale, evaluation_of, loss_sums, total_loss
 from potlp_jax.learning.network import Answers
 from potlp_jax.learning.panorama_learner import PanoramaLearner, PanoramaOptions
+from potlp_jax.learning.predictions import part_of
 from potlp_jax.learning.serialization import load_estimator, save_estimator
-from potlp_jax.learning.training import batches_of, check_data, train
+from potlp_jax.learning.training import batches_of, check_data, scale_of, train
 from potlp_jax.learning.training_options import TrainingConfig
 from potlp_jax.learning.training_steps import initial_state, learning_rate_schedule, make_train_step, shared_sums
 from potlp_jax.recipes.fitting import _tell_of_what_is_shared
@@ -254,6 +256,11 @@ def test_a_panorama_network_learns_from_the_subgoals_in_view_alone():
     batch = batches.training_batch(0)
     asked = np.asarray(batch.inputs.distance)[np.asarray(batch.mask)]
     assert sorted(asked.tolist()) == list(range(1, 18, 2))
+    # And so are the figures of the loss, and the scales of costs.
+    seen = part_of(samples, samples.in_view)
+    assert scale_of(learner, samples) == DataScale.of(seen) != DataScale.of(samples)
+    assert learner.config == PanoramaOptions().learner(seen).config
+    assert cost_scales(seen) != cost_scales(samples)
 
 
 def test_the_order_is_a_function_of_seed_and_step_and_covers_an_epoch():
@@ -357,6 +364,27 @@ def test_a_time_budget_ends_training_with_an_evaluation():
     assert (done.reason, done.steps) == ("time", 1)
     assert [progress.step for progress in seen] == [1]
     assert np.isfinite(done.best_loss)
+
+
+def test_a_training_whose_time_is_over_before_its_first_evaluation_goes_on_to_one(tmp_path):
+    class KilledError(Exception):
+        pass
+
+    def kill(step, loss):
+        if step == 3:
+            raise KilledError
+
+    samples = synthetic(16, 4, 9)
+    network, config = _learner(samples, TINY), _config(8, checkpoint_steps=2)
+    with pytest.raises(KilledError):
+        train(network, samples, samples, config, folder=tmp_path, on_step=kill)
+    assert checkpoint_steps(tmp_path) == [2]
+    # What the checkpoint has as the best are parameters that learned nothing.
+    done = train(network, samples, samples, config, folder=tmp_path, budget_seconds=0.001)
+    assert (done.reason, done.steps, done.best_step) == ("time", 3, 3)
+    assert np.isfinite(done.best_loss)
+    first = initial_state(network, config).params
+    assert not all(map(np.array_equal, jax.tree.leaves(done.params), jax.tree.leaves(first)))
 
 
 @pytest.mark.parametrize(

@@ -54,12 +54,13 @@ def excess_of(name: str, samples: Samples) -> Float64[np.ndarray, " N"]:
     """The squared distance of an estimator from each label.
 
     Raises:
-        EvaluationError: it was not trained here, or from other pictures, maps or units than those of the samples.
+        EvaluationError: it was not trained here, or from other pictures, maps, labels or units than those of the
+            samples.
     """
     estimator = named_estimator(name)
     if not isinstance(estimator, TrainedEstimator):
         raise EvaluationError(f"{name}: only estimators that were trained with this library answer data sets")
-    check_fit(estimator.config, estimator.domain, samples, name, "the data set")
+    check_fit(estimator.config, estimator.domain, samples, name, "the data set", estimator.metadata)
     answers = predict(learner_of(estimator.config), estimator.params, samples).success
     return (answers - np.asarray(samples.success, np.float64)) ** 2
 

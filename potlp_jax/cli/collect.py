@@ -2,7 +2,6 @@
 
 import importlib.util
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -80,18 +79,19 @@ def collect(
     if not number:
         fail(f"how many worlds of the split {split}? Give --worlds")
     folder = make_folder(out)
+    config = with_settings(chosen.collect, settings_from_words(settings or []), "--set")
+    told = [collection.Collected(0, 0, 0)]
     with progress_bar() as progress, open_engine(processes, cluster) as engine:
-        collection.collect(
-            generator,
-            chosen.environment,
-            of_split,
-            number,
-            folder,
-            with_settings(chosen.collect, settings_from_words(settings or []), "--set"),
-            engine,
-            tell=partial(collection_bars(progress), of_split),
-        )
+        show = collection_bars(progress)
+
+        def tell(collected: "Collected") -> None:
+            told.append(collected)
+            show(of_split, collected)
+
+        collection.collect(generator, chosen.environment, of_split, number, folder, config, engine, tell)
     console().print(collection.summary(read_dataset(folder)))
+    if overflow := collection.overflow_in_words(told[-1], config):
+        console().print(overflow)
 
 
 def _chosen(environment: str | None, recipe: str | None) -> "Recipe":

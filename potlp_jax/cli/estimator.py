@@ -3,8 +3,7 @@
 import dataclasses
 import importlib.util
 import logging
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,6 +15,14 @@ from rich.table import Table
 from potlp_jax.cli.group import Command, command_app
 from potlp_jax.cli.options import Json
 from potlp_jax.cli.output import FAILED, console, fail, file_console, make_folder, print_json, progress_bar, to_json
+from potlp_jax.learning.made_from import (
+    map_shape_of,
+    mapping_in,
+    number_in,
+    text_in,
+    trained_before_on,
+    trained_on,
+)
 
 if TYPE_CHECKING:
     from potlp_jax.learning.dataset import Samples
@@ -84,7 +91,7 @@ def evaluate_estimator(
     params, config, domain, metadata = load_estimator(estimator)
     samples = read_dataset(dataset)
     # An estimator asked about propositions that it does not know would answer without meaning.
-    check_fit(config, domain, samples, str(estimator), str(dataset))
+    check_fit(config, domain, samples, str(estimator), str(dataset), metadata)
     _warn(metadata, samples)
     folder = None if out is None else make_folder(out)
     learner = learner_of(config)
@@ -135,19 +142,14 @@ def _warn(metadata: Mapping[str, Any], samples: "Samples") -> None:
     from potlp_jax.environments.splits import Split
 
     own = (samples.metadata.environment, samples.metadata.split)
+    sources = [*trained_on(metadata), *trained_before_on(metadata)]
     # By name and split: other worlds of the same split are still worlds that training may have seen.
-    if any((source.get("environment"), source.get("split")) == own for source in _trained_on(metadata)):
+    if any((source.get("environment"), source.get("split")) == own for source in sources):
         logger.warning(
             f"the estimator was trained on {'/'.join(own)}: these figures say nothing about worlds it has not seen"
         )
     if samples.metadata.split == Split.TEST:
         warn_of_test_worlds()
-
-
-def _trained_on(metadata: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """The data sets that an estimator was fitted to."""
-    # Files of before these were listed have the metadata of one alone, and those of others may have nothing.
-    return [*metadata.get("training_data", {}).values()] or [metadata.get("data", {})]
 
 
 def _predict(
@@ -233,7 +235,7 @@ def show_estimator(estimator: EstimatorArgument, json: Json = False) -> None:
     params, config, domain, metadata = load_estimator(estimator)
     architecture = architecture_of(config)
     # What a map costs goes by its size; 64 × 192 cells where the file does not say of what maps it learned.
-    shape = tuple(metadata.get("data", {}).get("shape", (64, 192)))
+    shape = map_shape_of(metadata) or (64, 192)
     description = {
         "estimator": str(estimator),
         "bytes": estimator.stat().st_size,
@@ -278,10 +280,9 @@ def _sizes(description: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _rows(description: dict[str, Any]) -> list[tuple[str, str]]:
     """Names and values for people; what the file does not say is left out."""
-    # Estimators of others may lack any entry of the metadata; those of the network are always there.
     network, domain, metadata = (description[name] for name in ("network", "domain", "metadata"))
     operations = description["operations"]
-    rows = [
+    return [
         ("propositions", ", ".join(network["propositions"])),
         ("serves", f"worlds of {domain['family'] or 'no named family'}, costs in {domain['unit']}"),
         ("panorama", " × ".join(map(str, network["image_shape"])) + " pixels"),
@@ -289,42 +290,56 @@ def _rows(description: dict[str, Any]) -> list[tuple[str, str]]:
         ("arithmetic", "; ".join(f"{count / 1e6:.2f} MFLOP {what}" for what, count in operations.items())),
         ("architecture", description["architecture"]),
         *_sizes(description),
+        *_rows_of_making(metadata),
     ]
-    if metadata.get("initial"):
-        rows.append(("goes on from", metadata["initial"]))
-    sources = _trained_on(metadata)
-    if any(sources):
-        rows += zip(["trained on", *[""] * (len(sources) - 1)], map(_in_words, sources), strict=True)
-    if "panoramas" in metadata:
-        rows.append(("", f"{metadata['panoramas']:,} panoramas, {metadata.get('samples', 0):,} samples"))
-    if "steps" in metadata:
-        minutes = metadata.get("seconds", 0) / 60
-        rows.append(
-            (
-                "training",
-                f"{metadata['steps']:,} steps in {minutes:.0f} minutes, ended by {metadata.get('ended_by')}; "
-                f"best at step {metadata.get('best_step'):,}",
-            )
-        )
-    if "prior" in metadata:
-        rows.append(("mean P_S of the data", f"{metadata['prior']:.4f}"))
-    rows += [
-        (name.replace("_", " "), f"{value:.4f}")
-        for name, value in metadata.get("figures", {}).items()
-        if name.startswith("validation_") and name != "validation_samples" and math.isfinite(value)
-    ]
-    if "versions" in metadata:
-        rows.append(("versions", ", ".join(f"{name} {value}" for name, value in metadata["versions"].items())))
-    return rows
+
+
+def _rows_of_making(metadata: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """How an estimator was made. Files of others may lack any entry, or have something else in its place."""
+    if initial := text_in(metadata, "initial"):
+        yield "goes on from", initial
+    for name, sources in (("trained on", trained_on(metadata)), ("before that on", trained_before_on(metadata))):
+        yield from zip([name, *[""] * (len(sources) - 1)], map(_in_words, sources), strict=False)
+    counts = [(name, number_in(metadata, name)) for name in ("panoramas", "samples")]
+    if counted := ", ".join(f"{count:,} {name}" for name, count in counts if count is not None):
+        yield "", counted
+    if training := _training_in_words(metadata):
+        yield "training", training
+    prior = number_in(metadata, "prior")
+    if prior is not None:
+        yield "mean P_S of the data", f"{prior:.4f}"
+    figures = mapping_in(metadata, "figures")
+    for name in figures:
+        value = number_in(figures, name)
+        if value is not None and name.startswith("validation_") and name != "validation_samples":
+            yield name.replace("_", " "), f"{value:.4f}"
+    if versions := mapping_in(metadata, "versions"):
+        yield "versions", ", ".join(f"{name} {value}" for name, value in versions.items())
+
+
+def _training_in_words(metadata: Mapping[str, Any]) -> str:
+    """How long a training was and how it ended; empty where the file does not say how many steps it had."""
+    steps, seconds, best = (number_in(metadata, name) for name in ("steps", "seconds", "best_step"))
+    if steps is None:
+        return ""
+    words = f"{steps:,} steps"
+    if seconds is not None:
+        words += f" in {seconds / 60:.0f} minutes"
+    if ended_by := text_in(metadata, "ended_by"):
+        words += f", ended by {ended_by}"
+    return words if best is None else f"{words}; best at step {best:,}"
 
 
 def _in_words(source: Mapping[str, Any]) -> str:
-    words = f"{source.get('environment')}/{source.get('split')}"
-    if "worlds" in source:
-        words += f", {source['worlds']} worlds"
-    if source.get("driver"):
-        asked = source.get("estimator")
-        words += f" from {source.get('first_world')}, by {source['driver']}" + (f" with {asked}" if asked else "")
+    words = "/".join(text_in(source, name) or "not named" for name in ("environment", "split"))
+    worlds, first = number_in(source, "worlds"), number_in(source, "first_world")
+    if worlds is not None:
+        words += f", {worlds} worlds"
+    if driver := text_in(source, "driver"):
+        asked = text_in(source, "estimator")
+        words += (
+            (f" from {first}" if first is not None else "") + f", by {driver}" + (f" with {asked}" if asked else "")
+        )
     return words
 
 

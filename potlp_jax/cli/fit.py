@@ -53,9 +53,19 @@ def fit(
         Path | None, typer.Option("--validation", help="Dataset of other worlds; decides which parameters are kept.")
     ] = None,
     recipe: RecipeName = None,
-    epochs: Annotated[int | None, typer.Option("--epochs", min=1, help="Passes over the panoramas, at most.")] = None,
+    epochs: Annotated[
+        int | None,
+        typer.Option(
+            "--epochs",
+            min=1,
+            help="Passes over the panoramas, at most. Rounds of a recipe say their own.",
+        ),
+    ] = None,
     minutes: Annotated[
-        float | None, typer.Option("--minutes", help="Plan as many steps as fit into this time.")
+        float | None,
+        typer.Option(
+            "--minutes", help="Plan as many steps as fit into this time; with a recipe's rounds, in the fit of each."
+        ),
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", min=0, help="Of parameters, order and augmentation.")] = None,
     initial: Annotated[
@@ -104,9 +114,13 @@ def fit(
     given = None if recipe is None else read_recipe(recipe)
     if cluster is not None and datasets:
         fail("--cluster is for collecting, as a recipe does: a fit is shared by processes that join (--join)")
-    config = with_settings(
-        fitting.FitConfig() if given is None else given.fit, settings_from_words(settings or []), "--set"
-    )
+    changes = settings_from_words(settings or [])
+    if given is not None and given.rounds and not datasets and (epochs is not None or "epochs" in changes):
+        fail(
+            "each round of a recipe has epochs of its own: change `epochs` of `fit` and of each round in a copy of its "
+            "file; leave out --epochs"
+        )
+    config = with_settings(fitting.FitConfig() if given is None else given.fit, changes, "--set")
     options = {"epochs": epochs, "minutes": minutes}
     config = with_settings(config, _given(**options) | {"training": _given(seed=seed)}, "options")
     join_processes(join)

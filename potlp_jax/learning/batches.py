@@ -41,7 +41,7 @@ class Batch:
     success_cost: Float32[Array, "G K"]
     """The true R_S; NaN where P_S = 0."""
     failure_cost: Float32[Array, "G K"]
-    """The true R_F; may be NaN where it is not known."""
+    """The true R_F."""
     success_weight: Float32[Array, "G K"]
     failure_weight: Float32[Array, "G K"]
     mask: Bool[Array, "G K"]

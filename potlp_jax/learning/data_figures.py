@@ -3,9 +3,11 @@
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from potlp_jax.errors import TrainingError
 from potlp_jax.learning.dataset import Samples, decode
+from potlp_jax.learning.domain import FLOOR
 
 
 def image_shape(samples: Samples) -> tuple[int, int]:
@@ -17,10 +19,17 @@ def image_shape(samples: Samples) -> tuple[int, int]:
     return rows, columns
 
 
-def cost_scales(samples: Samples) -> dict[str, Any]:
-    """``success_cost_scale``, ``failure_cost_scale``: each cost's spread where it counts in the loss; and ``step``."""
+def cost_scales(samples: Samples, usable: Bool[np.ndarray, "N"] | None = None) -> dict[str, Any]:
+    """``success_cost_scale``, ``failure_cost_scale``: each cost's spread where it counts in the loss; and ``step``.
+
+    Args:
+        samples: the training data.
+        usable: those that are learned from; all by default.
+    """
     step = float(samples.metadata.resolution)
     succeeded, failed = samples.success > 0, (samples.success < 1) & np.isfinite(samples.failure_cost)
+    if usable is not None:
+        succeeded, failed = succeeded & usable, failed & usable
     # Scales are rounded nowhere: they are part of what the network answers and stored with it.
     return {
         "success_cost_scale": spread(samples.success_cost[succeeded], step),
@@ -39,14 +48,14 @@ def camera_geometry(samples: Samples, asker: str) -> dict[str, Any]:
     Raises:
         TrainingError: the data do not say how their camera sees the floor. Real data need not.
     """
-    names, camera = ("horizon", "far", "fold"), samples.metadata.camera
-    missing = [name for name in names if name not in camera]
+    camera = samples.metadata.camera
+    missing = [name for name in FLOOR if name not in camera]
     if missing:
         raise TrainingError(
             f"{asker} needs {', '.join(missing)} of the data set's camera (docs/camera.md): collect it again, or train "
             "a panorama network without a fovea"
         )
-    return {name: float(camera[name]) for name in names}
+    return {name: float(camera[name]) for name in FLOOR}
 
 
 def spread(values: np.ndarray, least: float) -> float:

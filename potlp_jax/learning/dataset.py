@@ -30,6 +30,9 @@ from potlp_jax.learning.shard_files import TEMPORARY, metadata_of, write_table
 
 JPEG_QUALITY: int = 92
 
+IMAGE_FORMATS: tuple[str, ...] = ("jpeg", "png")
+"""Of panoramas; ``png`` is without loss."""
+
 # Samples that are looked at together.
 _SAMPLES = 1 << 18
 
@@ -168,8 +171,8 @@ def encode(
     Raises:
         DatasetError: another format, or an image that cannot be encoded.
     """
-    if image_format not in ("jpeg", "png"):
-        raise DatasetError(f"unknown image format {image_format!r}; choose jpeg or png")
+    if image_format not in IMAGE_FORMATS:
+        raise DatasetError(f"unknown image format {image_format!r}; choose {' or '.join(IMAGE_FORMATS)}")
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if image_format == "jpeg" else []
     extension = ".jpg" if image_format == "jpeg" else ".png"
     # OpenCV's images are BGR.
@@ -213,7 +216,8 @@ def view_id(shard: int, index: int) -> int:
 
 def finished_shards(folder: Path | str) -> set[int]:
     """Numbers of the shards that are complete; none where there is no such folder."""
-    names = (re.fullmatch(r"samples-(\d{5})\.parquet", path.name) for path in Path(folder).glob("samples-*.parquet"))
+    # Five digits at least: a larger number has as many as it needs.
+    names = (re.fullmatch(r"samples-(\d{5,})\.parquet", path.name) for path in Path(folder).glob("samples-*.parquet"))
     return {int(name[1]) for name in names if name}
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from potlp_jax.codec import config_from_dict, differences, json_copy
 from potlp_jax.errors import ConfigurationError, DatasetError
 from potlp_jax.files import one_line, short
-from potlp_jax.learning.domain import Domain
+from potlp_jax.learning.domain import FLOOR, Domain, unit_of
 from potlp_jax.world.camera import CameraConfig
 
 SCHEMA_VERSION: int = 2
@@ -84,7 +84,13 @@ class DatasetMetadata:
 
     @property
     def domain(self) -> Domain:
-        """What an estimator serves that learns from this dataset. Raises DatasetError where ``camera`` is none."""
+        """What an estimator serves that learns from this dataset; its camera is not known where it has no ``FLOOR``.
+
+        Raises:
+            DatasetError: ``camera`` is none.
+        """
+        if any(name not in self.camera for name in FLOOR):
+            return Domain(self.family, None, unit_of(self.resolution))
         try:
             camera = config_from_dict(CameraConfig, self.camera, "camera")
         except ConfigurationError as error:

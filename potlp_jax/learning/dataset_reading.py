@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Int32, Int64
+from jaxtyping import Bool, Int8, Int32, Int64
 
 from potlp_jax.errors import DatasetError
 from potlp_jax.learning.dataset import (
@@ -84,25 +84,31 @@ def _one_after_another(parts: Iterable[Samples]) -> Samples:
 def _read_shard(folder: Path | str, shard: int, metadata: DatasetMetadata, kept: ImageFile) -> Samples:
     """A shard whose images, maps and worlds are kept in a file."""
     paths = worlds_file(folder, shard), views_file(folder, shard), samples_file(folder, shard)
-    worlds, of_worlds = _read_worlds(paths[0], kept)
+    worlds, sizes, of_worlds = _read_worlds(paths[0], kept)
     views, world_of_views, images, maps = _read_views(paths[1], kept)
     columns = _sample_columns(read_table(paths[2], SAMPLES_SCHEMA), len(metadata.propositions), paths[2])
     view_of = _index_of(columns.pop("view"), views, "view", paths[2])
     world_of = _index_of(world_of_views, worlds, "world", paths[1])
+    cells = columns["cells"]
+    inside = np.all((cells >= 0) & (cells < sizes[world_of[view_of]]), axis=1)
+    _require({"row and column must be of a cell of the world's map": inside}, paths[2])
     return Samples(
         images=images, maps=maps, worlds=of_worlds, world_of=world_of, view_of=view_of, metadata=metadata, **columns
     )
 
 
-def _read_worlds(path: Path, kept: ImageFile) -> tuple[Int64[np.ndarray, " worlds"], OnDisk[EncodedWorld]]:
-    """Numbers of a shard's worlds, and their maps on disk."""
+def _read_worlds(
+    path: Path, kept: ImageFile
+) -> tuple[Int64[np.ndarray, " worlds"], Int32[np.ndarray, "worlds 2"], OnDisk[EncodedWorld]]:
+    """Numbers of a shard's worlds, rows and columns of their maps, and the maps on disk."""
     numbers, bounds = [np.zeros(0, np.int64)], [np.zeros((0, 4), np.int64)]
+    sizes = [np.zeros((0, 2), np.int32)]
     for rows in checked_rows(path, WORLDS_SCHEMA, WORLDS_SCHEMA.names):
         numbers.append(rows["world"].to_numpy())
-        sizes = np.stack([rows["rows"].to_numpy(), rows["columns"].to_numpy()], axis=-1)
+        sizes.append(np.stack([rows["rows"].to_numpy(), rows["columns"].to_numpy()], axis=-1))
         maps = (rows[name].to_pylist() for name in ("cells", "letters"))
-        bounds.append(kept.write(zip(map(np.ndarray.tobytes, sizes), *maps, strict=True)))
-    return np.concatenate(numbers), OnDisk(kept, _world, np.concatenate(bounds))
+        bounds.append(kept.write(zip(map(np.ndarray.tobytes, sizes[-1]), *maps, strict=True)))
+    return np.concatenate(numbers), np.concatenate(sizes), OnDisk(kept, _world, np.concatenate(bounds))
 
 
 def _world(size: bytes, cells: bytes, letters: bytes) -> EncodedWorld:
@@ -158,7 +164,7 @@ def _sample_columns(table: pa.Table, propositions: int, path: Path) -> dict[str,
 def _check_values(columns: Mapping[str, np.ndarray], path: Path) -> None:
     # NaN fails every comparison, so that it is refused wherever a rule does not allow it by name.
     success = columns["success"] > 0
-    positive = ("success_weight", "failure_weight")
+    positive, vectors = ("success_weight", "failure_weight"), ("phi_stay", "phi_go")
     rules = {
         "success_probability must lie in [0, 1]": (columns["success"] >= 0) & (columns["success"] <= 1),
         "success_cost must be a positive number where success_probability > 0": ~success
@@ -166,8 +172,19 @@ def _check_values(columns: Mapping[str, np.ndarray], path: Path) -> None:
         "failure_cost must be a number >= 0": np.isfinite(columns["failure_cost"]) & (columns["failure_cost"] >= 0),
         "distance must be a number >= 0": np.isfinite(columns["distance"]) & (columns["distance"] >= 0),
         "bearing must be a number": np.isfinite(columns["bearing"]),
+        **{f"{name} must have entries -1, 0 and 1": _all_signs(columns[name]) for name in vectors},
         **{f"{name} must be a positive number": np.isfinite(columns[name]) & (columns[name] > 0) for name in positive},
     }
+    _require(rules, path)
+
+
+def _all_signs(vectors: Int8[np.ndarray, "N P"]) -> Bool[np.ndarray, "N"]:
+    # Not by the absolute value: that of -128 is no int8.
+    return np.all((vectors >= -1) & (vectors <= 1), axis=1)
+
+
+def _require(rules: Mapping[str, np.ndarray], path: Path) -> None:
+    """Name the first row of the file for which a rule does not hold."""
     for rule, holds in rules.items():
         if not holds.all():
             raise DatasetError(f"{path}, row {int(np.argmin(holds))}: {rule}")

@@ -79,6 +79,9 @@ class Domain:
         return tuple(misfits)
 
 
+FLOOR: tuple[str, ...] = ("horizon", "far", "fold")
+"""Fields of a camera that say how it sees the floor. Data from elsewhere need not have them."""
+
 LOGS: str = "log"
 """Family of the worlds that are read from robots' logs."""
 

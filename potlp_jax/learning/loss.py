@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float32
+from jaxtyping import Array, Bool, Float32
 
 from potlp_jax.errors import TrainingError
 from potlp_jax.learning.batches import Batch
@@ -64,13 +64,24 @@ class DataScale:
     prior: float
 
     @classmethod
-    def of(cls, samples: Samples) -> "DataScale":
-        """The figures of these samples. Raises TrainingError where there are none."""
-        if not len(samples.success):
+    def of(cls, samples: Samples, usable: Bool[np.ndarray, "N"] | None = None) -> "DataScale":
+        """The figures of these samples.
+
+        Args:
+            samples: the training data.
+            usable: those that are learned from (``Learner.usable``); all by default.
+
+        Raises:
+            TrainingError: there are none.
+        """
+        # A slice of all of them is no copy.
+        chosen = slice(None) if usable is None or usable.all() else usable
+        success = samples.success[chosen]
+        if not len(success):
             raise TrainingError("the data set has no samples")
         # The weight of what happened; a label between 0 and 1 is that share of a success.
-        weight = samples.success * samples.success_weight + (1 - samples.success) * samples.failure_weight
-        return cls(float(np.mean(weight, dtype=np.float64)), float(np.mean(samples.success, dtype=np.float64)))
+        weight = success * samples.success_weight[chosen] + (1 - success) * samples.failure_weight[chosen]
+        return cls(float(np.mean(weight, dtype=np.float64)), float(np.mean(success, dtype=np.float64)))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -114,7 +114,7 @@ class PanoramaOptions:
                 fovea=self.fovea,
                 second_widths=self.second_widths,
                 exclusive_within=self.exclusive_within,
-                **cost_scales(samples),
+                **cost_scales(samples, samples.in_view),
                 **(camera_geometry(samples, "a fovea") if self.fovea else {}),
             )
         )

@@ -3,9 +3,9 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -18,6 +18,7 @@ from potlp_jax.learning.building_config import BuildingConfig
 from potlp_jax.learning.dataset import Samples, decode
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.learner import Learner
+from potlp_jax.learning.made_from import nearest_misfit
 from potlp_jax.learning.network import Answers, Params, require_propositions
 
 # As in training by default: the answers do not depend on it, only the memory and the time.
@@ -46,7 +47,14 @@ class Predictions:
 Columns = TypeVar("Columns", Samples, Predictions)
 
 
-def check_fit(config: EstimatorConfig, domain: Domain, samples: Samples, estimator: str, dataset: str) -> None:
+def check_fit(
+    config: EstimatorConfig,
+    domain: Domain,
+    samples: Samples,
+    estimator: str,
+    dataset: str,
+    metadata: Mapping[str, Any] | None = None,
+) -> None:
     """Whether the estimator's answers mean the same as the data set's labels.
 
     Args:
@@ -54,11 +62,12 @@ def check_fit(config: EstimatorConfig, domain: Domain, samples: Samples, estimat
         domain: of the worlds that the estimator learned from.
         samples: the data set.
         estimator, dataset: their names in messages.
+        metadata: of the estimator's file, which say how its labels were made.
 
     Raises:
         PropositionsError: other propositions.
-        EvaluationError: another size of panorama, another camera, another unit of cost, or maps with other cells or
-            painted in another way than those it learned from.
+        EvaluationError: another size of panorama, another camera, another unit of cost, labels of another kind, or maps
+            with other cells or painted in another way than those it learned from.
     """
     require_propositions(config.propositions, tuple(samples.metadata.propositions), estimator, asker=dataset)
     if not samples.images:
@@ -75,6 +84,9 @@ def check_fit(config: EstimatorConfig, domain: Domain, samples: Samples, estimat
             f"{dataset} is not what {estimator} learned from: {'; '.join(misfits)}. Collect a data set with the same, "
             "or train an estimator for this one"
         )
+    misfit = nearest_misfit(metadata or {}, samples.metadata.nearest)
+    if misfit is not None:
+        raise EvaluationError(f"{dataset} does not ask what {estimator} answers: {misfit}")
     # In a trial it looks at cells of its own (``learning.resampling``); maps of data sets are read as they are.
     if isinstance(config, BuildingConfig) and not math.isclose(config.step, samples.metadata.resolution, rel_tol=1e-4):
         raise EvaluationError(

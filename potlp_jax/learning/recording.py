@@ -17,9 +17,11 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Int32, UInt8
 
+from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, require_fields
 from potlp_jax.codec import json_copy
 from potlp_jax.errors import DatasetError
 from potlp_jax.learning.dataset import (
+    IMAGE_FORMATS,
     JPEG_QUALITY,
     SAMPLES_SCHEMA,
     VIEWS_SCHEMA,
@@ -57,7 +59,7 @@ class RecordingConfig:
         tasks_per_world: drawn for the outcome classes.
         classes: outcome classes per view, at most; staying_sets: distinct sets of staying letters among them.
         image_format, quality: of the encoded images: ``jpeg`` or ``png``; quality is JPEG's.
-        frontiers: which components of the frontier are subgoals.
+        frontiers: which components of the frontier are subgoals; of more than ``max_subgoals`` the nearest are kept.
         seed: of everything but the worlds.
         held_out: formulas whose languages are never drawn.
         camera: takes the images.
@@ -81,6 +83,19 @@ class RecordingConfig:
     look_every: int = 1
     glances: bool = True
     nearest: bool = False
+
+    def __post_init__(self) -> None:
+        require_fields(self, ("views_per_world", "classes", "tasks_per_world"), AT_LEAST_ONE, DatasetError)
+        require_fields(self, ("seed", "look_every"), NOT_NEGATIVE, DatasetError)
+        if not 0 <= self.spacing[0] <= self.spacing[1]:
+            raise DatasetError(f"spacing is {self.spacing}: give the least and the most, in cells")
+        # A sheet of questions goes from one set to another (``question_sheet``).
+        if self.staying_sets < 2:
+            raise DatasetError(f"staying_sets is {self.staying_sets}; give at least 2")
+        if self.image_format not in IMAGE_FORMATS:
+            raise DatasetError(f"image_format is {self.image_format!r}; choose {' or '.join(IMAGE_FORMATS)}")
+        if not 0 <= self.quality <= 100:
+            raise DatasetError(f"quality is {self.quality}; give a number from 0 to 100")
 
 
 def recording_metadata(
@@ -162,6 +177,8 @@ class Recorder:
         self.worlds: dict[str, list[Any]] = {name: [] for name in WORLDS_SCHEMA.names}
         self.views: dict[str, list[Any]] = {name: [] for name in VIEWS_SCHEMA.names}
         self.samples: dict[str, list[Any]] = {name: [] for name in SAMPLES_SCHEMA.names}
+        self.overflowed = 0
+        """Views of maps with more subgoals than are recorded."""
 
     def add_world(self, world: World, index: int, unseen: Bool[np.ndarray, "H W"] | None = None) -> None:
         """Record a true map; the views that are added next are of it.
@@ -220,6 +237,7 @@ class Recorder:
         }
         for name, value in row.items():
             self.views[name].append(value)
+        self.overflowed += Status.SUBGOAL_OVERFLOW in Status(int(scene.subgoals.status))
         for name, values in _sample_columns(view, scene, questions, labels, weights).items():
             self.samples[name].extend(values)
 

@@ -82,7 +82,11 @@ def checked_rows(path: Path, schema: pa.Schema, columns: Sequence[str]) -> Itera
         for rows in file.iter_batches(_ROWS, columns=list(columns), use_threads=False):
             # Offsets that point beyond their values would be followed later.
             rows.validate(full=True)
-            if any(column.null_count for column in rows.columns):
+            # In lists as well: an array of numbers has no place for them.
+            if any(
+                column.null_count or (pa.types.is_list(column.type) and column.flatten().null_count)
+                for column in rows.columns
+            ):
                 raise broken_shard(path, "has missing values")
             if len(rows):
                 yield rows

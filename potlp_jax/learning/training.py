@@ -106,6 +106,11 @@ def batches_of(learner: Learner, samples: Samples, config: TrainingConfig) -> Ba
     )
 
 
+def scale_of(learner: Learner, training: Samples) -> DataScale:
+    """The figures of what is learned from: a panorama network never sees the samples out of view."""
+    return DataScale.of(training, learner.usable(training))
+
+
 def seconds_per_step(learner: Learner, training: Samples, config: TrainingConfig, steps: int = 8) -> float:
     """Measured time of a step with its share of decoding, after compilation; nothing is kept of these steps.
 
@@ -117,7 +122,7 @@ def seconds_per_step(learner: Learner, training: Samples, config: TrainingConfig
         Seconds.
     """
     batches = batches_of(learner, training, config)
-    train_step = make_train_step(learner, config, DataScale.of(training))
+    train_step = make_train_step(learner, config, scale_of(learner, training))
     state = everywhere(initial_state(learner, config))
     started = 0.0
     for number, batch in enumerate(prefetched(batches.training_batch, 0, steps + 2)):
@@ -253,7 +258,7 @@ class _Loop:
         self._learner, self._config, self._folder = learner, config, folder
         self._budget = budget_seconds
         # Figures of the training data also scale the validation loss: they belong to the loss, not to the data.
-        scale = DataScale.of(training)
+        scale = scale_of(learner, training)
         self.batches = batches_of(learner, training, config)
         self._validation = batches_of(learner, validation, config)
         self._identity = training_identity(learner, training, validation, config, initial)
@@ -346,13 +351,12 @@ class _Loop:
         """Why training is over, or None."""
         if self.steps_done >= self._config.steps:
             return "planned"
-        # However short the time, parameters that learned nothing are no estimator.
-        if self.steps_done == 0:
-            return None
         # After the plan, which is the usual end: its name says that the schedule was completed.
         if self._config.patience and int(self._state.evaluations_since_best) >= self._config.patience:
             return "patience"
-        return "time" if self.out_of_time else None
+        # However short the time: until the first evaluation the best parameters are those that learned nothing. A
+        # training that was killed before it goes on to one.
+        return "time" if self.out_of_time and np.isfinite(float(self._state.best_loss)) else None
 
     def result(self) -> Trained:
         """The best parameters so far."""

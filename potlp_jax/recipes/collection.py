@@ -15,10 +15,10 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 
 from potlp_jax import plugins
-from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, require_fields
+from potlp_jax.checks import AT_LEAST_ONE, require_fields
 from potlp_jax.codec import json_copy
 from potlp_jax.engine.engine import Broken, Engine, Here
 from potlp_jax.engine.writer import only_writer
@@ -90,11 +90,8 @@ class CollectConfig(RecordingConfig):
     posterior: int = 0
 
     def __post_init__(self) -> None:
-        names = ("views_per_world", "classes", "drives", "pursued", "tasks_per_world", "worlds_per_shard")
-        require_fields(self, names, AT_LEAST_ONE, DatasetError)
-        require_fields(self, ("seed", "look_every"), NOT_NEGATIVE, DatasetError)
-        if not 0 <= self.spacing[0] <= self.spacing[1]:
-            raise DatasetError(f"spacing is {self.spacing}: give the least and the most, in cells")
+        super().__post_init__()
+        require_fields(self, ("drives", "pursued", "worlds_per_shard"), AT_LEAST_ONE, DatasetError)
         if self.posterior < 0:
             raise DatasetError(
                 f"posterior is {self.posterior}: give a number of buildings, or 0 for the labels of the robot's own"
@@ -108,11 +105,18 @@ class CollectConfig(RecordingConfig):
 
 @dataclasses.dataclass(frozen=True)
 class Collected:
-    """Where a collection stands: worlds done of all, and views recorded since it was started."""
+    """Where a collection stands.
+
+    Attributes:
+        worlds, of: worlds done, of all.
+        views: recorded since it was started.
+        overflowed: of these, the views of maps with more subgoals than are recorded.
+    """
 
     worlds: int
     of: int
     views: int
+    overflowed: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,10 +132,11 @@ class _Job:
 
 
 def collection_of(generator: Generator) -> CollectConfig:
-    """What to record in worlds of a family: subgoals and panoramas as its trials have them, and never the formulas it
-    holds out.
+    """What to record in worlds of a family: subgoals, panoramas and what the robot senses as its trials have them, and
+    never the formulas it holds out.
     """
-    # The estimator is asked about the subgoals of trials and looks through their camera, so it must learn from these.
+    # The estimator is asked about the subgoals of trials, on maps of their sensor, and looks through their camera: it
+    # must learn from these.
     trials = trial_config_for(generator)
     frontiers = trials.decision.frontiers
     return CollectConfig(
@@ -139,7 +144,7 @@ def collection_of(generator: Generator) -> CollectConfig:
         camera=trials.camera,
         disturbance=trials.disturbance,
         look_every=trials.look_every,
-        explorer=ExplorerConfig(frontiers=frontiers),
+        explorer=ExplorerConfig(frontiers=frontiers, sensor=trials.sensor),
         # An estimator of one family serves all that look like it, so that it must not know their formulas either.
         held_out=HELD_OUT.get(generator.family or generator.name, ()),
     )
@@ -202,15 +207,16 @@ def _collect_missing(job: _Job, shards: int, folder: Path, engine: Engine, tell:
     # What is finished stays as it is; a larger number of worlds adds shards.
     missing = [shard for shard in range(shards) if shard not in finished]
     worlds = shards * size
-    views, done = 0, worlds - len(missing) * size
+    views, overflowed, done = 0, 0, worlds - len(missing) * size
     tell(Collected(done, worlds, views))
     for shard, found in engine.run(_recorded, job, missing):
         if isinstance(found, Broken):
             raise DatasetError(f"shard {shard} of {folder} cannot be collected: {found.error}")
         (recorder,) = found
         write_shard(folder, shard, recorder.worlds, recorder.views, recorder.samples, job.metadata)
-        views, done = views + len(recorder.views["view"]), done + size
-        tell(Collected(done, worlds, views))
+        views, overflowed = views + len(recorder.views["view"]), overflowed + recorder.overflowed
+        done += size
+        tell(Collected(done, worlds, views, overflowed))
 
 
 def whole_shards(worlds: int, size: int) -> int:
@@ -326,19 +332,36 @@ def _drives(
     return policy_drives(world, tasks, Policy(config.driver), job.estimator, settings, key), len(tasks)
 
 
+def overflow_in_words(collected: Collected, config: CollectConfig) -> str:
+    """What is said where views had more subgoals than are recorded; empty where none had."""
+    if not collected.overflowed:
+        return ""
+    most = config.frontiers.max_subgoals
+    return (
+        f"{collected.overflowed} of the {collected.views} views that were recorded now have more than {most} subgoals: "
+        f"the nearest {most} of each are asked about (--set frontiers.max_subgoals={2 * most} records more, into an "
+        "empty folder)"
+    )
+
+
 def summary(samples: Samples) -> str:
     """Size and balance of a dataset, in words."""
-    holds = samples.success > 0
+    # The mean and not the share of successes: with ``posterior`` a label is a share itself.
+    success = samples.success
     views = len(samples.images)
-    if not len(holds):
+    if not len(success):
         return f"{views} views, no samples"
     lines = [
-        f"{views} views, {len(holds)} samples ({len(holds) / views:.1f} a view), {holds.mean():.1%} successes",
+        f"{views} views, {len(success)} samples ({len(success) / views:.1f} a view), {_mean(success)}",
         f"images: {np.mean([len(image) for image in samples.images]) / 1024:.1f} KiB each",
     ]
     # A proposition that is hardly ever asked for, or never found, will not be learned.
     for index, name in enumerate(samples.metadata.propositions):
         asked = samples.phi_go[:, index] > 0
-        found = f", {holds[asked].mean():.1%} of them successes" if asked.any() else ""
+        found = f", {_mean(success[asked])} there" if asked.any() else ""
         lines.append(f"{name}: asked for in {asked.mean():.1%} of samples{found}")
     return "\n".join(lines)
+
+
+def _mean(success: Float32[np.ndarray, "N"]) -> str:
+    return f"mean P_S {np.mean(success, dtype=np.float64):.3f}"

@@ -22,11 +22,13 @@ from typing import Any
 from potlp_jax.checks import POSITIVE, require_fields
 from potlp_jax.codec import read_settings, settings_file, with_settings
 from potlp_jax.engine.opening import open_engine
+from potlp_jax.environments.base import Generator
 from potlp_jax.environments.registry import make
-from potlp_jax.environments.splits import Split
+from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.errors import ConfigurationError
 from potlp_jax.learning.dataset import Samples
 from potlp_jax.learning.dataset_reading import joined, read_dataset
+from potlp_jax.learning.domain import unit_of
 from potlp_jax.learning.training import Trained
 from potlp_jax.planning.policies import Policy
 from potlp_jax.recipes.collection import CollectConfig, Collected, collect, collection_of, whole_shards
@@ -167,6 +169,12 @@ def read_recipe(given: str | Path) -> Recipe:
 
 def _require_alike(recipe: Recipe, where: str) -> None:
     """Before anything is collected: data sets that differ in this cannot be joined."""
+    named = Counter(chosen.environment for chosen in recipe.beside)
+    # Of each there is one folder in a stage.
+    if twice := [environment for environment, count in named.items() if count > 1]:
+        raise ConfigurationError(
+            f"{where}: {twice[0]} stands beside {recipe.environment} twice: give one share for both"
+        )
     own = make(recipe.environment)
     for chosen in recipe.beside:
         other = make(chosen.environment)
@@ -176,6 +184,17 @@ def _require_alike(recipe: Recipe, where: str) -> None:
                 f"{where}: {chosen.environment} cannot stand beside {recipe.environment}: its worlds are of "
                 f"{its[0]} with {', '.join(its[1])}, and not of {mine[0]} with {', '.join(mine[1])}"
             )
+        mine, its = _resolution(own), _resolution(other)
+        if mine != its:
+            raise ConfigurationError(
+                f"{where}: {chosen.environment} cannot stand beside {recipe.environment}: its cells measure {its:g} "
+                f"{unit_of(its)}, and not {mine:g} {unit_of(mine)}"
+            )
+
+
+def _resolution(generator: Generator) -> float:
+    """The side of a cell, which all worlds of a family share, as data sets have it."""
+    return float(generator.generate(world_key(Split.TRAINING, 0, generator.name)).resolution)
 
 
 def recipe_for(environment: str) -> Recipe:
@@ -260,6 +279,7 @@ class _Parts:
 
     def __init__(self, recipe: Recipe) -> None:
         self._recipe = recipe
+        self._usual_sensor = collection_of(make(recipe.environment)).explorer.sensor
         self._taken: Counter[tuple[str, Split]] = Counter()
 
     def of_own(self, name: str, split: Split, worlds: int, config: CollectConfig) -> _Part:
@@ -269,10 +289,12 @@ class _Parts:
     def of_others(self, name: str, worlds: int, config: CollectConfig) -> Iterator[_Part]:
         """Training worlds of the families beside it, where there are so many of its own."""
         for chosen in self._recipe.beside:
-            # Subgoals as the trials of the family have them.
-            frontiers = collection_of(make(chosen.environment)).frontiers
-            explorer = dataclasses.replace(config.explorer, frontiers=frontiers)
-            own = dataclasses.replace(config, frontiers=frontiers, explorer=explorer)
+            # Subgoals and the sensor as the trials of the family have them; a sensor that the recipe names is for all.
+            usual = collection_of(make(chosen.environment))
+            named = config.explorer.sensor != self._usual_sensor
+            sensor = config.explorer.sensor if named else usual.explorer.sensor
+            explorer = dataclasses.replace(config.explorer, frontiers=usual.frontiers, sensor=sensor)
+            own = dataclasses.replace(config, frontiers=usual.frontiers, explorer=explorer)
             count = chosen.worlds(worlds, config.worlds_per_shard)
             yield self._part(f"{name}-{chosen.environment}", chosen.environment, Split.TRAINING, count, own)
 
