@@ -1,13 +1,15 @@
 """Checks of configurations: one form of rule and of message wherever several fields are checked alike."""
 
+import dataclasses
 import math
 import numbers
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 
-@dataclass(frozen=True)
+
+@dataclasses.dataclass(frozen=True)
 class Kind:
     """What values of a kind fulfil, and how a message asks for one."""
 
@@ -27,13 +29,18 @@ def is_whole(value: object) -> bool:
     return isinstance(value, numbers.Integral) and not isinstance(value, bool)
 
 
+def is_number(value: object) -> bool:
+    """Whether it is one number of whatever type, NumPy's too; True and False are none, nor is an array."""
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)
+
+
 COUNT: Kind = Kind(lambda value: is_whole(value) and value >= 1, "a whole number of at least 1")
+WHOLE: Kind = Kind(lambda value: is_whole(value) and value >= 0, "a whole number from 0")
 AT_LEAST_ONE: Kind = Kind(lambda value: value >= 1, "at least 1")
-POSITIVE: Kind = Kind(lambda value: math.isfinite(value) and value > 0, "a positive number")
-FINITE: Kind = Kind(math.isfinite, "a finite number")
-NOT_NEGATIVE: Kind = Kind(lambda value: math.isfinite(value) and value >= 0, "a number from 0")
-LIMIT: Kind = Kind(lambda value: value > 0, "a positive number, or infinity for none")
-SHARE: Kind = Kind(lambda value: 0 <= value <= 1, "a number from 0 to 1")
+POSITIVE: Kind = Kind(lambda value: is_number(value) and 0 < value < math.inf, "a positive number")
+FINITE: Kind = Kind(lambda value: is_number(value) and math.isfinite(value), "a finite number")
+NOT_NEGATIVE: Kind = Kind(lambda value: is_number(value) and 0 <= value < math.inf, "a number from 0")
+SHARE: Kind = Kind(lambda value: is_number(value) and 0 <= value <= 1, "a number from 0 to 1")
 
 
 def require_fields(config: object, names: Iterable[str], kind: Kind, error: type[Exception]) -> None:
@@ -44,17 +51,24 @@ def require_fields(config: object, names: Iterable[str], kind: Kind, error: type
             raise error(f"{name} is {value}; give {kind.wanted}")
 
 
-def as_python_numbers(config: object, names: Iterable[str]) -> None:
-    """Make whole numbers of other types Python's, in a frozen dataclass: records of settings hold no others.
+def as_python_numbers(config: Any) -> None:
+    """Make numbers of other types Python's in all fields of a frozen dataclass: records of settings hold no others.
 
     Args:
-        config: which is being made.
-        names: fields; what is no whole number stays as it is.
+        config: which is being made. What is no number, and no tuple of them, stays as it is.
     """
-    for name in names:
-        value = getattr(config, name)
-        if is_whole(value):
-            object.__setattr__(config, name, int(value))
+    for field in dataclasses.fields(config):
+        object.__setattr__(config, field.name, _as_python(getattr(config, field.name)))
+
+
+def _as_python(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(map(_as_python, value))
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if is_whole(value):
+        return int(value)
+    return float(value) if is_number(value) else value
 
 
 def require_rules(rules: Iterable[tuple[bool, str]], what: str, error: type[Exception]) -> None:

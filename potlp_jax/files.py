@@ -7,11 +7,14 @@ the reader's own kind of `PotlpError`. What they see to:
 - only regular files are opened: a FIFO would wait for ever, and /dev/zero has no end;
 - sizes are checked before anything is read, unpacked or decoded, against limits that the message names;
 - whatever a parser raises on damaged input, an error of recursion or memory included, becomes one line.
+
+One writer is here, too (`write_whole`): what takes hours to make again is never left half written.
 """
 
 import contextlib
 import io
 import json
+import os
 import re
 import stat
 import xml.etree.ElementTree as ElementTree
@@ -319,6 +322,34 @@ def _array(contents: bytes) -> np.ndarray:
         raise ValueError(f"an array of shape {shape} and type {dtype} does not have {found} bytes")
     array = np.frombuffer(contents, dtype, count, stream.tell())
     return array.reshape(shape, order="F" if fortran else "C")
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text in UTF-8 under a temporary name in the same folder, and rename it: a reader finds all of it or none.
+
+    Args:
+        path: of the file; what is there already is replaced at the end, or stays as it is.
+        text: what it is to hold.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    # A link stays one. A pipe or /dev/stdout is written to: a rename would put a file in its place.
+    path = path.resolve()
+    if path.exists() and not path.is_file():
+        path.write_text(text, "utf-8")
+        return
+    # With the process's number: two that write the same file do not write into one.
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            # Before the rename: otherwise a power cut could leave the name without the contents.
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def require_mapping(path: Path | str, value: Any, error: type[PotlpError], what: str) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from potlp_jax.cli import app
 from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.splits import Split
+from potlp_jax.environments.toy import Toy
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.situation import DecisionConfig
@@ -25,7 +26,15 @@ from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
 from potlp_jax.trials.record import NEVER_SEEN, Outcome
 from potlp_jax.trials.run import run
-from potlp_jax.verify.audit import path_cost, problems_of, problems_of_ending, problems_of_path
+from potlp_jax.verify.audit import (
+    formula_of,
+    path_cost,
+    problems_of,
+    problems_of_ending,
+    problems_of_path,
+    task_of_record,
+)
+from potlp_jax.verify.semantics import has_language_of
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import make_world, world_digest
 from potlp_jax.world.sensing import SensorConfig
@@ -425,7 +434,11 @@ State: 1 {0}
 """Reach the goal, as an automaton."""
 
 
-@pytest.mark.parametrize("name", ["", 'name: "deliver the mail"', 'name: "F goal"'])
+# The last two read as formulas, and as the number of a task: of another language than the automaton's.
+NAMES = ["", 'name: "deliver the mail"', 'name: "goal"', 'name: "1"']
+
+
+@pytest.mark.parametrize("name", [*NAMES, 'name: "F goal"'])
 def test_a_sweep_of_an_automaton_is_audited_whatever_becomes_of_its_file(tmp_path, monkeypatch, name):
     file, out = tmp_path / "tasks" / "mail.hoa", tmp_path / "out"
     file.parent.mkdir()
@@ -466,7 +479,7 @@ def test_a_sweep_does_not_go_on_with_another_automaton(tmp_path):
     assert "automata" in refused.output
 
 
-@pytest.mark.parametrize("name", ["", 'name: "deliver the mail"'])
+@pytest.mark.parametrize("name", NAMES)
 def test_a_trial_of_an_automaton_without_a_formula_is_audited(tmp_path, name):
     file = tmp_path / "mail.hoa"
     file.write_text(MAIL.replace("NAMED\n", f"{name}\n" if name else ""))
@@ -474,6 +487,60 @@ def test_a_trial_of_an_automaton_without_a_formula_is_audited(tmp_path, name):
     assert _command(trial, tmp_path)[0] == 0
     code, said = _command(dataclasses.replace(trial, outcome=Outcome.STUCK), tmp_path)
     assert (code, "is not what the word says" in said) == (1, True)
+
+
+def test_a_formula_is_what_a_record_is_for_if_its_automaton_is_that_of_the_formula(trial):
+    other = trial.task_hoa.replace(FORMULA, "F c")
+    assert formula_of(task_of_record(trial, WORLD.propositions)) == FORMULA
+    assert formula_of(task_of_record(dataclasses.replace(trial, task_text="F c"), WORLD.propositions)) == FORMULA
+    misnamed = dataclasses.replace(trial, task_text="F c", task_hoa=other)
+    assert formula_of(task_of_record(misnamed, WORLD.propositions)) is None
+
+
+def test_a_wrong_translation_is_judged_by_the_formula(trial, monkeypatch):
+    """It comes out the same once more: the record's automaton is no evidence for it."""
+    hoa = WORLD.task("F c").to_hoa().replace("F c", FORMULA)
+    wrong = dataclasses.replace(Task.from_hoa(hoa, WORLD.propositions), structure=TASK.structure)
+    monkeypatch.setattr(Task, "from_formula", lambda *_: wrong)
+    asked = task_of_record(dataclasses.replace(trial, task_hoa=hoa), WORLD.propositions)
+    assert asked is wrong
+    assert formula_of(asked) == FORMULA
+
+
+FIRE = ("Fire", "Goal", "Gate")
+
+
+@pytest.mark.parametrize("formula", ["!Fire U Goal", "F Gate & F(Goal)", "F(Fire) & XX Goal"])
+def test_names_that_begin_as_operators_do_are_names_to_the_auditor_too(formula):
+    task = Task.from_formula(formula, FIRE)
+    read = (task.text, FIRE, task.dfa.transitions, task.dfa.accepting, task.dfa.initial)
+    assert has_language_of(*read)
+    assert not has_language_of("F Fire", *read[1:])
+
+
+def test_where_both_readings_are_possible_the_operators_count():
+    both = ("Fire", "ire")
+    task = Task.from_formula("!ire U Fire", both)
+    assert has_language_of(task.text, both, task.dfa.transitions, task.dfa.accepting, task.dfa.initial)
+
+
+class Fires(Toy):
+    name = "fires"
+    propositions = ("Goal", "Fire")
+
+    def draw(self, key):
+        world = Toy().generate(key)
+        return dataclasses.replace(world, propositions=self.propositions)
+
+
+def test_a_sweep_over_such_names_is_audited(tmp_path):
+    environment = "tests.test_audit:Fires"
+    tasks = ["!Fire U Goal"]
+    data = {"environments": [environment], "tasks": tasks, "policies": ["baseline"], "worlds": 1}
+    run_sweep(specification_from_dict(data, "here"), tmp_path, 1)
+    result = CliRunner().invoke(app, ["audit", str(tmp_path), "--json"])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["problems"] == []
 
 
 def test_a_shipped_task_is_its_formula():

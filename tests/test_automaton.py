@@ -17,6 +17,7 @@ from potlp_jax.errors import TaskError, TaskWarning, UnsatisfiableError
 from potlp_jax.task.automaton import Dfa, canonical_dfa, translate
 from potlp_jax.task.formula import parse_formula
 from potlp_jax.task.hoa import read_hoa, write_hoa
+from potlp_jax.task.reading import read_task
 from potlp_jax.task.task import Task
 from potlp_jax.verify.semantics import satisfies_lasso, word_satisfies, word_violates
 
@@ -300,6 +301,17 @@ def test_hoa_labels_aliases_comments_and_headers():
     assert Task.from_hoa(task.to_hoa()).text == automaton.name
 
 
+def test_hoa_aliases_may_stand_before_the_propositions():
+    text = EVENTUALLY_A.replace("[0] 1", "[@x & @all] 1").replace("[!0] 0", "[!@x] 0")
+    early = text.replace("Start:", "Alias: @x 0 Alias: @all @x | t\nStart:")
+    assert read_hoa(early).transitions.tolist() == read_hoa(EVENTUALLY_A).transitions.tolist()
+
+
+def test_hoa_may_begin_with_a_byte_order_mark(tmp_path):
+    (tmp_path / "task.hoa").write_text(EVENTUALLY_A, "utf-8-sig")
+    assert read_task(str(tmp_path / "task.hoa")).dfa.num_states == 2
+
+
 def test_hoa_acceptance_true_and_false():
     body = "--BODY--\nState: 0\n[t] 0\n--END--"
     assert read_hoa(f"HOA: v1\nStart: 0\nAcceptance: 0 t\n{body}").accepting.tolist() == [True]
@@ -318,6 +330,14 @@ def test_hoa_acceptance_true_and_false():
         ("Acceptance: 1 Inf(0)\n", "", 6, "no 'Acceptance:'"),
         ("Acceptance: 1 Inf(0)", "Acceptance: 2 Inf(0)&Inf(1)", 6, "must be Büchi"),
         ("Acceptance: 1 Inf(0)", "Acceptance: 1 Fin(0)", 6, "must be Büchi"),
+        ("Acceptance: 1 Inf(0)", "Acceptance: 1 Inf(0)\nAcceptance: 0 t", 7, "a second 'Acceptance:' header"),
+        ("States: 2", "States: 2\nStates: 1", 3, "a second 'States:' header"),
+        ("AP:", "AP: 0\nAP:", 5, "a second 'AP:' header"),
+        ("AP:", 'name: "a"\nname: "b"\nAP:', 5, "a second 'name:' header"),
+        ("AP:", "Alias: @x 0\nAlias: @x !0\nAP:", 5, "a second alias @x"),
+        ("AP:", "Alias: @x @y\nAlias: @y 0\nAP:", 4, "@y is not a label"),
+        ("AP:", "Alias: @x 0 1\nAP:", 4, "expected a header or --BODY--, found 1"),
+        ("AP:", "Alias: x 0\nAP:", 4, "expected an alias such as @a, found x"),
         ('AP: 2 "a" "b"', 'AP: 3 "a" "b"', 4, "announces 3"),
         ('AP: 2 "a" "b"', 'AP: 2 "a" "a"', 4, "announces 2"),
         ('AP: 2 "a" "b"', "AP: 17" + "".join(f' "p{i}"' for i in range(17)), 4, "too many"),

@@ -21,6 +21,7 @@ from potlp_jax.bench.problems import family_problem
 from potlp_jax.bench.timing import Timing, compile_call, environment, measure, timed_runs
 from potlp_jax.cache import LOG_LEVEL, SWITCH, cache_folder, enable_compilation_cache, machine_fingerprint
 from potlp_jax.cli import app
+from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.environments.toy import Toy
 from potlp_jax.learning.estimator import TrainedEstimator
@@ -30,6 +31,7 @@ from potlp_jax.planning.search.api import search_tree
 from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.task.task import Task
+from potlp_jax.trials.config import TrialConfig, trial_config_for
 from potlp_jax.world.frontiers import FrontierConfig
 from tests.reference.domains import domain_of
 
@@ -144,7 +146,7 @@ def test_phases_of_perception_and_decision(scene):
         params=params, config=config, domain=domain_of("rooms"), metadata={}, name="tiny", digest=""
     )
     decision = DecisionConfig(frontiers=FrontierConfig(max_subgoals=2), search=QUICK)
-    rows = measure_perception(scene, trained, decision, repeats=1)
+    rows = measure_perception(scene, trained, TrialConfig(decision=decision), repeats=1)
     phases = [row.phase for row in rows]
     assert phases[:3] == ["render", "encode", "remember"]
     # What `measure_decision` measures, whatever the estimator.
@@ -164,6 +166,27 @@ def test_perception_needs_an_estimator():
     told = _potlp("bench", "--parts", "perception", "--environment", "toy", "--repeats", 1)
     assert told.exit_code == 2
     assert "no estimator is shipped" in told.stderr
+
+
+def test_decisions_are_measured_with_the_settings_of_the_worlds(monkeypatch):
+    asked = []
+
+    def make_scene(world, task, sensor):
+        asked.append(sensor)
+
+    def measure_decision(scene, decision, repeats):
+        asked.append(decision)
+        return []
+
+    monkeypatch.setattr("potlp_jax.bench.planner.make_scene", make_scene)
+    monkeypatch.setattr("potlp_jax.bench.planner.measure_decision", measure_decision)
+    monkeypatch.setattr("potlp_jax.cli.bench._print", lambda rows, where: None)
+    told = _potlp("bench", "--parts", "decision", "--environment", "delivery", "--simulations", 12)
+    assert told.exit_code == 0, told.output
+    config = trial_config_for(make("delivery"))
+    assert config.decision.frontiers.max_subgoals == 64
+    search = dataclasses.replace(config.decision.search, simulations=12)
+    assert asked == [config.sensor, dataclasses.replace(config.decision, search=search)]
 
 
 def test_environment_says_where_it_was_measured():
@@ -196,6 +219,7 @@ def test_bench_prints_json(problem):
         (("bench", "--family", "none"), "three-single"),
         (("export", "F a", "--height", "5", "--out", "out"), "--width"),
         (("export", "F a", "--batch", "some", "--out", "out"), "some"),
+        (("export", "F a", "--batch", "²", "--out", "out"), "--batch '²': give a number"),
         (("export", "F a", "--platforms", "abacus", "--out", "out"), "abacus"),
     ],
 )

@@ -1,5 +1,6 @@
 """What a caller's own program may ask of the planner: sharding with its checks on, and keys used once."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,9 +13,12 @@ from jax.sharding import Mesh, PartitionSpec
 
 import potlp_jax
 from potlp_jax import BestFirstConfig, DecisionConfig, FrontierConfig, SensorConfig, Start, UctConfig
+from potlp_jax.errors import TaskError, WorldError
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
+from potlp_jax.rl.episodes import TaskEnv
 from potlp_jax.trials.config import TrialConfig
+from potlp_jax.verify.semantics import satisfies_lasso
 from tests.reference.domains import domain_of
 from tests.reference.toy_plan import TASK, C, S, plan
 
@@ -148,6 +152,106 @@ def test_what_has_another_type_is_refused_by_name():
     )
     for line, said in zip(told.splitlines(), expected, strict=True):
         assert said in line
+
+
+SETTINGS_OF_ANOTHER_TYPE = """
+from potlp_jax import DecisionConfig, SensorConfig
+from potlp_jax.trials.config import TrialConfig
+from potlp_jax.world.camera import CameraConfig, Disturbance
+for make in (
+    lambda: TrialConfig(panoramas=2.5),
+    lambda: TrialConfig(panoramas=True),
+    lambda: TrialConfig(look_every=1.5),
+    lambda: TrialConfig(replan_distance=True),
+    lambda: DecisionConfig(commitment=True),
+    lambda: SensorConfig(range_cells=True),
+    lambda: CameraConfig(height=96.5),
+    lambda: CameraConfig(ceiling_colour=(1.5, 2, 3)),
+    lambda: Disturbance(noise="x"),
+):
+    try:
+        print("no error", make())
+    except ValueError as error:
+        print(error)
+"""
+
+
+def test_settings_of_trials_of_another_type_are_refused_by_name():
+    command = [sys.executable, "-c", SETTINGS_OF_ANOTHER_TYPE]
+    told = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    expected = (
+        "panoramas is 2.5; give a whole number of at least 1",
+        "panoramas is True; give a whole number of at least 1",
+        "look_every is 1.5; give a whole number from 0",
+        "replan_distance is True; give a number from 0",
+        "commitment is True; give a number from 0",
+        "range_cells must be a finite number of cells, 0 or more, found True",
+        "height must be at least 1, width at least 4, both whole numbers",
+        "a colour is three whole numbers of 0 to 255",
+        "noise, exposure and colour must be finite numbers",
+    )
+    for line, said in zip(told.splitlines(), expected, strict=True):
+        assert said in line
+
+
+NUMPYS = """
+import sys
+from dataclasses import asdict
+from pathlib import Path
+import numpy as np
+from potlp_jax import BestFirstConfig, DecisionConfig, FrontierConfig, SensorConfig, UctConfig, run
+from potlp_jax.codec import config_from_dict
+from potlp_jax.trials.config import TrialConfig
+from potlp_jax.trials.record import load_trial
+from potlp_jax.world.camera import CameraConfig, Disturbance
+half, two = np.float32(0.5), np.int64(2)
+for search in (BestFirstConfig(simulations=two, optimism=half), UctConfig(simulations=two, exploration=half)):
+    config = TrialConfig(
+        decision=DecisionConfig(
+            frontiers=FrontierConfig(min_size=two),
+            search=search,
+            dead_end_factor=half,
+            commitment=half,
+            least_chance=half,
+            irrevocable_last=np.bool_(True),
+        ),
+        sensor=SensorConfig(range_cells=np.float64(9)),
+        camera=CameraConfig(height=np.int32(8), ambient=half, ceiling_colour=(np.uint8(1), np.uint8(2), np.uint8(3))),
+        disturbance=Disturbance(noise=half),
+        panoramas=two,
+        look_every=two,
+        replan_distance=half,
+        budget_factor=np.float32(20),
+        revealed=np.bool_(False),
+    )
+    trial = run("toy", 1, "baseline", config=config)
+    trial.save(Path(sys.argv[1]))
+    assert config_from_dict(TrialConfig, load_trial(Path(sys.argv[1])).config, "record") == config
+"""
+
+
+def test_a_trial_with_numbers_of_numpys_as_settings_can_be_saved(tmp_path):
+    command = [sys.executable, "-c", NUMPYS, str(tmp_path / "trial.json")]
+    run = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert run.returncode == 0, run.stderr
+
+
+# What the documentation says is raised.
+
+
+@pytest.mark.parametrize(
+    ("asked", "error", "said"),
+    [
+        (lambda: potlp_jax.run("toy", world=-1), WorldError, "the index of a world must lie in 0.."),
+        (lambda: potlp_jax.run("toy", split="tset"), WorldError, "'tset'; choose from: calibration, training, valid"),
+        (lambda: TOY.world(0, "tset"), WorldError, "unknown split 'tset'; choose from"),
+        (lambda: satisfies_lasso("F b", ("a",), (), (1,)), TaskError, "b is not among the propositions ('a',)"),
+        (lambda: TaskEnv([], TOY.task(1)), WorldError, "there is no world"),
+    ],
+)
+def test_what_cannot_be_done_is_the_error_that_is_documented(asked, error, said):
+    with pytest.raises(error, match=re.escape(said)):
+        asked()
 
 
 OF_ANOTHER_SHAPE = """

@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 from potlp_jax.cli import app, completion
 from potlp_jax.cli.output import clear_errors
+from potlp_jax.cli.run import _why_infeasible
 from potlp_jax.environments.families import FAMILIES, NAMED
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
@@ -27,6 +28,7 @@ from potlp_jax.errors import PotlpError, PotlpWarning, WorldError
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
 from potlp_jax.task.task import Task
+from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import Outcome, load_trial
 from potlp_jax.trials.run import run
 from tests.reference.command_line import all_commands
@@ -199,6 +201,9 @@ def test_max_positive_literals_reaches_the_task():
         (("compare", "toy", "--policies", "oracle,clever"), "clever"),
         (("run", "toy", "--policy", "potlp"), "no estimator is shipped for the propositions goal"),
         (("run", "firefighting", "--estimator", "nowhere.npz"), "nowhere.npz"),
+        (("run", "toy", "--no-animation"), "--no-animation needs --out"),
+        (("explain", "trial.json:0", "--depth", "3"), "--depth needs --out"),
+        (("explain", "trial.json:0", "--estimator", "firefighting"), "--estimator needs --out"),
         (("explain", "nothing"), "FOLDER:INDEX"),
         (("explain", "nowhere/trial.json:0"), "nowhere/trial.json"),
     ],
@@ -390,6 +395,28 @@ def test_an_infeasible_trial_says_whether_the_world_is_at_fault(monkeypatch):
     result = _potlp("run", "toy", "-t", "2", "--policy", "baseline", "--world", "1")
     assert result.exit_code == 1
     assert "with the whole map it is impossible too: try --world 3" in result.stderr
+
+
+def test_a_world_whose_known_path_is_longer_than_the_budget_is_not_at_fault():
+    """As in a sweep, which counts it as possible."""
+    short = TrialConfig(budget_factor=0.1)
+    said = _why_infeasible(Toy(), Split.VALIDATION, Toy().task(2), short, world=1)
+    assert said.startswith("with the whole map the task is possible in this world")
+
+
+def test_where_no_further_world_can_be_made_the_result_stands(monkeypatch):
+    def draw(self, key):
+        if not (key == world_key("validation", 1, "toy")).all():
+            raise WorldError("there is one world")
+        world = plain(self, key)
+        return world.replace(letters=world.letters * 0)
+
+    plain = Toy.draw
+    monkeypatch.setattr(Toy, "draw", draw)
+    result = _potlp("run", "toy", "-t", "2", "--policy", "baseline", "--world", "1")
+    assert (result.exit_code, "infeasible" in result.stdout) == (1, True)
+    assert "with the whole map it is impossible too: check the task" in result.stderr
+    assert "there is one world" not in result.stderr
 
 
 def test_a_task_that_no_world_allows_is_to_be_checked(monkeypatch):

@@ -125,6 +125,15 @@ def test_decisions_along_a_bag_are_those_of_the_simulator(trial, tmp_path, kind)
     assert views == Views()
 
 
+def test_no_budget_ends_a_log(bags):
+    drive = drive_of(bags / name_of(FORMATS[0]), places_of(bags))
+    short = dataclasses.replace(NEAR, budget_factor=0.01)
+    found, expected = (replay(drive, TASK, Policy.BASELINE, jax.random.key(0), each)[0] for each in (short, NEAR))
+    assert (found.path, found.decisions) == (expected.path, expected.decisions)
+    assert found.config["budget_factor"] == 0.01
+    assert found.outcome is expected.outcome is not Outcome.BUDGET
+
+
 @pytest.mark.parametrize("kind", FORMATS)
 def test_a_dataset_from_a_bag_has_the_rows_of_the_simulator(bags, tmp_path, kind):
     settings = {"spacing": (2.0, 6.0), "tasks_per_world": 2, "image_format": "png"}

@@ -129,6 +129,37 @@ def test_without_a_compiler_the_twin_runs_and_the_status_says_why(kernels, monke
     assert "no C++ compiler" in libraries._loaded("scale").reason
 
 
+@pytest.mark.parametrize("named", ["wrapper {compiler}", "'{folder}/my tools/c++'", "{folder}/my tools/c++"])
+def test_the_compiler_that_is_named_may_have_words_behind_it(named, compiler, tmp_path, monkeypatch):
+    monkeypatch.delenv("CXX", raising=False)
+    (path,) = build.find_compiler().command
+    (tmp_path / "my tools").mkdir()
+    for program, text in (("wrapper", 'exec "$@"'), ("my tools/c++", f'exec {path} "$@"')):
+        (tmp_path / program).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / program).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("CXX", named.format(compiler=path, folder=tmp_path))
+    found = build.find_compiler()
+    assert found.command[0].startswith(str(tmp_path))
+    assert found.command[1:] == ((path,) if named.startswith("wrapper") else ())
+
+
+@pytest.mark.parametrize("named", ["nowhere++", "nowhere -m32", "'c++"])
+def test_a_compiler_that_is_named_and_not_there_is_said(named, kernels, monkeypatch):
+    monkeypatch.setenv("CXX", named)
+    with pytest.warns(UserWarning, match=r"scale: the native kernel cannot be used here.*CXX is"):
+        np.testing.assert_array_equal(_scale(jnp.ones(2, jnp.float32)), [3, 3])
+
+
+def test_with_a_wrapped_compiler_kernels_are_built(kernels, compiler, tmp_path, monkeypatch):
+    monkeypatch.delenv("CXX", raising=False)
+    (path,) = build.find_compiler().command
+    (tmp_path / "wrapper").write_text('#!/bin/sh\nexec "$@"\n')
+    (tmp_path / "wrapper").chmod(0o755)
+    monkeypatch.setenv("CXX", f"{tmp_path / 'wrapper'} {path}")
+    np.testing.assert_array_equal(_scale(jnp.ones(2, jnp.float32)), [2, 2])
+
+
 def test_what_does_not_compile_leaves_the_twin_and_no_file_and_is_said(kernels, compiler):
     (kernels / "scale.cc").write_text("not C++")
     with pytest.warns(UserWarning, match=r"scale: the native kernel cannot be used here.*slower"):

@@ -5,17 +5,20 @@ import functools
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from potlp_jax.cli import app
 from potlp_jax.environments.toy import Toy, ToyConfig
+from potlp_jax.errors import TaskError
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
 from potlp_jax.planning.situation import DecisionConfig
+from potlp_jax.rl.episodes import OUTCOME_NAMES, TaskEnv
 from potlp_jax.task.task import Task, TaskSizes
 from potlp_jax.trials.batch import Start, run_batch
 from potlp_jax.trials.config import TrialConfig
@@ -99,6 +102,20 @@ def test_a_batch_beside_a_task_that_has_classes():
         for trial in run_batch(starts, Policy.POTLP, BEST_FIRST, slots=3, estimator=NETWORK)
     }
     assert found == {**FORMULAS, "F goal": Outcome.SATISFIED}
+
+
+def test_an_episode_is_the_baselines_trial():
+    task = TASKS["X X goal"]
+    env = TaskEnv([WORLD], task, BEST_FIRST)
+    state, step = env.reset_in(WORLD)
+    mask = np.asarray(step.observation.action_mask)
+    # The one edge of the arrays is padding.
+    assert (env.num_actions, mask.tolist()) == (4 + 2, [False] * 4 + [True, True])
+    _, last = env.step(state, jnp.int32(env.num_actions - 1))
+    assert OUTCOME_NAMES[int(last.extras["outcome"])] == Outcome.SATISFIED
+    assert float(last.reward) == -run_trial(WORLD, task, Policy.BASELINE, jax.random.key(0), BEST_FIRST).cost
+    with pytest.raises(TaskError, match="there is nothing to do for 'true': every word satisfies it"):
+        TaskEnv([WORLD], WORLD.task("true"), BEST_FIRST)
 
 
 def test_its_record_is_read_searched_again_and_shown(tmp_path):

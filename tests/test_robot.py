@@ -7,15 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
+from typer.testing import CliRunner
 
 import potlp_jax
-from potlp_jax.errors import RobotError
+from potlp_jax.cli import app
+from potlp_jax.errors import RecordError, RobotError
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import BrokenDriveError
 from potlp_jax.trials.record import BeliefMap, load_trial
-from potlp_jax.trials.replay import views_of
+from potlp_jax.trials.replay import replay_decision, views_of
 from potlp_jax.trials.robot import GrowingRobot, Leg, SimulatedRobot
 from potlp_jax.trials.setbacks import SetbackConfig
 from potlp_jax.view.decisions import describe_decision
@@ -548,6 +550,22 @@ def test_the_record_says_which_estimator_was_asked_also_where_the_map_is_known()
     )
     assert "TrueMapEstimator" in asked.versions["estimator"]
     assert "estimator" not in not_asked.versions
+
+
+def test_what_the_oracle_asked_is_not_in_the_record_of_a_robots_drive(tmp_path):
+    """The record's world is the last map: its answers would be others, and the search another."""
+    letters = np.where(FLOOR == "f", 1, np.where(FLOOR == "e", 2, 0))
+    world = make_world(FLOOR == "#", letters, (1, 1), propositions=PROPOSITIONS)
+    config = TrialConfig()
+    trial = potlp_jax.run_robot(SimulatedRobot(world, config), TASK, "oracle", KEY, config, world=world)
+    said = "the oracle asked the true map, which is not in the record of a robot's drive"
+    with pytest.raises(RecordError, match=said):
+        replay_decision(trial, 0)
+    trial.save(tmp_path / "trial.json")
+    drawn = CliRunner().invoke(app, ["explain", f"{tmp_path}:0", "--out", str(tmp_path / "tree.png")])
+    assert (drawn.exit_code, " ".join(drawn.stderr.split())) == (2, f"potlp: {said}")
+    assert CliRunner().invoke(app, ["explain", f"{tmp_path}:0"]).exit_code == 0
+    assert CliRunner().invoke(app, ["view", str(tmp_path), "--no-open"]).exit_code == 0
 
 
 def test_a_late_leg_is_noted():

@@ -104,7 +104,14 @@ def test_settings_of_decisions_that_make_no_sense_are_named(name, value):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("budget_factor", 0.0), ("budget_factor", float("nan")), ("replan_distance", -1.0), ("panoramas", 0)],
+    [
+        ("budget_factor", 0.0),
+        ("budget_factor", float("nan")),
+        ("budget_factor", float("inf")),
+        ("replan_distance", -1.0),
+        ("panoramas", 0),
+        ("look_every", -1),
+    ],
 )
 def test_settings_of_trials_that_make_no_sense_are_named(name, value):
     with pytest.raises(ValueError, match=f"{name} is "):

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import os
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,6 +15,7 @@ from eval.formulas import random_tasks
 from potlp_jax.codec import config_from_dict
 from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.environments.toy import Toy
 from potlp_jax.errors import PluginError, RecordError
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.labels import TrueMapEstimator
@@ -34,6 +37,7 @@ from potlp_jax.trials.robot import Leg, SimulatedRobot
 from potlp_jax.trials.setbacks import SetbackConfig, Setbacks
 from potlp_jax.types import NO_STATE, Status
 from potlp_jax.verify.audit import problems_of, satisfaction_is_promised
+from potlp_jax.view.decisions import task_of
 from potlp_jax.world.frontiers import FrontierConfig
 from potlp_jax.world.grid import BeliefMap, belief_from_numpy, make_world, pad_world
 from potlp_jax.world.sensing import SensorConfig
@@ -177,6 +181,52 @@ def test_a_decision_is_replayed_from_its_record():
         assert float(plan.q_values[action.index]) == action.q_value
     with pytest.raises(ValueError, match="no decision 9999"):
         replay_decision(trial, 9999)
+
+
+def test_a_decision_is_replayed_with_the_edges_that_were_left_out(tmp_path):
+    world = Toy().world(0)
+    whole, limited = (Task.from_formula("F goal & F hazard", world.propositions, limit) for limit in (None, 1))
+    assert whole.sizes.edges > limited.sizes.edges
+    trial = run_trial(world, limited, Policy.ORACLE, jax.random.key(0))
+    trial.save(tmp_path / "trial.json")
+    read = load_trial(tmp_path / "trial.json")
+    assert read.max_positive_literals == task_of(read).max_positive_literals == 1
+    decision = next(decision for decision in read.decisions if decision.actions)
+    _, plan, _ = replay_decision(read, decision.index)
+    found = np.flatnonzero(np.isfinite(np.asarray(plan.q_values)))
+    recorded = {action.index: action.q_value for action in decision.actions}
+    assert {index: float(plan.q_values[index]) for index in found.tolist()} == recorded
+    # Records from before it was kept.
+    data = json.loads((tmp_path / "trial.json").read_text())
+    del data["max_positive_literals"]
+    (tmp_path / "trial.json").write_text(json.dumps({**data, "checksum": record_checksum(data)}))
+    before = dataclasses.replace(read, max_positive_literals=None)
+    assert load_trial(tmp_path / "trial.json").to_dict() == before.to_dict()
+
+
+def test_a_record_that_cannot_be_written_leaves_the_one_before(tmp_path, monkeypatch):
+    path = tmp_path / "trial.json"
+    trial = _run(ROOMS.generate(world_key(Split.VALIDATION, 0, "rooms")), TASKS[0], Policy.BASELINE, 0)
+    trial.save(path)
+    before = path.read_text()
+
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("os.fsync", full)
+        with pytest.raises(OSError, match="No space left"):
+            dataclasses.replace(trial, notes=("another",)).save(path)
+    assert path.read_text() == before
+    assert list(tmp_path.iterdir()) == [path]
+    # Where there is no file to be replaced it is written to, and a link stays one.
+    trial.save(Path(os.devnull))
+    assert not Path(os.devnull).is_file()
+    link = tmp_path / "link.json"
+    link.symlink_to(path)
+    dataclasses.replace(trial, notes=("another",)).save(link)
+    assert link.is_symlink()
+    assert load_trial(path).notes == ("another",)
 
 
 def test_a_record_names_status_bits(tmp_path):

@@ -8,15 +8,12 @@ from potlp_jax.bench.planner import PhaseRow, Phases, Scene, measure_decision, w
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.observing import with_memory
 from potlp_jax.planning.policies import Policy
-from potlp_jax.planning.situation import DecisionConfig
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.robot import photograph
-from potlp_jax.world.camera import CameraConfig, Disturbance
+from potlp_jax.world.camera import Disturbance
 
 
-def measure_perception(
-    scene: Scene, trained: TrainedEstimator, config: DecisionConfig, repeats: int, camera: CameraConfig = CameraConfig()
-) -> list[PhaseRow]:
+def measure_perception(scene: Scene, trained: TrainedEstimator, config: TrialConfig, repeats: int) -> list[PhaseRow]:
     """The phases of perception, in their order, then those of the decision (``measure_decision``) with what was seen.
 
     * render: the panorama, in the simulator
@@ -27,9 +24,8 @@ def measure_perception(
     Args:
         scene: a scene with the true map's estimator, which holds the world to render.
         trained: the network.
-        config: settings of the decision.
+        config: settings of a trial. Its camera must be the one that the network was trained with.
         repeats: timed runs of each phase.
-        camera: the simulated camera; it must be the one that the network was trained with.
 
     Returns:
         A row for each phase, then those of the decision.
@@ -38,10 +34,10 @@ def measure_perception(
     world, key = world_of(scene), jax.random.key(0)
     phases = Phases(repeats)
     panorama = phases.measure(
-        "render", lambda world, cell: photograph(world, cell, key, camera, Disturbance()), world, scene.cell
+        "render", lambda world, cell: photograph(world, cell, key, config.camera, Disturbance()), world, scene.cell
     )
     # An estimator before its first observation: an empty memory of the right size.
-    blind = trained.start(*world.shape, TrialConfig().panoramas, float(world.resolution))
+    blind = trained.start(*world.shape, config.panoramas, float(world.resolution))
     seen = phases.measure("encode", lambda estimator, image: estimator.encode(image), blind, panorama)
     memory = phases.measure(
         "remember",
@@ -53,4 +49,4 @@ def measure_perception(
     )
     # The same scene with the network instead of the true map: its "estimates" phase is the network's answers.
     seeing = dataclasses.replace(scene, estimator=with_memory(blind, memory))
-    return [*phases.rows, *measure_decision(seeing, config, repeats, Policy.POTLP)]
+    return [*phases.rows, *measure_decision(seeing, config.decision, repeats, Policy.POTLP)]

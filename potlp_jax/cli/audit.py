@@ -1,6 +1,7 @@
 """``potlp audit``: trials judged against worlds that are made anew."""
 
 import itertools
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
@@ -10,6 +11,8 @@ import typer
 from potlp_jax.cli.group import Command, command_app
 from potlp_jax.cli.options import Json
 from potlp_jax.cli.output import FAILED, console, fail, print_json, progress_bar
+
+logger = logging.getLogger(__name__)
 
 app = command_app()
 
@@ -72,9 +75,8 @@ def _trial(path: Path) -> tuple[int, list[tuple[str, str]]]:
     from potlp_jax.cli.inputs import record_file
     from potlp_jax.environments.registry import make
     from potlp_jax.environments.splits import Split
-    from potlp_jax.task.task import Task
     from potlp_jax.trials.record import LOG_PREFIX, ROBOT_PREFIX, load_trial
-    from potlp_jax.verify.audit import problems_of
+    from potlp_jax.verify.audit import formula_of, problems_of, task_of_record
     from potlp_jax.verify.semantics import can_be_judged
 
     file = record_file(path)
@@ -88,8 +90,11 @@ def _trial(path: Path) -> tuple[int, list[tuple[str, str]]]:
     if not environment or split not in list(Split) or trial.world_number is None:
         fail(f"{file}: does not say from which environment, split and number its world is: {trial.environment!r}")
     generator = make(environment)
-    # An automaton without a formula is what it is: the record has the only copy.
-    is_formula = can_be_judged(trial.task_text, generator.propositions)
-    task = generator.task(trial.task_text) if is_formula else Task.from_hoa(trial.task_hoa, generator.propositions)
+    task = task_of_record(trial, generator.propositions)
+    if formula_of(task) is None and can_be_judged(trial.task_text, generator.propositions):
+        logger.warning(
+            f"{file}: the task is called {trial.task_text!r}, and its automaton is not that of this formula: the trial "
+            "is judged by the automaton"
+        )
     problems = problems_of(trial, task, generator.world(trial.world_number, Split(split)))
     return 1, [(str(file), problem) for problem in problems]

@@ -15,7 +15,7 @@ from potlp_jax.cli.output import console, fail, package_version, print_json, pro
 if TYPE_CHECKING:
     from potlp_jax.bench.planner import DistanceRow, PhaseRow, Scene, SearchRow
     from potlp_jax.learning.estimator import TrainedEstimator
-    from potlp_jax.planning.situation import DecisionConfig
+    from potlp_jax.trials.config import TrialConfig
 
 # In the order in which they are measured and shown.
 PARTS = ("search", "distances", "decision", "perception")
@@ -66,12 +66,13 @@ def run_bench(
     from potlp_jax.bench.planner import make_scene, make_world, measure_search
     from potlp_jax.bench.problems import FAMILIES
     from potlp_jax.bench.timing import environment as describe_environment
-    from potlp_jax.cli.inputs import setting_changes, trial_config
+    from potlp_jax.cli.inputs import setting_changes
+    from potlp_jax.codec import with_settings
     from potlp_jax.environments.registry import make
     from potlp_jax.learning.domain import Domain
     from potlp_jax.learning.estimator import estimator_for
     from potlp_jax.planning.search.config import BestFirstConfig
-    from potlp_jax.world.camera import CameraConfig
+    from potlp_jax.trials.config import trial_config_for
 
     chosen = _read_parts(parts)
     # All words are read before anything is measured: measuring takes minutes.
@@ -80,7 +81,6 @@ def run_bench(
         fail(f"unknown family {family!r}; choose from: {', '.join(FAMILIES)}")
     # Before anything starts XLA, which counts the cores once and makes a thread for each.
     _pin(core)
-    decision = trial_config(setting_changes(simulations=simulations)).decision
     # Of the two searches the default is measured; `eval.bench` compares them.
     searching = BestFirstConfig() if simulations is None else BestFirstConfig(simulations=simulations)
     rows: dict[str, list[Any]] = {}
@@ -92,13 +92,15 @@ def run_bench(
             progress.update(bar, description="exploring a world")
             asked = make(environment).task(task)
             made = make_world(environment, size, world)
-            here = Domain.of_world(made, CameraConfig())
+            # A decision takes longer with more subgoals: what is measured is a trial's in such worlds.
+            config = with_settings(trial_config_for(made), setting_changes(simulations=simulations))
+            here = Domain.of_world(made, config.camera)
             # Before the world is explored, so that a missing estimator is reported before anything long.
             trained = estimator_for(asked.propositions, here) if "perception" in chosen else None
-            scene = make_scene(made, asked)
+            scene = make_scene(made, asked, config.sensor)
             progress.update(bar, description="compiling and measuring")
             rows |= _measure_scene(
-                scene, parts=chosen, trained=trained, decision=decision, sources=sources, repeats=repeats
+                scene, parts=chosen, trained=trained, config=config, sources=sources, repeats=repeats
             )
     # Figures mean nothing without the machine: every table and document begins with it.
     where = describe_environment()
@@ -113,7 +115,7 @@ def _measure_scene(
     *,
     parts: list[str],
     trained: "TrainedEstimator | None",
-    decision: "DecisionConfig",
+    config: "TrialConfig",
     sources: int,
     repeats: int,
 ) -> dict[str, list[Any]]:
@@ -124,9 +126,9 @@ def _measure_scene(
     if "distances" in parts:
         rows["distances"] = [measure_distances(scene, sources, repeats)]
     if "decision" in parts:
-        rows["decision"] = measure_decision(scene, decision, repeats)
+        rows["decision"] = measure_decision(scene, config.decision, repeats)
     if trained is not None:
-        rows["perception"] = measure_perception(scene, trained, decision, repeats)
+        rows["perception"] = measure_perception(scene, trained, config, repeats)
     return rows
 
 

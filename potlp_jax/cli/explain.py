@@ -20,6 +20,9 @@ logger = logging.getLogger(__name__)
 BREADTH: int = 4
 """Actions per node in the picture of a tree."""
 
+DEPTH: int = 2
+"""Actions in a row in the picture of a tree, unless another number is given."""
+
 app = command_app()
 
 
@@ -48,15 +51,20 @@ def explain_decision(
         Path | None,
         typer.Option("--out", "-o", help="Search again and draw the top of the tree (.png, .svg or .pdf)."),
     ] = None,
-    depth: Annotated[int, typer.Option(min=1, max=5, help="Actions in a row in the picture of the tree.")] = 2,
+    depth: Annotated[
+        int | None, typer.Option(min=1, max=5, help=f"Actions in a row in the picture of the tree; default: {DEPTH}.")
+    ] = None,
     estimator: EstimatorName = None,
     json: Json = False,
 ) -> None:
     """Explain one decision: the actions that were weighed, their estimates and expected costs."""
     from potlp_jax.view.decisions import action_table, decision_to_dict, describe_decision, why_no_actions
 
+    for name, value in (("--depth", depth), ("--estimator", estimator)):
+        if out is None and value is not None:
+            fail(f"{name} needs --out: it is for the picture of the tree")
     trial, found = _read_decision(decision)
-    files = [] if out is None else _draw(trial, found, out, depth=depth, estimator=estimator)
+    files = [] if out is None else _draw(trial, found, out, depth=depth or DEPTH, estimator=estimator)
     if json:
         print_json({"trial": trial.summary(), **decision_to_dict(found)})
         return

@@ -83,7 +83,7 @@ def _read_batch(text: str | None) -> int | str | None:
     # None leaves the batch axis away altogether, which is not the same as a batch of one.
     if text is None or text == ANY_BATCH:
         return text
-    if not text.isdigit() or int(text) < 1:
+    if not text.isdecimal() or int(text) < 1:
         fail(f"--batch {text!r}: give a number of problems, or {ANY_BATCH}")
     return int(text)
 

@@ -1,5 +1,6 @@
 """``potlp run``: one trial, its record, picture and animation."""
 
+import contextlib
 import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,7 +21,7 @@ from potlp_jax.cli.options import (
     TaskName,
     WorldNumber,
 )
-from potlp_jax.cli.output import FAILED, console, make_folder, print_json, progress_bar
+from potlp_jax.cli.output import FAILED, console, fail, make_folder, print_json, progress_bar
 
 if TYPE_CHECKING:
     from potlp_jax.environments.base import Generator
@@ -87,6 +88,8 @@ def run_one(
     from potlp_jax.trials.record import Outcome
     from potlp_jax.trials.rules import trial_key
 
+    if out is None and not animation:
+        fail("--no-animation needs --out: without a folder there is no animation")
     generator = make(environment)
     chosen_split = read_split(split, generator)
     named = None if policy is None else named_policy(policy)
@@ -127,25 +130,30 @@ def _why_infeasible(generator: "Generator", split: "Split", task: "Task", config
     """Whether the world or the policy is at fault, and another world to try."""
     from potlp_jax.cli.inputs import make_world
     from potlp_jax.environments.splits import MAX_INDEX
+    from potlp_jax.errors import WorldError
     from potlp_jax.planning.policies import Policy
+    from potlp_jax.sweep.work import was_possible
     from potlp_jax.trials.loop import run_trial
-    from potlp_jax.trials.record import Outcome
     from potlp_jax.trials.rules import trial_key
 
     def is_possible(number: int) -> bool:
         # The planner that knows the map from the start finds every path there is.
         made = make_world(generator, split, number)
-        return run_trial(made, task, Policy.KNOWN_MAP, trial_key(number), config).outcome is Outcome.SATISFIED
+        return was_possible(run_trial(made, task, Policy.KNOWN_MAP, trial_key(number), config))
 
     # A task without a way back, such as one that forbids what was entered, can be lost by a decision.
     if is_possible(world):
         return "with the whole map the task is possible in this world: the policy went where it cannot be satisfied"
     # As many as tell a task that is impossible everywhere from a few unlucky worlds.
-    following = range(world + 1, min(world + WORLDS_TRIED, MAX_INDEX) + 1)
-    other = next((number for number in following if is_possible(number)), None)
-    if other is None:
-        return f"with the whole map it is impossible too, as in the {len(following)} worlds that follow: check the task"
-    return f"with the whole map it is impossible too: try --world {other}"
+    tried = 0
+    for number in range(world + 1, min(world + WORLDS_TRIED, MAX_INDEX) + 1):
+        # A family of one's own may have no such world; the trial that was asked for has its result.
+        with contextlib.suppress(WorldError):
+            if is_possible(number):
+                return f"with the whole map it is impossible too: try --world {number}"
+            tried += 1
+    also = f", as in the {tried} worlds that follow" if tried else ""
+    return f"with the whole map it is impossible too{also}: check the task"
 
 
 def _write(trial: "Trial", folder: Path, animation: bool) -> list[Path]:

@@ -41,6 +41,10 @@ class Split(enum.StrEnum):
     VALIDATION = "validation"
     TEST = "test"
 
+    @classmethod
+    def _missing_(cls, value: object) -> "Split":
+        raise WorldError(f"unknown split {value!r}; choose from: {', '.join(cls)}")
+
 
 FLOOR_PLAN_PREFIX = "floorplan:"
 """How the names of families of worlds on real floor plans begin."""
@@ -82,13 +86,13 @@ def world_key(split: Split | str, index: int, family: str) -> PRNGKeyArray:
         A typed key, of which ``Generator.generate`` makes the world.
 
     Raises:
-        ValueError: where the index is negative or above ``MAX_INDEX``, or the split has no such name.
-        WorldError: where worlds of the family must not be drawn from the split.
+        WorldError: where the index is negative or above ``MAX_INDEX``, there is no split of such a name, or worlds of
+            the family must not be drawn from it.
     """
     check_split(Split(split), family)
     number = list(Split).index(Split(split))
     if not 0 <= index <= MAX_INDEX:
-        raise ValueError(f"the index of a world must lie in 0..{MAX_INDEX}, found {index}")
+        raise WorldError(f"the index of a world must lie in 0..{MAX_INDEX}, found {index}")
     # The implementation is named, so that no setting of jax changes the worlds; CRC-32, because Python's own hash of a
     # text differs between processes.
     family_key = jax.random.fold_in(jax.random.key(_ROOT_SEED, impl="threefry2x32"), zlib.crc32(family.encode()))

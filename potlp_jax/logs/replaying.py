@@ -1,7 +1,6 @@
 """What a policy would have decided at each moment of a drive: the loop of a trial, with a log for a robot."""
 
 import dataclasses
-import math
 from pathlib import Path
 
 import jax
@@ -108,6 +107,9 @@ class LoggedRobot:
 
 _is_due = jax.jit(Stop.is_due)
 
+_NO_BUDGET = 1e30
+"""``budget_factor`` of a drive that no budget ends: more cells than any log has, and a number in single precision."""
+
 
 def replay(
     drive: Drive,
@@ -158,7 +160,7 @@ def replay(
         task,
         policy,
         key,
-        dataclasses.replace(config, budget_factor=math.inf),
+        dataclasses.replace(config, budget_factor=_NO_BUDGET),
         estimator=asked,
         world=drive.world,
     )

@@ -14,9 +14,11 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import os
+import shlex
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from potlp_jax.cache import SWITCH as CACHE_SWITCH
@@ -29,7 +31,7 @@ KERNELS: Path = Path(__file__).parent / "kernels"
 FLAGS: tuple[str, ...] = ("-std=c++17", "-O3", "-march=native", "-ffp-contract=off", "-shared", "-fPIC", "-w")
 
 COMPILERS: tuple[str, ...] = ("c++", "g++", "clang++")
-"""Tried in this order, unless the environment variable CXX names one."""
+"""Tried in this order, unless the environment variable CXX names one, with words such as ``ccache`` if need be."""
 
 MOST_SECONDS: float = 300.0
 """What takes longer to compile is given up."""
@@ -50,22 +52,45 @@ class Compiler:
     """A C++ compiler.
 
     Attributes:
-      path: of the program.
+      command: the program's path, and words that always follow it.
       version: all that it says of itself.
     """
 
-    path: str
+    command: tuple[str, ...]
     version: str
 
 
 def find_compiler() -> Compiler:
-    """The system's C++ compiler. Raises NoCompilerError where there is none, BuildError where it does not run."""
-    chosen = os.environ.get("CXX", "")
-    names = (chosen,) if chosen else COMPILERS
+    """The system's C++ compiler, or the one that CXX names.
+
+    Raises:
+      NoCompilerError: there is none, and none was named.
+      BuildError: the one that was named cannot be found, or the compiler does not run.
+    """
+    chosen = os.environ.get("CXX", "").strip()
+    command = _named_command(chosen) if chosen else _first_command(COMPILERS)
+    return Compiler(command=command, version=_run([*command, "--version"]))
+
+
+def _first_command(names: Sequence[str]) -> tuple[str, ...]:
     path = next((found for found in map(shutil.which, names) if found), None)
     if path is None:
         raise NoCompilerError(f"no C++ compiler: none of {', '.join(names)} is on PATH")
-    return Compiler(path=path, version=_run([path, "--version"]))
+    return (path,)
+
+
+def _named_command(chosen: str) -> tuple[str, ...]:
+    """The command that CXX names: a program whose path may have spaces, or one with words behind it."""
+    try:
+        choices = [[chosen], shlex.split(chosen)]
+    # A quote that is never closed.
+    except ValueError as error:
+        raise BuildError(f"CXX is {chosen!r}, which is no command: {error}") from error
+    for program, *words in choices:
+        path = shutil.which(program)
+        if path is not None:
+            return (path, *words)
+    raise BuildError(f"CXX is {chosen!r}, and {choices[-1][0]!r} cannot be found")
 
 
 def built_library(name: str) -> Path:
@@ -107,7 +132,7 @@ def _key(name: str, compiler: Compiler) -> str:
     sources = [KERNELS / f"{name}.cc", *sorted(KERNELS.glob("*.h"))]
     texts = [source.read_text("utf-8") for source in sources]
     return _digest(
-        "\0".join([*texts, compiler.path, compiler.version, *FLAGS, importlib.metadata.version("jaxlib")]).encode()
+        "\0".join([*texts, *compiler.command, compiler.version, *FLAGS, importlib.metadata.version("jaxlib")]).encode()
     )
 
 
@@ -121,7 +146,7 @@ def _compile(name: str, compiler: Compiler, folder: Path, prefix: str) -> Path:
     try:
         # The headers as the system's: their warnings are nobody's here.
         headers = ["-isystem", jax.ffi.include_dir(), f"-I{KERNELS}"]
-        _run([compiler.path, *FLAGS, *headers, str(KERNELS / f"{name}.cc"), "-o", text])
+        _run([*compiler.command, *FLAGS, *headers, str(KERNELS / f"{name}.cc"), "-o", text])
         file = folder / f"{prefix}{_digest(part.read_bytes())}.so"
         part.rename(file)
     finally:

@@ -68,7 +68,7 @@ class DecisionConfig:
         require_fields(self, ("least_chance",), SHARE, ValueError)
         if self.path_horizon is not None:
             require_fields(self, ("path_horizon",), COUNT, ValueError)
-            as_python_numbers(self, ("path_horizon",))
+        as_python_numbers(self)
 
     def horizon(self, height: int, width: int) -> int:
         """Moves in the path of one decision on a map of this size."""

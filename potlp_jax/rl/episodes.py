@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float32, Int8, Int32, PRNGKeyArray
 
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.splits import Split
-from potlp_jax.errors import TaskError
+from potlp_jax.errors import TaskError, WorldError
 from potlp_jax.planning.move import Move, MoveKind, move_to
 from potlp_jax.planning.policies import Policy, direct_move
 from potlp_jax.planning.situation import Situation, assess
@@ -146,17 +146,21 @@ class TaskEnv:
 
         Raises:
             PropositionsError: a world has other propositions than the task.
-            TaskError: the task is decided before the first step, whatever the robot does.
+            TaskError: every word satisfies the task.
+            WorldError: there is no world.
         """
+        if not worlds:
+            raise WorldError("there is no world to begin an episode in: give at least one")
         for world in worlds:
             require_same_propositions(task.propositions, world.propositions, asker=f"the task {task.text!r}")
-        if not len(task.edges):
-            raise TaskError(f"there is nothing to do for {task.text!r}: its automaton has no transition to attempt")
+        if task.dfa.accepting[task.dfa.initial]:
+            raise TaskError(f"there is nothing to do for {task.text!r}: every word satisfies it")
         # Their settings are static and must agree too, which jax.tree.map checks.
         self.worlds: World = jax.tree.map(lambda *leaves: jnp.stack(leaves), *worlds)
         self.task = task
         self.config: TrialConfig = config_in(worlds[0], config)
-        self._edges = len(task.edges)
+        # Of the arrays, which have one even where nothing can be attempted (``X X goal``): it is masked.
+        self._edges = task.sizes.edges
         # What the planner calls A - 1: all pairs of a subgoal and an edge come first.
         self._finish = self.config.decision.frontiers.max_subgoals * self._edges
         # No policy decides here; the setup only carries the rules of a leg.

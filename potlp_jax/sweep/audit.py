@@ -41,6 +41,7 @@ def audit_rows(
     # Making a world takes longer than judging a trial in it: each is made once, for the trials of all policies.
     made: tuple[str, int] | None = None
     generator, world = None, None
+    tasks: dict[tuple[str, str], str | Task] = {}
     for row in sorted(rows, key=lambda row: (row.item.environment, row.item.world)):
         environment, number = row.item.environment, row.item.world
         if generator is None or made is None or made[0] != environment:
@@ -48,9 +49,11 @@ def audit_rows(
         if world is None or made != (environment, number):
             world = generator.generate(world_key(split, number, generator.name))
         made = (environment, number)
-        automaton = automata.get(row.item.task)
-        task = row.item.task if automaton is None else Task.from_hoa(automaton, generator.propositions)
-        yield from ((row, problem) for problem in problems_of_row(row, world, task, seed))
+        name = (environment, row.item.task)
+        if name not in tasks:
+            automaton = automata.get(row.item.task)
+            tasks[name] = row.item.task if automaton is None else Task.from_hoa(automaton, generator.propositions)
+        yield from ((row, problem) for problem in problems_of_row(row, world, tasks[name], seed))
 
 
 def audit_items(rows: Sequence[Row], specification: Specification) -> Iterator[tuple[Row, str]]:

@@ -56,6 +56,12 @@ class Examined:
     possible: bool
 
 
+def was_possible(trial: Finished | Trial) -> bool:
+    """Whether a task is possible in a world, by the trial there of the policy that knows the map from the start."""
+    # One whose known path is longer than the budget is possible all the same, and is charged as any other.
+    return trial.outcome is not Outcome.INFEASIBLE
+
+
 class Work:
     """What a sweep's trials have in common, and how a unit of them is done.
 
@@ -87,8 +93,7 @@ class Work:
         """Whether the planner that knows the map finds a way; the items are of one environment."""
         items = list(items)
         for item, trial in self._trials(items, items[0].environment, Policy.KNOWN_MAP):
-            # One whose known path is longer than the budget is possible all the same, and is charged as any other.
-            yield Examined(item, trial.outcome is not Outcome.INFEASIBLE)
+            yield Examined(item, was_possible(trial))
 
     def rows(self, items: Iterable[Item], environment: str, policy: str) -> Iterator[Row]:
         """The rows of trials of one environment and policy, as they end.

@@ -31,6 +31,9 @@ _TOKEN = re.compile(
       | (?P<symbol>[\[\](){}!&|])""",
     re.VERBOSE | re.DOTALL,
 )
+_ONCE = ("AP:", "Acceptance:", "States:", "name:")
+"""Headers of which the format allows one: a second one would silently take the place of the first."""
+
 DEEPEST: int = 30
 """Parentheses within each other in a label; Spot writes none. More would exhaust the stack of a recursive descent."""
 
@@ -93,6 +96,7 @@ class _Header:
     propositions: tuple[str, ...] | None = None
     acceptance: str | None = None
     aliases: dict[str, np.ndarray] = field(default_factory=dict)
+    seen: set[str] = field(default_factory=set)
 
 
 def read_hoa(text: str) -> HoaAutomaton:
@@ -102,7 +106,8 @@ def read_hoa(text: str) -> HoaAutomaton:
         TaskError: syntax, or anything that is not a complete deterministic automaton with state-based Büchi
             acceptance; names the line.
     """
-    return _Reader(_tokens(text)).read()
+    # Some editors begin a file with a byte-order mark.
+    return _Reader(_tokens(text.removeprefix("\ufeff"))).read()
 
 
 def write_hoa(dfa: Dfa, propositions: Sequence[str], name: str) -> str:
@@ -233,16 +238,40 @@ class _Reader:
         version = self._expect("name", "the version")
         if version.text != "v1":
             raise _error(version.line, f"version {version} is not known; v1 is")
+        aliases: list[int] = []
         while self._next.text != "--BODY--":
-            self._read_header_item(self._expect("header", "a header or --BODY--"))
+            item = self._expect("header", "a header or --BODY--")
+            if item.text == "Alias:":
+                # Labels are sets of letters, which are known once ``AP:`` has been read; that may come later.
+                aliases.append(self._position)
+                self._skip_header_item()
+            else:
+                self._read_header_item(item)
+        self._read_aliases(aliases)
         if self._header.initial == _UNKNOWN:
             raise self._error("there is no 'Start:' header: the automaton needs one initial state")
         if self._header.acceptance is None:
             raise self._error("there is no 'Acceptance:' header")
         self._take()
 
+    def _read_aliases(self, positions: Sequence[int]) -> None:
+        """Read the aliases that begin at these tokens; one may use those before it."""
+        end = self._position
+        for position in positions:
+            self._position = position
+            name = self._expect("alias", "an alias such as @a")
+            if name.text in self._header.aliases:
+                raise _error(name.line, f"a second alias {name}")
+            self._header.aliases[name.text] = self._disjunction()
+            if self._next.kind not in ("header", "section"):
+                raise self._error(f"expected a header or --BODY--, found {self._next}")
+        self._position = end
+
     def _read_header_item(self, token: _Token) -> None:
         header = self._header
+        if token.text in _ONCE and token.text in header.seen:
+            raise _error(token.line, f"a second '{token}' header")
+        header.seen.add(token.text)
         match token.text:
             case "States:":
                 header.num_states = self._number("the number of states")
@@ -250,9 +279,6 @@ class _Reader:
                 self._read_start(token)
             case "AP:":
                 self._read_propositions(token)
-            case "Alias:":
-                name = self._expect("alias", "an alias such as @a").text
-                header.aliases[name] = self._disjunction()
             case "Acceptance:":
                 self._read_acceptance(token)
             case "name:":
@@ -274,8 +300,6 @@ class _Reader:
             raise self._error("a conjunction of initial states: alternating automata are not supported")
 
     def _read_propositions(self, token: _Token) -> None:
-        if self._header.propositions is not None:
-            raise _error(token.line, "a second 'AP:' header")
         count = self._number("the number of propositions")
         names: list[str] = []
         while self._next.kind == "string":
@@ -351,8 +375,7 @@ class _Reader:
             return None
         letters = self._disjunction()
         self._expect_symbol("]")
-        # An alias may stand before ``AP:``, when there was one letter; constants are all that it can hold then.
-        return np.broadcast_to(letters, self._letters.shape)
+        return letters
 
     # Body
 

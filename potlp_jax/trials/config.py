@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from potlp_jax.checks import AT_LEAST_ONE, LIMIT, NOT_NEGATIVE, require_fields
+from potlp_jax.checks import COUNT, NOT_NEGATIVE, POSITIVE, WHOLE, as_python_numbers, require_fields
 from potlp_jax.codec import with_settings
 from potlp_jax.environments.base import Generator
 from potlp_jax.errors import PotlpWarning
@@ -46,9 +46,12 @@ class TrialConfig:
     revealed: bool = False
 
     def __post_init__(self) -> None:
-        require_fields(self, ("panoramas",), AT_LEAST_ONE, ValueError)
-        require_fields(self, ("look_every", "replan_distance"), NOT_NEGATIVE, ValueError)
-        require_fields(self, ("budget_factor",), LIMIT, ValueError)
+        require_fields(self, ("panoramas",), COUNT, ValueError)
+        require_fields(self, ("look_every",), WHOLE, ValueError)
+        require_fields(self, ("replan_distance",), NOT_NEGATIVE, ValueError)
+        # Infinity is no budget: a batch keeps paths of this length, and JSON has no such number.
+        require_fields(self, ("budget_factor",), POSITIVE, ValueError)
+        as_python_numbers(self)
 
 
 def trial_config_for(source: World | Generator) -> TrialConfig:

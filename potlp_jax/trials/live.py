@@ -64,8 +64,8 @@ def run_robot(
 
     Raises:
         RobotError: the robot broke its side of the contract, or it or the listener raised something else. After the
-            first observation it is a ``BrokenDriveError``, which has the record until then as ``trial``: ``unfinished``,
-            and the error is its last note.
+            first observation it is a ``BrokenDriveError``, whose ``trial`` is the record until then: ``unfinished``,
+            with the error as its last note.
         PropositionsError: the robot's map, task, estimator and ``world`` are not over the same propositions.
         EstimatorError: no estimator is shipped for the task's propositions in such a world.
         PotlpError: the policy is ``oracle`` and there is no ``world``.

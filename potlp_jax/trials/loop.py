@@ -503,6 +503,7 @@ def make_trial(
         world_number=world_number,
         config=dataclasses.asdict(config),
         versions=versions(estimator),
+        max_positive_literals=task.max_positive_literals,
     )
 
 

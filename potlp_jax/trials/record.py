@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int32
 
+from potlp_jax.checks import COUNT
 from potlp_jax.codec import config_from_dict, finite_or_text
 from potlp_jax.errors import PotlpError, RecordError
-from potlp_jax.files import read_json, reading, short
+from potlp_jax.files import read_json, reading, short, write_whole
 from potlp_jax.task.propositions import check_propositions, require_same_propositions
 from potlp_jax.types import status_names, status_of
 from potlp_jax.world.grid import (
@@ -189,6 +190,7 @@ class Trial(RunRecord):
         environment, world_number: where the world comes from; None where it has no number.
         config: the settings, as ``dataclasses.asdict`` makes them.
         versions: of what the figures depend on.
+        max_positive_literals: of the task (``Task.max_positive_literals``); None in records from before it was kept.
     """
 
     first_seen: Int32[np.ndarray, "H W"]
@@ -203,6 +205,7 @@ class Trial(RunRecord):
     versions: Mapping[str, str]
     corrections: tuple[Correction, ...] = ()
     notes: tuple[str, ...] = ()
+    max_positive_literals: int | None = None
 
     def belief_at(self, step: int) -> BeliefMap:
         """The belief after observing from ``path[step]``."""
@@ -256,9 +259,9 @@ class Trial(RunRecord):
         return finite_or_text({"format": FORMAT, **data})
 
     def save(self, path: Path) -> None:
-        """Write the record as JSON."""
+        """Write the record as JSON: whole, or not at all. An earlier record is replaced once the new one is on disk."""
         data = self.to_dict()
-        path.write_text(json.dumps({**data, "checksum": record_checksum(data)}, allow_nan=False))
+        write_whole(path, json.dumps({**data, "checksum": record_checksum(data)}, allow_nan=False))
 
 
 def belief_seen_by(world: World, first_seen: Int32[np.ndarray, "H W"], step: int) -> BeliefMap:
@@ -341,6 +344,8 @@ def _decision_to_dict(decision: Decision) -> dict[str, Any]:
 
 
 def _trial_from_dict(data: Mapping[str, Any]) -> Trial:
+    # Records from before the limit was kept have none.
+    data = {"max_positive_literals": None, **data}
     values = {field.name: data[field.name] for field in dataclasses.fields(Trial)}
     values["outcome"] = Outcome(data["outcome"])
     values["cost"] = float(data["cost"])
@@ -370,6 +375,8 @@ def _check(trial: Trial) -> None:
             raise ValueError(f"{name} is no text")
     if not (isinstance(trial.config, Mapping) and isinstance(trial.versions, Mapping)):
         raise ValueError("config and versions are no mappings")
+    if not (trial.max_positive_literals is None or COUNT.allows(trial.max_positive_literals)):
+        raise ValueError("max_positive_literals is no whole number of at least 1")
     if not all(type(number) is int and number >= 0 for number in (*trial.word, *trial.states)):
         raise ValueError("word and states are no numbers from 0")
     if not len(trial.path) == len(trial.word) == len(trial.states) > 0:

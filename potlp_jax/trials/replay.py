@@ -73,8 +73,8 @@ def replay_decision(
         The planning problem of the decision, its plan and the searched tree.
 
     Raises:
-        RecordError: the trial has no such decision, its policy does not search, or its settings are not those that it
-            was made with.
+        RecordError: the trial has no such decision, its policy does not search, its settings are not those that it
+            was made with, or it asked what is not in the record (``estimator_at``).
         EstimatorError: the estimator is not the trial's.
     """
     if not 0 <= index < len(trial.decisions):
@@ -84,7 +84,7 @@ def replay_decision(
         raise RecordError(f"policy {trial.policy!r} does not search: its decisions have no tree")
     decision = trial.decisions[index]
     # From the automaton in the record: formulas need Spot, and a record is read without it.
-    task = Task.from_hoa(trial.task_hoa, propositions=trial.propositions)
+    task = Task.from_hoa(trial.task_hoa, trial.propositions, trial.max_positive_literals)
     config = _decision_config_at(trial, index)
     problem = _replayed_problem(
         trial.planned_on(decision),
@@ -126,9 +126,13 @@ def estimator_at(trial: Trial, index: int, estimator: TrainedEstimator | Estimat
 
     Raises:
         EstimatorError: the estimator is not the trial's.
-        RecordError: its panoramas cannot be made again (``panorama_at``).
+        RecordError: its panoramas cannot be made again (``panorama_at``), or the policy is ``oracle`` and a robot
+            drove, whose record does not hold the true map.
     """
     if trial.policy != Policy.POTLP:
+        # The record's world is the map that the robot knew at the end: its answers would be others.
+        if trial.environment.startswith(ROBOT_PREFIX):
+            raise RecordError("the oracle asked the true map, which is not in the record of a robot's drive")
         return TrueMapEstimator(world=trial.world)
     given = asked_of(Policy.POTLP, estimator)
     found = _estimator_of_record(trial, given)

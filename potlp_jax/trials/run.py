@@ -49,7 +49,7 @@ def run(
     Raises:
         PluginError: there is no such environment, policy or estimator.
         TaskError: there is no such task.
-        WorldError: there is no such world.
+        WorldError: there is no such world, or no such split.
         EstimatorError: no estimator is shipped for the task in such worlds.
         PropositionsError: the task, or the estimator, is over other propositions than the environment.
     """

@@ -9,7 +9,9 @@ what was observed when are checked against the world by rules of this file alone
 moves or simulates is used: a mistake made there is not made here again.
 """
 
+import functools
 import math
+import warnings
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
@@ -18,9 +20,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int32
 
+from potlp_jax.errors import TaskError, TaskWarning
 from potlp_jax.task.task import Task
 from potlp_jax.trials.record import NEVER_SEEN, Outcome, Trial
-from potlp_jax.verify.semantics import can_be_judged, word_satisfies, word_violates
+from potlp_jax.verify.semantics import can_be_judged, has_language_of, word_satisfies, word_violates
 from potlp_jax.world.grid import World
 from potlp_jax.world.settings import Settings
 
@@ -87,7 +90,7 @@ def problems_of_path(
         cost: what the planner says that the path costs, in the unit of the world's resolution.
         outcome: how the planner says that the trial ended; ``"satisfied"`` is the value that matters.
         task: a formula, co-safe linear temporal logic over the world's propositions; or a task, which is judged by its
-            formula, or where its text is none by its automaton.
+            formula (``formula_of``), or where it has none by its automaton.
 
     Returns:
         One sentence for each problem. One about a violation of the task begins with ``violates``.
@@ -119,11 +122,55 @@ def problems_of_path(
 
 def _judged(task: str | Task, propositions: tuple[str, ...], word: Sequence[int]) -> tuple[bool, bool]:
     """Whether a word satisfies and whether it violates a task."""
-    if isinstance(task, Task) and not can_be_judged(task.text, propositions):
+    formula = formula_of(task) if isinstance(task, Task) else task
+    if formula is None:
+        assert isinstance(task, Task)
         states = _states_of(task, word)
         return any(task.dfa.accepting[state] for state in states), bool(task.dfa.trap[states[-1]])
-    formula = task.text if isinstance(task, Task) else task
     return word_satisfies(formula, propositions, word), word_violates(formula, propositions, word)
+
+
+# Tasks are compared by identity, and all trials of a sweep ask for the same few.
+@functools.lru_cache(maxsize=64)
+def formula_of(task: Task) -> str | None:
+    """The formula by which a task is judged; None for an automaton of which its table alone says what is to be done.
+
+    A task that was made from a formula is judged by it, whatever its automaton. The name of an automaton may be
+    anything, also a formula of another language: it counts only where the languages are equal.
+    """
+    if task.structure is not None:
+        is_formula = can_be_judged(task.text, task.propositions)
+    else:
+        dfa = task.dfa
+        is_formula = has_language_of(task.text, task.propositions, dfa.transitions, dfa.accepting, int(dfa.initial))
+    return task.text if is_formula else None
+
+
+def task_of_record(trial: Trial, propositions: tuple[str, ...]) -> Task:
+    """What a trial was for, by its record alone: its formula, or where the text is a mere name its automaton.
+
+    Args:
+        trial: of a record.
+        propositions: of the environment.
+
+    Returns:
+        The task, over these propositions.
+
+    Raises:
+        TaskError: the automaton of the record is none, or names another proposition.
+    """
+    recorded = Task.from_hoa(trial.task_hoa, propositions)
+    if formula_of(recorded) is not None:
+        return recorded
+    # Either a file's automaton that is called as a formula is, or a formula that was translated wrongly. A wrong
+    # translation comes out once more, and is judged by the formula.
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", TaskWarning)
+            translated = Task.from_formula(trial.task_text, propositions)
+    except TaskError:
+        return recorded
+    return translated if _has_table_of(translated, recorded) else recorded
 
 
 def _world_differences(claimed: World, world: World) -> list[str]:
@@ -156,12 +203,16 @@ def _task_differences(trial: Trial, task: Task) -> list[str]:
             f"{task.propositions}"
         )
         return found
-    claimed, true = Task.from_hoa(trial.task_hoa, trial.propositions).dfa, task.dfa
-    # Both are minimal with their states in one canonical order: equal languages have equal tables.
-    tables = ((claimed.transitions, true.transitions), (claimed.accepting, true.accepting))
-    if claimed.initial != true.initial or not all(np.array_equal(mine, other) for mine, other in tables):
+    if not _has_table_of(Task.from_hoa(trial.task_hoa, trial.propositions), task):
         found.append("its automaton is not that of the task")
     return found
+
+
+def _has_table_of(task: Task, other: Task) -> bool:
+    # Both are minimal with their states in one canonical order: equal languages have equal tables.
+    mine, true = task.dfa, other.dfa
+    tables = ((mine.transitions, true.transitions), (mine.accepting, true.accepting))
+    return mine.initial == true.initial and all(np.array_equal(one, another) for one, another in tables)
 
 
 def _states_of(task: Task, word: Sequence[int]) -> list[int]:

@@ -2,12 +2,13 @@
 
 * ``satisfies_lasso`` evaluates any LTL formula on an infinite word ``prefix . loop . loop . ...``, exactly.
 * ``word_satisfies`` and ``word_violates`` tell whether a finite word decides a co-safe formula, whatever follows.
+* ``has_language_of`` tells whether an automaton is one of a co-safe formula.
 
 Syntax: ``! & | -> <-> xor ^ X F G U R V W M true false 1 0 [] <>``, also ``&& || => <=>``, names, "quoted names" and
 parentheses; ``X[n]``, ``F[n:m]``, ``G[n:m]`` and, without an end, ``F[n:]`` and ``G[n:]`` (also ``..`` or ``,`` for the
-colon, ``$`` for no end, and ``!``, which changes nothing on infinite words). ``U R V W M`` and ``->`` associate to the
-right and bind as in Spot: from weak to strong
-``-> <->``, ``xor``, ``|``, ``&``, ``U R W M``, ``X F G !``.
+colon, ``$`` for no end, and ``!``, which changes nothing on infinite words). A word that begins with F, G or X is a
+name where it is a proposition, and what is left of it without these letters is none. ``U R V W M`` and ``->`` associate
+to the right and bind as in Spot: from weak to strong ``-> <->``, ``xor``, ``|``, ``&``, ``U R W M``, ``X F G !``.
 
 A letter is an integer whose bit i is set where ``propositions[i]`` is true.
 
@@ -19,8 +20,11 @@ References:
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
+
+import numpy as np
+from jaxtyping import Bool, Int
 
 from potlp_jax.errors import TaskError
 
@@ -52,7 +56,7 @@ def satisfies_lasso(formula: str, propositions: Sequence[str], prefix: Sequence[
         Whether the word satisfies the formula.
 
     Raises:
-        TaskError: the formula cannot be read, or the loop is empty.
+        TaskError: the formula cannot be read, names what is no proposition, or the loop is empty.
     """
     if not loop:
         raise TaskError("the loop of an infinite word is empty: give at least one letter that repeats")
@@ -60,7 +64,7 @@ def satisfies_lasso(formula: str, propositions: Sequence[str], prefix: Sequence[
     letters = [*prefix, *loop]
     successor = [*range(1, len(letters)), len(prefix)]
     bit = {name: i for i, name in enumerate(propositions)}
-    return _truth(_normal_form(formula), bit, letters, successor)[0]
+    return _truth(_normal_form(formula, tuple(propositions)), bit, letters, successor)[0]
 
 
 def word_satisfies(formula: str, propositions: Sequence[str], word: Sequence[int]) -> bool:
@@ -78,7 +82,7 @@ def word_satisfies(formula: str, propositions: Sequence[str], word: Sequence[int
         Whether the task is accomplished.
 
     Raises:
-        TaskError: the formula cannot be read or is not co-safe.
+        TaskError: the formula cannot be read, names what is no proposition, or is not co-safe.
     """
     return _always_reaches_done(_after(formula, tuple(propositions), word), _own_letters(formula, tuple(propositions)))
 
@@ -95,7 +99,7 @@ def word_violates(formula: str, propositions: Sequence[str], word: Sequence[int]
         Whether the task can no longer be accomplished.
 
     Raises:
-        TaskError: the formula cannot be read or is not co-safe.
+        TaskError: the formula cannot be read, names what is no proposition, or is not co-safe.
     """
     return not _can_reach_done(_after(formula, tuple(propositions), word), _own_letters(formula, tuple(propositions)))
 
@@ -109,13 +113,64 @@ def can_be_judged(formula: str, propositions: Sequence[str]) -> bool:
     return True
 
 
+def has_language_of(
+    formula: str,
+    propositions: Sequence[str],
+    transitions: Int[np.ndarray, "Z L"],
+    accepting: Bool[np.ndarray, " Z"],
+    initial: int,
+) -> bool:
+    """Whether an automaton accepts exactly the words that satisfy the co-safe formula. Exact.
+
+    Args:
+        formula: the text, which may also be none.
+        propositions: names of the bits of a letter.
+        transitions: ``[z, letter]`` is the next state.
+        accepting: states in which the word so far satisfies, whatever follows.
+        initial: where words begin.
+
+    Returns:
+        Whether it does; False where the text is no co-safe formula over these propositions.
+    """
+    known = tuple(propositions)
+    if not can_be_judged(formula, known):
+        return False
+    own = _own_letters(formula, known)
+    # By each of the formula's own letters, the automaton's letters that are the same to the formula.
+    # The last one holds all of the formula's names.
+    bits = {name: known.index(name) for name in own[-1]}
+    letters = np.arange(2 ** len(known))
+    alike = {letter: np.flatnonzero(_shows(letters, letter, bits)) for letter in own}
+    start = (initial, _after(formula, known, ()))
+    reached, waiting = {start}, [start]
+    while waiting:
+        state, rest = waiting.pop()
+        # A co-safe language is what its good prefixes say.
+        if bool(accepting[state]) != _always_reaches_done(rest, own):
+            return False
+        following = {
+            (int(target), _step(rest, letter))
+            for letter in own
+            for target in np.unique(transitions[state, alike[letter]])
+        }
+        waiting += following - reached
+        reached |= following
+    return True
+
+
+def _shows(letters: Int[np.ndarray, " L"], names: frozenset[str], bits: Mapping[str, int]) -> Bool[np.ndarray, " L"]:
+    """Which letters hold these names and no others of those that have bits."""
+    held = sum(1 << bit for name, bit in bits.items() if name in names)
+    return (letters & sum(1 << bit for bit in bits.values())) == held
+
+
 # Parser
 
 
 class _Parser:
     """Recursive descent: one method per level of precedence, weakest first; ``""`` ends the tokens."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str, known: Sequence[str]) -> None:
         self.text = text
         tokens: list[str] = []
         position = 0
@@ -123,7 +178,8 @@ class _Parser:
             match = _TOKEN.match(text, position)
             if match is None:
                 raise TaskError(f"formula {text!r}: cannot read {text[position:]!r}")
-            tokens += _split_operators(match.group(1))
+            token = match.group(1)
+            tokens += [token] if _is_whole_name(token, known) else _split_operators(token)
             position = match.end()
         self.tokens = [_ALIASES.get(token, token) for token in tokens] + [""]
 
@@ -212,6 +268,13 @@ def _later(f: Formula, count: int) -> Formula:
     return f
 
 
+def _is_whole_name(token: str, known: Sequence[str]) -> bool:
+    """Whether a known name such as FIRE is meant as it stands, and not as F and IRE."""
+    operand = token.lstrip("FGX")
+    # F, G and X alone are operators, whatever is known; and where both readings are possible, Spot's counts.
+    return token in known and operand not in ("", token, *known)
+
+
 def _split_operators(token: str) -> list[str]:
     """``XFa`` is X F a, as in Spot; names such as F1 or X2 are names."""
     # A digit after the letter makes it a name, any other letter an operator in front of one.
@@ -220,12 +283,21 @@ def _split_operators(token: str) -> list[str]:
     return [token]
 
 
-def _normal_form(text: str) -> Formula:
-    """Parsed, and rewritten to true, false, literals, and, or, X, U, R."""
+def _normal_form(text: str, propositions: Sequence[str]) -> Formula:
+    """Parsed, and rewritten to true, false, literals, and, or, X, U, R. Raises TaskError for other names than these."""
     try:
-        return _push_negation(_Parser(text).whole(), True)
+        formula = _push_negation(_Parser(text, propositions).whole(), True)
     except RecursionError:
         raise TaskError(f"formula {text[:80]!r} is nested too deeply to be judged") from None
+    unknown = sorted(set(_names(formula)) - set(propositions))
+    if unknown:
+        raise TaskError(f"formula {text!r}: {', '.join(unknown)} is not among the propositions {tuple(propositions)}")
+    return formula
+
+
+def _names(f: Formula) -> list[str]:
+    """The propositions of a formula, each as often as it is there."""
+    return [f[1]] if f[0] == "name" else [name for g in f[1:] for name in _names(g)]
 
 
 def _push_negation(f: Formula, positive: bool) -> Formula:
@@ -370,13 +442,13 @@ def _step(rest: Rest, letter: frozenset[str]) -> Rest:
 
 
 @cache
-def _parsed(formula: str) -> Formula:
-    return _normal_form(formula)
+def _parsed(formula: str, propositions: tuple[str, ...]) -> Formula:
+    return _normal_form(formula, propositions)
 
 
 def _after(formula: str, propositions: tuple[str, ...], word: Sequence[int]) -> Rest:
     """What remains to be done after a word."""
-    rest: Rest = frozenset({frozenset({_parsed(formula)})})
+    rest: Rest = frozenset({frozenset({_parsed(formula, propositions)})})
     for letter in word:
         rest = _step(rest, frozenset(name for i, name in enumerate(propositions) if letter >> i & 1))
     return rest
@@ -385,21 +457,8 @@ def _after(formula: str, propositions: tuple[str, ...], word: Sequence[int]) -> 
 @cache
 def _own_letters(formula: str, propositions: tuple[str, ...]) -> tuple[frozenset[str], ...]:
     """All letters over the formula's own propositions: the others change nothing."""
-    names: list[str] = []
-
-    def collect(f: Formula) -> None:
-        if f[0] == "name":
-            names.append(f[1])
-        else:
-            for g in f[1:]:
-                collect(g)
-
-    collect(_parsed(formula))
     # One letter for each combination of the names that the formula mentions: 2 to the power of few.
-    own = sorted(set(names))
-    unknown = sorted(set(own) - set(propositions))
-    if unknown:
-        raise TaskError(f"formula {formula!r}: {', '.join(unknown)} is not among the propositions {propositions}")
+    own = sorted(set(_names(_parsed(formula, propositions))))
     return tuple(frozenset(name for i, name in enumerate(own) if letter >> i & 1) for letter in range(2 ** len(own)))
 
 

@@ -46,13 +46,13 @@ _INVALID_KINDS: Mapping[str, str] = MappingProxyType({**KINDS, "fallback": KINDS
 
 
 @lru_cache(maxsize=8)
-def _task(hoa: str, propositions: tuple[str, ...]) -> Task:
-    return Task.from_hoa(hoa, propositions)
+def _task(hoa: str, propositions: tuple[str, ...], max_positive_literals: int | None) -> Task:
+    return Task.from_hoa(hoa, propositions, max_positive_literals)
 
 
 def task_of(trial: Trial) -> Task:
     """The task of a record; the last few are kept, because every decision of a trial asks for it."""
-    return _task(trial.task_hoa, trial.propositions)
+    return _task(trial.task_hoa, trial.propositions, trial.max_positive_literals)
 
 
 def rank_actions(decision: Decision) -> list[ActionRecord]:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float32, Int32, PRNGKeyArray, UInt8
 
-from potlp_jax.checks import require_rules
+from potlp_jax.checks import COUNT, NOT_NEGATIVE, as_python_numbers, is_whole, require_rules
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +59,10 @@ class CameraConfig:
         lengths = (self.far, self.fold, self.eye_height, self.texture_reach)
         colours = (*self.ceiling_colour, *self.smoke_colour)
         rules = (
-            (self.height >= 1 and self.width >= 4, "height must be at least 1, width at least 4"),
+            (
+                COUNT.allows(self.height) and COUNT.allows(self.width) and self.width >= 4,
+                "height must be at least 1, width at least 4, both whole numbers",
+            ),
             # From the middle of a cell all corners lie in directions of rational tangent. Of the bearings that are a
             # rational part of the circle, as those of columns are, only multiples of 45 degrees have one (Niven's
             # theorem), and columns look half a step beside these where their number is a multiple of 8.
@@ -74,9 +77,13 @@ class CameraConfig:
             (self.eye_height < self.wall_height < math.inf, "the eye must be below the ceiling, wall_height"),
             (math.isfinite(self.horizon), "horizon must be a number of rows"),
             (0 <= self.texture <= 1 and 0 <= self.ambient <= 1, "texture and ambient lie between 0 and 1"),
-            (len(colours) == 6 and all(0 <= v <= 255 for v in colours), "a colour is three values of 0 to 255"),
+            (
+                len(colours) == 6 and all(is_whole(v) and 0 <= v <= 255 for v in colours),
+                "a colour is three whole numbers of 0 to 255",
+            ),
         )
         require_rules(rules, "a camera", ValueError)
+        as_python_numbers(self)
 
     def lengths(self, scale: float = 1.0) -> dict[str, float]:
         """The fields that are lengths, by name, in cells that are ``scale`` times smaller."""
@@ -98,8 +105,9 @@ class Disturbance:
     colour: float = 0.0
 
     def __post_init__(self) -> None:
-        if not all(math.isfinite(value) and value >= 0 for value in dataclasses.astuple(self)):
+        if not all(NOT_NEGATIVE.allows(value) for value in dataclasses.astuple(self)):
             raise ValueError(f"noise, exposure and colour must be finite numbers, 0 or more, found {self}")
+        as_python_numbers(self)
 
 
 def column_bearings(config: CameraConfig) -> Float[np.ndarray, " columns"]:

@@ -82,7 +82,7 @@ class FrontierConfig:
             raise ValueError(
                 f"max_subgoals, min_size and most_subgoals must be whole numbers of at least 1, found {self}"
             )
-        as_python_numbers(self, ("max_subgoals", "min_size", "most_subgoals"))
+        as_python_numbers(self)
 
     def grown(self) -> "FrontierConfig | None":
         """With an array of the next length, None where it is as long as it may become."""

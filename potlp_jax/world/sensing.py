@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int, Int32, UInt8
 
+from potlp_jax.checks import NOT_NEGATIVE, as_python_numbers
 from potlp_jax.errors import WorldError
 from potlp_jax.native import by_platform, target
 from potlp_jax.precision import in_32_bits, whole_numbers
@@ -57,8 +58,9 @@ class SensorConfig:
     range_cells: float = 104.0
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.range_cells) and self.range_cells >= 0):
+        if not NOT_NEGATIVE.allows(self.range_cells):
             raise ValueError(f"range_cells must be a finite number of cells, 0 or more, found {self.range_cells}")
+        as_python_numbers(self)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -39,6 +39,7 @@ class BestFirstConfig:
         _check_counts(self, "simulations", "max_depth", "tree_capacity", "guess_failures")
         if not SHARE.allows(self.optimism):
             raise ValueError(f"BestFirstConfig.optimism is {self.optimism}, must lie in [0, 1]")
+        as_python_numbers(self)
 
     @property
     def capacity(self) -> int:
@@ -79,6 +80,7 @@ class UctConfig:
         # With infinity no action would look better than another, and the first one would be taken again and again.
         if not NOT_NEGATIVE.allows(self.exploration):
             raise ValueError(f"UctConfig.exploration is {self.exploration}, must be finite and not negative")
+        as_python_numbers(self)
 
     @property
     def capacity(self) -> int:
@@ -97,4 +99,3 @@ def _check_counts(config: BestFirstConfig | UctConfig, *names: str) -> None:
         value = getattr(config, name)
         if not (COUNT.allows(value) or (value is None and name == "tree_capacity")):
             raise ValueError(f"{type(config).__name__}.{name} is {value}, must be {COUNT.wanted}")
-    as_python_numbers(config, names)
