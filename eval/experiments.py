@@ -158,7 +158,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "worst-school": Experiment(
         page="delivery",
         command="python -m eval.limit.worst {all}/delivery/school --out {out} --trials 10 --buildings 8 "
-        "--report {out}/worst",
+        "--report docs/results/delivery/worst_school",
     ),
     "real-maps": Experiment(
         page="delivery",
@@ -172,11 +172,13 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     "worst-gdc": Experiment(
         page="delivery",
-        command="python -m eval.limit.worst {all}/real-maps/gdc_3ne --out {out} --trials 10 --report {out}/worst",
+        command="python -m eval.limit.worst {all}/real-maps/gdc_3ne --out {out} --trials 10 "
+        "--report docs/results/real_maps/gdc_worst",
     ),
     "worst-uma": Experiment(
         page="delivery",
-        command="python -m eval.limit.worst {all}/real-maps/uma_rooms --out {out} --trials 10 --report {out}/worst",
+        command="python -m eval.limit.worst {all}/real-maps/uma_rooms --out {out} --trials 10 "
+        "--report docs/results/real_maps/uma_worst",
     ),
     "worst-intel": Experiment(
         page="delivery",
