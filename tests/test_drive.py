@@ -606,6 +606,16 @@ def test_a_robot_that_knows_no_move_stands_though_the_leg_before_left_its_goal()
     assert not link._way
 
 
+def test_a_robot_that_is_already_where_it_is_to_go_stands():
+    robot, cell, link, _ = on_the_floor()
+    robot.advance(way(cell, 5), AT_ONCE)
+    _, cell = robot.observe()
+    # Into the next cell while it is decided.
+    link.step(FLOOR.resolution / ORDINARY.speed)
+    assert robot.advance(way(cell, 1), AT_THE_END).cells == ((cell[0], cell[1] + 1),)
+    assert link.cancelled == link.goals == ["goal 0"]
+
+
 def test_a_goal_is_taken_back_again_when_the_robot_is_heard_again():
     class Deaf(SimulatedLink):
         """Loses what it is told for a while, and says nothing meanwhile."""

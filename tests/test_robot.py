@@ -13,13 +13,14 @@ import potlp_jax
 from potlp_jax.cli import app
 from potlp_jax.errors import RecordError, RobotError
 from potlp_jax.learning.labels import TrueMapEstimator
-from potlp_jax.planning.situation import DecisionConfig
+from potlp_jax.trials import loop
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import BrokenDriveError
 from potlp_jax.trials.record import BeliefMap, load_trial
 from potlp_jax.trials.replay import replay_decision, views_of
 from potlp_jax.trials.robot import GrowingRobot, Leg, SimulatedRobot
 from potlp_jax.trials.setbacks import SetbackConfig
+from potlp_jax.types import NO_STATE
 from potlp_jax.view.decisions import describe_decision
 from potlp_jax.view.replay_page import replay_data
 from potlp_jax.world.grid import belief_from_numpy, make_world, moved_layer
@@ -442,7 +443,7 @@ def test_a_drive_that_breaks_off_leaves_its_record(fault, tmp_path):
 @pytest.mark.parametrize(
     ("cells", "cell"), [(list, tuple), (list, list), (np.array, np.array), (tuple, lambda cell: tuple(np.array(cell)))]
 )
-def test_cells_of_any_whole_numbers_decide_alike(cells, cell):
+def test_cells_of_any_whole_numbers_decide_alike(cells, cell, monkeypatch):
     class Converts(Rover):
         def observe(self):
             belief, here = super().observe()
@@ -451,14 +452,23 @@ def test_cells_of_any_whole_numbers_decide_alike(cells, cell):
         def advance(self, path, stop):
             return leg_of(cells([cell(there) for there in super().advance(path, stop).cells]))
 
-    # What was chosen counts for the next choice, if the robot went there.
-    config = TrialConfig(decision=DecisionConfig(commitment=3.0))
-    wanted, found = (
-        potlp_jax.run_robot(looking(robot), TASK, "potlp", KEY, config, estimator=Footprints.of_shape(FLOOR.shape))
-        for robot in (Rover, Converts)
-    )
-    assert found.decisions == wanted.decisions
-    assert found.path == wanted.path
+    decide, intentions = loop._decide, []
+
+    def note(*arguments, **options):
+        intention = arguments[6]
+        intentions.append((intention.cell.tolist(), int(intention.edge), int(intention.state)))
+        return decide(*arguments, **options)
+
+    def run(kind):
+        intentions.clear()
+        trial = potlp_jax.run_robot(looking(kind), TASK, "potlp", KEY, estimator=Footprints.of_shape(FLOOR.shape))
+        # What the robot is committed to where it went where it was told.
+        return trial.decisions, trial.path, tuple(intentions)
+
+    monkeypatch.setattr(loop, "_decide", note)
+    wanted = run(Rover)
+    assert any(state != NO_STATE for _, _, state in wanted[2])
+    assert run(Converts) == wanted
 
 
 def test_a_remark_that_cannot_be_had_costs_no_record():

@@ -172,6 +172,8 @@ class RemoteRobot:
         self._follow(self._inbox.take_poses())
         ahead = self._ahead(planned)
         if not ahead:
+            # It is where it was to go; the goal before may lead beyond, and the next decision takes time.
+            self._mover.stop()
             return Leg(tuple(self._entered))
         self._mover.begin([self._metres(cell) for cell in ahead], self.frame_id)
         while True:
