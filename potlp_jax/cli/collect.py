@@ -118,7 +118,8 @@ def collection_bars(progress: "Progress") -> "Callable[[Split, Collected], None]
     def show(split: "Split", collected: "Collected") -> None:
         if split not in bars:
             bars[split] = progress.add_task("", total=collected.of)
-        text = f"worlds of {split}, {collected.views} views"
+        cut = f", {collected.overflowed} with more subgoals than are recorded" if collected.overflowed else ""
+        text = f"worlds of {split}, {collected.views} views{cut}"
         progress.update(bars[split], completed=collected.worlds, description=text)
 
     return show

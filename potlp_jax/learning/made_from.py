@@ -54,12 +54,14 @@ def share_worlds(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Whether two data sets are known to have simulated worlds in common: numbers of one split of one environment."""
     if any(one.get(name) != other.get(name) for name in ("environment", "split")):
         return False
-    bounds = [(data.get("first_world"), data.get("worlds")) for data in (one, other)]
-    # Robots' logs have no such numbers.
-    if not all(isinstance(first, int) and isinstance(count, int) for first, count in bounds):
-        return False
-    (first, count), (second, others) = bounds
-    return first < second + others and second < first + count
+    mine, its = _world_numbers(one), _world_numbers(other)
+    return max(mine.start, its.start) < min(mine.stop, its.stop)
+
+
+def _world_numbers(data: Mapping[str, Any]) -> range:
+    """Numbers of a data set's worlds; none where it does not say them, as robots' logs do not."""
+    first, count = data.get("first_world"), data.get("worlds")
+    return range(first, first + count) if isinstance(first, int) and isinstance(count, int) else range(0)
 
 
 def nearest_of(metadata: Mapping[str, Any]) -> bool | None:
