@@ -6,8 +6,6 @@ import numbers
 from collections.abc import Callable, Iterable
 from typing import Any
 
-import numpy as np
-
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
@@ -62,6 +60,9 @@ def as_python_numbers(config: Any) -> None:
 
 
 def _as_python(value: Any) -> Any:
+    # Here, for help and completion of the commands load this module, and shall not wait for numpy.
+    import numpy as np
+
     if isinstance(value, tuple):
         return tuple(map(_as_python, value))
     if isinstance(value, bool | np.bool_):
