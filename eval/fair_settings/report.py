@@ -33,6 +33,11 @@ def _introduction() -> list[str]:
         "world, all tasks of a world resampled together) lies below 0 in both; otherwise the default stays. The JSON",
         "file holds the chosen settings as `policy_settings` of a [sweep's file](../sweeps.md).",
         "",
+        "```sh",
+        "python -m eval.fair_settings FAMILY --policies baseline --worlds 20 --out out/fair    # or baseline,potlp",
+        "python -m eval.fair_settings --out out/fair --report docs/results/fair_settings",
+        "```",
+        "",
     ]
 
 

@@ -289,9 +289,8 @@ def _of_environment(results: Mapping[str, Any], before: str) -> str:
 def _foot(results: Mapping[str, Any], data: str) -> Iterator[str]:
     yield "**Command.** The same command goes on where it was stopped, and with more worlds or another estimator."
     yield ""
-    environment = _of_environment(results, " --environment ")
-    report = Path("docs", "results", Path(data).stem)
-    yield from ("```sh", f"python -m eval.limit --out out/limit{environment} --report {report}", "```", "")
+    # As it was given: number of worlds and of drawn buildings are part of what the table is.
+    yield from ("```sh", results["provenance"]["command"].replace(" --as-it-is", ""), "```", "")
     yield f"Worlds of the split {results['split']}, the first of each task in which it is possible. Tasks:"
     yield ""
     yield from (f"- {name}: `{table['task']}`" for name, table in results["tables"].items())
