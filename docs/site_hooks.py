@@ -14,6 +14,8 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "potlp_jax"
 NOT_FOR_CALLERS = ("cli",)
 """Rooms without an API page: the command line is called by its commands."""
+_PAGES = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changes.md"}
+_NOTEBOOK, _PUBLIC = r"notebooks/\w+\.ipynb", "potlp_jax/__init__.py"
 
 
 def on_config(config: Any) -> Any:
@@ -44,13 +46,33 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Keep numbers, units and errors of a table's cell on one line."""
-    lines = markdown.split("\n")
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Lead links to files of the repository to their pages; keep numbers, units and errors of a cell on one line."""
+    lines = to_pages(markdown, "../" * page.file.src_uri.count("/")).split("\n")
     return "\n".join(
         re.sub(r"(?<=\d) (?=%|± )|(?<=±) ", "\N{NO-BREAK SPACE}", line) if line.startswith("|") else line
         for line in lines
     )
+
+
+def to_pages(markdown: str, up: str) -> str:
+    """A page whose links to notebooks, to the package and to texts at the root lead to the pages made of them.
+
+    Args:
+        markdown: the page.
+        up: the way from its folder to ``docs/``.
+    """
+
+    def led(link: re.Match[str]) -> str:
+        file = Path(link["file"])
+        if file.parts[0] == "notebooks":
+            page = f"notebooks/{file.stem}.md"
+        else:
+            page = "api/index.md" if file.name == "__init__.py" else _PAGES[file.name]
+        return f"]({up}{page}{link['anchor'] or ''})"
+
+    files = "|".join((*_PAGES, _NOTEBOOK, _PUBLIC))
+    return re.sub(rf"\]\({re.escape(up)}\.\./(?P<file>{files})(?P<anchor>#[\w-]+)?\)", led, markdown)
 
 
 def packages() -> list[str]:

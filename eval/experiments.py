@@ -49,7 +49,9 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="python -m eval.compact_rows {all}/table1-export/rows.csv docs/results/table1/rows.csv.gz",
     ),
     # Its trials are compared with the rows of Table I, world by world.
-    "observer": Experiment(page="table1", command="python -m eval.limit --out {out} --worlds 80 --arms ideal-observer"),
+    "observer": Experiment(
+        page="table1", command="python -m eval.limit --out {out} --worlds 750 --arms ideal-observer"
+    ),
     "beside": Experiment(
         page="table1",
         command="python -m eval.limit.beside docs/results/table1/rows.csv.gz {all}/observer "
@@ -126,9 +128,30 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="python -m eval.held_out docs/results/panorama/rows.csv.gz --estimator firefighting-panorama "
         "--out {out} --processes {processes} --report docs/results/panorama/held_out",
     ),
+    # The rows of all families go to one folder.
+    "fair": Experiment(
+        page="fair_settings",
+        command="python -m eval.fair_settings firefighting --policies baseline,potlp --worlds 20 --out {out}",
+    ),
+    "fair-delivery": Experiment(
+        page="fair_settings",
+        command="python -m eval.fair_settings delivery --policies baseline,potlp --worlds 20 --out {all}/fair",
+    ),
+    "fair-parcels": Experiment(
+        page="fair_settings",
+        command="python -m eval.fair_settings parcels --policies baseline --worlds 20 --out {all}/fair",
+    ),
+    "fair-small": Experiment(
+        page="fair_settings",
+        command="python -m eval.fair_settings campus-small-parcels --policies baseline --worlds 20 --out {all}/fair",
+    ),
+    "fair-medium": Experiment(
+        page="fair_settings",
+        command="python -m eval.fair_settings campus-medium-parcels --policies baseline --worlds 20 --out {all}/fair",
+    ),
     "fair-settings": Experiment(
         page="fair_settings",
-        command="python -m eval.fair_settings firefighting --out {out} --report docs/results/fair_settings",
+        command="python -m eval.fair_settings --out {all}/fair --report docs/results/fair_settings",
     ),
     "calibration": Experiment(page="calibration", command="python -m eval.calibrate_firefighting --worlds 100"),
     "delivery": Experiment(

@@ -21,6 +21,14 @@ from pathlib import Path
 import pytest
 import yaml
 
+from docs.site_hooks import to_pages
+from eval import settings_page
+from potlp_jax.learning.panorama_learner import PanoramaOptions
+from potlp_jax.planning.search.config import UctConfig
+from potlp_jax.recipes.collection import CollectConfig
+from potlp_jax.recipes.fitting import FitConfig
+from potlp_jax.recipes.recipe import Beside, Recipe, Round
+from potlp_jax.trials.config import TrialConfig
 from tests.reference.mentions import parse_module, parse_potlp
 
 ROOT = Path(__file__).parent.parent
@@ -48,8 +56,6 @@ KNOWN_PROGRAMS = {
     ".",
 }
 FOLDERS = ("docs", "eval", "tests", "notebooks", "examples", "potlp_jax")
-GENERATED = ("api/", "notebooks/", "contributing.md", "changes.md")
-"""Pages that docs/site_hooks.py makes; `mkdocs build --strict` checks links to them."""
 
 
 def _name(path):
@@ -162,8 +168,6 @@ def test_links_resolve(page):
         if re.match(r"https?:", target):
             continue
         path, _, anchor = target.partition("#")
-        if path.startswith(GENERATED):
-            continue
         file = (page.parent / path).resolve() if path else page
         assert file.exists(), f"{target} does not exist"
         if anchor:
@@ -175,6 +179,25 @@ def test_no_formula_in_a_table_has_a_backslash(page):
     """The site would show it; ``<code>`` with ``&#124;`` is read alike there and in the repository."""
     for line in page.read_text("utf-8").splitlines():
         assert not (line.startswith("|") and re.search(r"`[^`|]*\\\|[^`]*`", line)), line
+
+
+def test_the_page_of_settings_is_that_of_the_code():
+    assert (ROOT / settings_page.PAGE).read_text("utf-8") == settings_page.page()
+
+
+def test_every_setting_has_a_meaning():
+    owners = (TrialConfig, UctConfig, CollectConfig, FitConfig, PanoramaOptions, Recipe, Round, Beside)
+    rows = [row for owner in owners for row in settings_page.rows_of(owner)]
+    assert {"decision.commitment", "spacing", "training.warmup", "explored.pursued"} <= {name for name, _, _ in rows}
+    assert [name for name, _, meaning in rows if not meaning] == []
+
+
+@pytest.mark.parametrize("up", ["", "../"])
+def test_links_to_files_of_the_repository_lead_to_the_pages_of_the_site(up):
+    page = f"[a]({up}../notebooks/1_first_plan.ipynb) [b]({up}../CHANGELOG.md#fixed) "
+    page += f"[c]({up}../potlp_jax/__init__.py) [d](x.md)"
+    site = f"[a]({up}notebooks/1_first_plan.md) [b]({up}changes.md#fixed) [c]({up}api/index.md) [d](x.md)"
+    assert to_pages(page, up) == site
 
 
 def test_the_navigation_has_every_page():

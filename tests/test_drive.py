@@ -842,6 +842,28 @@ def test_the_command_says_that_it_was_interrupted_before_the_first_decision(serv
     assert not list(tmp_path.rglob(RECORD))
 
 
+@pytest.mark.parametrize(
+    ("said", "policy"),
+    [
+        ([], "baseline"),
+        (["--estimator", "firefighting"], "potlp"),
+        (["--estimator", "firefighting", "-p", "baseline"], "baseline"),
+    ],
+)
+def test_the_command_asks_the_estimator_that_is_named(server, monkeypatch, said, policy):
+    pytest.importorskip("roslibpy")
+    asked = []
+
+    def drive_robot(link, task, policy, key, config, **_):
+        asked.append(policy)
+        return iter(())
+
+    monkeypatch.setattr("potlp_jax.drive.driving.drive_robot", drive_robot)
+    arguments = ["--task", TASK.text, "--propositions", ",".join(FLOOR.propositions), *said]
+    CliRunner().invoke(app, ["drive", f"127.0.0.1:{server.port}", *arguments])
+    assert asked == [policy]
+
+
 @pytest.mark.parametrize("broken", [False, True])
 def test_the_command_keeps_the_record_of_a_drive_that_ends_by_an_error_too(server, tmp_path, monkeypatch, broken):
     pytest.importorskip("roslibpy")

@@ -1,6 +1,7 @@
 """Environments, policies, cameras and estimators of others, by ``module:attribute`` and by entry point."""
 
 import sys
+from typing import ClassVar
 
 import pytest
 
@@ -15,8 +16,10 @@ from potlp_jax.planning.policies import Policy, named_policy
 from potlp_jax.sweep.runner import RESULTS, run_sweep
 from potlp_jax.sweep.specification import specification_from_dict, specification_from_store
 from potlp_jax.sweep.store import Store
+from potlp_jax.trials.config import trial_config_for
 from potlp_jax.trials.replay import replay_decision
 from potlp_jax.trials.run import run
+from potlp_jax.world.grid import world_digest, world_from_dict, world_to_dict
 
 MODULE = """
 import jax.numpy as jnp
@@ -90,6 +93,18 @@ def installed(elsewhere):
     lines = ["[potlp_jax.environments]", "small = foreign_worlds:Small", "gone = foreign_worlds:Gone"]
     (folder / "entry_points.txt").write_text("\n".join(lines))
     sys.path.insert(0, str(elsewhere))
+
+
+def test_settings_of_a_family_may_be_a_dictionary():
+    class Impatient(Toy):
+        name = "impatient"
+        settings: ClassVar = {"replan_distance": 2, "decision": {"frontiers": {"max_subgoals": 3}}}
+
+    world = Impatient().world(0)
+    hash(world.settings)
+    assert trial_config_for(world) == trial_config_for(Impatient())
+    assert trial_config_for(world).decision.frontiers.max_subgoals == 3
+    assert world_digest(world_from_dict(world_to_dict(world))) == world_digest(world)
 
 
 @pytest.mark.parametrize(("name", "height"), [("Small", 5), ("made", 5), ("tall", 11)])

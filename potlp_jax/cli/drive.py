@@ -100,11 +100,14 @@ def drive(
     follow: Annotated[bool, typer.Option("--follow", help="Send paths to Nav2: FollowPath.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Decide once, and publish nothing.")] = False,
     policy: Annotated[
-        str,
+        str | None,
         typer.Option(
-            "--policy", "-p", help="baseline, optimistic, or potlp with an --estimator.", autocompletion=complete_policy
+            "--policy",
+            "-p",
+            help="baseline, optimistic or potlp; default: potlp with an --estimator, baseline without.",
+            autocompletion=complete_policy,
         ),
-    ] = "baseline",
+    ] = None,
     estimator: EstimatorName = None,
     resolution: Annotated[float, typer.Option("--resolution", help="Metres a cell of the planner.")] = 0.2,
     radius: Annotated[
@@ -136,6 +139,7 @@ def drive(
     from potlp_jax.drive.driving import drive_robot
     from potlp_jax.drive.rosbridge import RosbridgeLink
     from potlp_jax.environments.ros.places import load_places
+    from potlp_jax.planning.policies import Policy
     from potlp_jax.task.reading import read_task
     from potlp_jax.trials.loop import BrokenDriveError
     from potlp_jax.trials.record import Outcome
@@ -177,7 +181,7 @@ def drive(
             for trial in drive_robot(
                 link,
                 asked,
-                policy,
+                policy or (Policy.BASELINE if estimator is None else Policy.POTLP),
                 jax.random.key(0),
                 config,
                 places=places,

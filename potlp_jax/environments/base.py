@@ -42,7 +42,7 @@ class Generator(abc.ABC):
     propositions: tuple[str, ...]
     # Defaults, so that a family of one's own has to say only what is special about it.
     tasks: Mapping[str, str] = MappingProxyType({})
-    settings: Settings = NO_SETTINGS
+    settings: Mapping[str, Any] = NO_SETTINGS
     family: str = ""
     config: Any = None
 
@@ -75,7 +75,8 @@ class Generator(abc.ABC):
         )
         # A world that says itself what it needs cannot be run with the settings, or the estimator, of another family by
         # oversight.
-        return dataclasses.replace(world, settings=self.settings, family=self.family or self.name)
+        # A family may write them as a dictionary; a world's are static under jit, and so have a hash.
+        return dataclasses.replace(world, settings=Settings(self.settings), family=self.family or self.name)
 
     def world(self, index: int, split: Split | str | None = None) -> World:
         """World number ``index`` of a split, by default of that from which the command line takes its worlds.

@@ -29,7 +29,8 @@ class BuildingConfig:
         success_cost_scale, failure_cost_scale: unit of the outputs R_S and R_F, and of their errors in the loss
             (standard deviations over the training data).
         step: the least R_S, one step of the grid, in the unit of cost.
-        exclusive_within: as in ``NetworkConfig``.
+        exclusive_within: subgoals so many cells apart exclude each other (``learning.exclusion.exclusive_chances``); 0:
+            attempts are independent, as in Eq. 3.
         glances: whether cells of which a part alone is in sight are painted, too, as in the training data
             (``learning.painting.paint``); networks of files that do not say it were trained without.
         own_within: squares around a subgoal within which a path through what is imagined does not come out again: what

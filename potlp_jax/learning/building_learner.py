@@ -133,7 +133,11 @@ class BuildingLearner:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class BuildingOptions:
-    """What can be chosen of a building network, as in ``BuildingConfig``, the rest of which follows from the data."""
+    """What can be chosen of a building network: ``BuildingConfig`` explains it, and its rest follows from the data.
+
+    Attributes:
+        kind: ``building``.
+    """
 
     kind: Literal["building"] = "building"
     widths: tuple[int, ...] = BuildingConfig.widths

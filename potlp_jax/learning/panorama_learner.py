@@ -89,6 +89,7 @@ class PanoramaOptions:
     """What can be chosen of a panorama network; the rest of ``NetworkConfig`` follows from the data.
 
     Attributes:
+        kind: ``panorama``.
         fovea: columns of pixels on each side of a subgoal that the network sees at full resolution; 0 for none.
         second_widths: channels of the eight convolutions after phi is joined.
         exclusive_within: cells within which subgoals exclude each other, as ``eval.exclusion`` measures; 0: nowhere.

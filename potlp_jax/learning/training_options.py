@@ -15,11 +15,12 @@ class TrainingOptions:
         seed: of the parameters, the order of the data and the augmentation.
         views_per_batch, samples_per_view: views in a batch, and samples of each; a view with more samples gives
             a new random choice in every epoch, one with fewer is padded.
-        learning_rate: the peak, after a linear rise over ``warmup`` of all steps, then a cosine to 0.
+        learning_rate: the peak, after a linear rise, then a cosine to 0.
+        warmup: share of all steps over which the learning rate rises.
         weight_decay: of AdamW.
         clip_norm: the gradient is scaled down to this norm.
         average_decay: of the moving average of the parameters that is evaluated and kept; 0 for none.
-        weighting: 1: the cross-entropy weighted by what mistakes cost; 0: not weighted; between: a mix.
+        weighting: 1: the cross-entropy weighted by what mistakes cost; 0: not weighted; anything between is a mix.
         cost_share: factor of both cost terms.
         view_share: factor of what the network says of a view beside its answers.
         augmentation: how views are varied.
