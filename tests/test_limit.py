@@ -226,19 +226,22 @@ def test_shares_and_what_each_part_brings(tmp_path):
     data.write_text(json.dumps(results))
     text = page(results, data)
     assert "true P_S add 60.0 points and true R_S and R_F take 30.0 points" in text
-    assert "could be told from none" not in text
+    assert "Of these differences true P_S in task 1, true R_S and R_F in task 1 alone can be told from none." in text
     wide = {"gain": 0.6, "low": -0.1, "high": 0.9}
     table = {**results["tables"]["1"], "gains": {"true-chances": wide, "true-costs": wide}}
-    assert "R_S and R_F could be told from none." in page({**results, "tables": {"1": table}}, data)
+    assert "none of true P_S or of true R_S and R_F can be told from none." in page(
+        {**results, "tables": {"1": table}}, data
+    )
     assert lines_of(text, tmp_path) == text
     assert text.count("<!-- made: limit.json -->\n*Made by") == 2
     assert page(json.loads(data.read_text()), data) == text
     assert "| 20.0 % (20 to 20) |" in text
     assert "| +60.0 (+60 to +60) |" in text
-    # Of floors the observer has the plan, and the command names the family.
-    floors = page({**results, "environment": "delivery"}, data)
+    # Of floors the observer has the plan; the command is the one that was given.
+    given = {**results["provenance"], "command": "python -m eval.limit --out x --as-it-is --worlds 5"}
+    floors = page({**results, "environment": "delivery", "provenance": given}, data)
     assert "# The limit of estimates: delivery" in floors
-    assert "--environment delivery --report docs/results/limit\n" in floors
+    assert "```sh\npython -m eval.limit --out x --worlds 5\n```" in floors
     # Without PO-TLP there is nothing that gains are over.
     without = results_of([row for row in rows if row["arm"] != Arm.POTLP], {"1": "F a"})
     assert markdown(without).count("| task |") == 1

@@ -43,6 +43,10 @@ OBSERVERS = {
 PARTS = (Arm.TRUE_CHANCES, Arm.TRUE_COSTS)
 """The truth in place of one part of the answers."""
 
+_EDGE = 5e-4
+# An interval that ends nearer to none ends beyond it with another seed of the bootstrap.
+_TRUE = {Arm.TRUE_CHANCES: "true P_S", Arm.TRUE_COSTS: "true R_S and R_F"}
+
 OTHER_OBSERVER = (
     "who may be where, given the floor plan, every mapped cell and letter, and whether a room is lit, of every room of "
     "which a floor cell has been in line of sight from any cell that was entered. Having the plan, it bounds from "
@@ -168,17 +172,19 @@ def _answer(results: Mapping[str, Any]) -> str:
         limit = "" if ideal is None else f"the ideal observer reaches {100 * ideal:.0f} %, "
         gains = {arm: table["gains"][arm]["gain"] for arm in PARTS if arm in table["gains"]}
         told = " and ".join(
-            f"true {'P_S' if arm is Arm.TRUE_CHANCES else 'R_S and R_F'} {'add' if gain >= 0 else 'take'} "
-            f"{100 * abs(gain):.1f} points"
-            for arm, gain in gains.items()
+            f"{_TRUE[arm]} {'add' if gain >= 0 else 'take'} {100 * abs(gain):.1f} points" for arm, gain in gains.items()
         )
         sentences.append(f"Task {name}: {limit}PO-TLP {100 * shares[Arm.POTLP]:.0f} %{'; ' + told if told else ''}.")
-    differences = [
-        table["gains"][arm] for table in results["tables"].values() for arm in PARTS if arm in table["gains"]
-    ]
-    known = [gain for gain in differences if gain["low"] is not None]
-    if known and all(gain["low"] <= 0 <= gain["high"] for gain in known):
-        sentences.append("None of these differences of true P_S or of true R_S and R_F could be told from none.")
+    differences = {
+        f"{_TRUE[arm]} in task {name}": gain
+        for name, table in results["tables"].items()
+        for arm in PARTS
+        if (gain := table["gains"].get(arm, {"low": None}))["low"] is not None
+    }
+    certain = [name for name, gain in differences.items() if gain["low"] > _EDGE or gain["high"] < -_EDGE]
+    if differences:
+        told = f"{', '.join(certain)} alone" if certain else "none of true P_S or of true R_S and R_F"
+        sentences.append(f"Of these differences {told} can be told from none.")
     counts = [table["satisfied"]["pairs"] for table in results["tables"].values()]
     number = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
     return f"In {number} {results['split']} worlds a task: {' '.join(sentences)}"
