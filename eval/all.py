@@ -130,12 +130,13 @@ def _run(run: Run, name: str, log: TextIO) -> int:
 
 def listing() -> str:
     """The table of ``--list``."""
-    rows = [("experiment", "page", "hours", "command")]
+    rows = [("experiment", "page", "minutes", "command")]
     for name, experiment in EXPERIMENTS.items():
-        hours = "?" if experiment.hours is None else f"{experiment.hours:.1f}"
-        rows.append((name, experiment.page, hours, experiment.command))
+        rows.append((name, experiment.page, str(experiment.minutes or "?"), experiment.command))
     names, pages = (max(len(row[column]) for row in rows) for column in (0, 1))
-    return "\n".join(f"{name:{names}}  {page:{pages}}  {hours:>5}  {command}" for name, page, hours, command in rows)
+    return "\n".join(
+        f"{name:{names}}  {page:{pages}}  {minutes:>7}  {command}" for name, page, minutes, command in rows
+    )
 
 
 def main() -> int:

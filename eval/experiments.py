@@ -12,14 +12,15 @@ class Experiment:
         page: of docs/results, that shows what the command gives.
         command: as its page has it; ``{out}`` is a folder of its own, ``{all}`` that of all experiments, ``{data}`` the
             folder of others' data, ``{processes}`` how many there may be.
-        hours: on two cores that do nothing else; None where it was never run alone and whole.
+        minutes: on two quick cores, of which another experiment may have had one; 1 for less; None where it was not run
+            whole since times are kept.
         one_core: whether it measures times, so that it is kept on one core.
         variables: of the environment.
     """
 
     page: str
     command: str
-    hours: float | None = None
+    minutes: int | None = None
     one_core: bool = False
     variables: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
@@ -40,17 +41,24 @@ EXPERIMENTS: dict[str, Experiment] = {
     "table1": Experiment(
         page="table1",
         command="python -m eval.table1 --out {out} --processes {processes} --report docs/results/table1/test",
-        hours=0.5,
+        minutes=24,
     ),
     # In little space, for what reads it beside other trials.
-    "table1-export": Experiment(page="table1", command="potlp sweep export {all}/table1 --out {out}/rows.csv"),
+    "table1-export": Experiment(
+        page="table1",
+        command="potlp sweep export {all}/table1 --out {out}/rows.csv",
+        minutes=1,
+    ),
     "table1-rows": Experiment(
         page="table1",
         command="python -m eval.compact_rows {all}/table1-export/rows.csv docs/results/table1/rows.csv.gz",
+        minutes=1,
     ),
     # Its trials are compared with the rows of Table I, world by world.
     "observer": Experiment(
-        page="table1", command="python -m eval.limit --out {out} --worlds 750 --arms ideal-observer"
+        page="table1",
+        command="python -m eval.limit --out {out} --worlds 750 --arms ideal-observer",
+        minutes=98,
     ),
     "beside": Experiment(
         page="table1",
@@ -58,50 +66,62 @@ EXPERIMENTS: dict[str, Experiment] = {
         "--report docs/results/table1/observer",
     ),
     "limit": Experiment(
-        page="limit", command="python -m eval.limit --out {out} --worlds 60 --report docs/results/limit"
+        page="limit",
+        command="python -m eval.limit --out {out} --worlds 60 --report docs/results/limit",
+        minutes=24,
     ),
     "limit-delivery": Experiment(
         page="limit_delivery",
         command="python -m eval.limit --out {out} --environment delivery --worlds 16 --buildings 8 "
         "--report docs/results/limit_delivery",
+        minutes=2,
     ),
     "worst": Experiment(
         page="worst",
         command="python -m eval.limit.worst {all}/table1 --out {out} --trials 40 --report docs/results/worst",
+        minutes=4,
     ),
     # The estimator on what it meets itself and on what the explorer meets, in buildings that chose nothing.
     "own": Experiment(
         page="estimator",
         command=f"{_COLLECTED} {_DRIVEN} --worlds 40 --set views_per_world=10 --set spacing=[10,120]",
+        minutes=1,
     ),
     "explored": Experiment(
         page="estimator",
         command=f"{_COLLECTED} --worlds 60 --set first_world=3100 --set views_per_world=5 --set spacing=[10,120] "
         "--set pursued=2",
+        minutes=1,
     ),
     "means": Experiment(
         page="estimator",
         command=f"{_COLLECTED} {_DRIVEN} --worlds 40 --set views_per_world=20 --set spacing=[4,40] --set posterior=16",
+        minutes=1,
     ),
     "f-own": Experiment(
         page="estimator",
         command=f"potlp estimator evaluate {_SHIPPED}firefighting.npz {{all}}/own --ablate all --out {{out}}",
+        minutes=1,
     ),
     "f-explored": Experiment(
         page="estimator",
         command=f"potlp estimator evaluate {_SHIPPED}firefighting.npz {{all}}/explored --out {{out}}",
+        minutes=1,
     ),
     "p-own": Experiment(
         page="estimator",
         command=f"potlp estimator evaluate {_SHIPPED}firefighting-panorama.npz {{all}}/own --out {{out}}",
+        minutes=1,
     ),
     "p-explored": Experiment(
         page="estimator",
         command=f"potlp estimator evaluate {_SHIPPED}firefighting-panorama.npz {{all}}/explored --out {{out}}",
+        minutes=1,
     ),
     "excess": Experiment(
         page="estimator",
         command="python -m eval.limit.excess firefighting --data {all}/means --report docs/results/estimator/excess",
+        minutes=1,
     ),
     "ablations": Experiment(
         page="ablations",
@@ -112,6 +132,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="estimator",
         command="python -m eval.held_out docs/results/table1/rows.csv.gz --out {out} --processes {processes} "
         "--report docs/results/estimator/held_out",
+        minutes=5,
     ),
     "panorama": Experiment(
         page="panorama",
@@ -237,15 +258,17 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="python -m eval.training_curve {all}/recipe-parcels --environment campus-small-parcels --worlds 100 "
         "--out {out} --report docs/results/delivery/curve_parcels",
     ),
-    "floors": Experiment(page="floors", command="python -m eval.floor_statistics", variables=_OTHERS),
+    "floors": Experiment(page="floors", command="python -m eval.floor_statistics", variables=_OTHERS, minutes=1),
     "buildings": Experiment(
         page="buildings",
         command="python -m eval.buildings --data {data} --out {out}/rows.jsonl --most 6 "
         "--report docs/results/buildings",
+        minutes=54,
     ),
     "commits": Experiment(
         page="commits",
         command="python -m eval.commits --pairs 10000 --out {out}/rows.jsonl --report docs/results/commits.json",
+        minutes=10,
     ),
     "trials": Experiment(
         page="trials",
@@ -253,7 +276,10 @@ EXPERIMENTS: dict[str, Experiment] = {
         variables=_OTHERS,
     ),
     "live": Experiment(
-        page="live", command="python -m eval.live --streams 1000 --out docs/results/live.json", variables=_OTHERS
+        page="live",
+        command="python -m eval.live --streams 1000 --out docs/results/live.json",
+        variables=_OTHERS,
+        minutes=2,
     ),
     "live-recorded": Experiment(
         page="live",
@@ -313,6 +339,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="python -m eval.bench.distances --repeats 3 --out docs/results/planner/distances.json "
         "--plot docs/results/planner/distances.png",
         one_core=True,
+        minutes=1,
     ),
     "native": Experiment(page="planner", command="python -m eval.bench.native", one_core=True),
     "ended": Experiment(
