@@ -341,7 +341,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         one_core=True,
         minutes=1,
     ),
-    "native": Experiment(page="planner", command="python -m eval.bench.native", one_core=True),
+    "native": Experiment(page="planner", command="python -m eval.bench.native", one_core=True, minutes=7),
     "ended": Experiment(
         page="planner", command="python -m eval.bench.ended --instances 60 --simulations 500 --seconds 2 --out {out}"
     ),

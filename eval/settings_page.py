@@ -32,8 +32,8 @@ from potlp_jax.world.sensing import SensorConfig
 
 PAGE: Path = Path("docs/settings.md")
 
-_MEANT: dict[type, type] = {BuildingOptions: BuildingConfig}
 # A class of options whose fields another class explains.
+_MEANT: dict[type, type] = {BuildingOptions: BuildingConfig}
 
 _HEAD = """# All settings
 
@@ -43,6 +43,7 @@ this page). A dot leads into a group: in a file `decision.frontiers.min_size` is
 Environments have defaults of their own for some of them, which `settings` of their generators hold.
 """
 
+# The tables of each section: what stands before it, whose settings, and of which group.
 _SECTIONS: tuple[tuple[str, tuple[tuple[str, type, str], ...]], ...] = (
     (
         "Trials",
@@ -92,8 +93,8 @@ trials have, too, is as in the family's trials where nothing else is said.""",
         ),
     ),
 )
-# The tables of each section: what stands before it, whose settings, and of which group.
 
+# Groups that stand in one place, and are named in others.
 _ELSEWHERE: dict[type, str] = {
     FrontierConfig: "as `decision.frontiers` of trials",
     CameraConfig: "as `camera` of trials",
@@ -102,7 +103,6 @@ _ELSEWHERE: dict[type, str] = {
     CollectConfig: "as in *Collecting*",
     FitConfig: "as in *Fitting*",
 }
-# Groups that stand in one place, and are named in others.
 
 
 def meanings(owner: type) -> dict[str, str]:

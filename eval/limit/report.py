@@ -43,8 +43,8 @@ OBSERVERS = {
 PARTS = (Arm.TRUE_CHANCES, Arm.TRUE_COSTS)
 """The truth in place of one part of the answers."""
 
-_EDGE = 5e-4
 # An interval that ends nearer to none ends beyond it with another seed of the bootstrap.
+_EDGE = 5e-4
 _TRUE = {Arm.TRUE_CHANCES: "true P_S", Arm.TRUE_COSTS: "true R_S and R_F"}
 
 OTHER_OBSERVER = (
