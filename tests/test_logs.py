@@ -149,7 +149,7 @@ def test_a_dataset_from_a_bag_has_the_rows_of_the_simulator(bags, tmp_path, kind
     pool = [TaskDistribution(TOY.propositions).draw(rng) for _ in range(2)]
     record_views(recorder, WORLD, _simulated_poses(), pool, rng, lambda _, step: panorama_of(step), most=200)
     expected = pd.DataFrame(recorder.samples)
-    assert count == len(views) == len(recorder.views["view"]) > 2
+    assert count.views == len(views) == len(recorder.views["view"]) > 2
     assert set(samples["success_probability"]) == {0.0, 1.0}
     for name in samples.columns:
         if samples[name].dtype.kind == "f":
@@ -448,6 +448,7 @@ def test_bags_become_one_dataset(bags, tmp_path):
     assert len(samples.success) == data["samples"]
     assert (samples.metadata.environment, samples.metadata.unit) == ("office", "metres")
     assert len(decode(samples.images[0])) == CameraConfig().height
+    assert set(data["overflowed"].values()) == {0}
     again = _potlp(*command, "--out", tmp_path)
     assert again.exit_code == 2
     assert "choose an empty folder" in again.stderr

@@ -70,6 +70,7 @@ def collect(
     from potlp_jax.engine.opening import open_engine
     from potlp_jax.environments.registry import make
     from potlp_jax.learning.dataset_reading import read_dataset
+    from potlp_jax.learning.recording import overflow_in_words
     from potlp_jax.recipes import collection
 
     chosen = _chosen(environment, recipe)
@@ -90,8 +91,9 @@ def collect(
 
         collection.collect(generator, chosen.environment, of_split, number, folder, config, engine, tell)
     console().print(collection.summary(read_dataset(folder)))
-    if overflow := collection.overflow_in_words(told[-1], config):
-        console().print(overflow)
+    most, now = config.frontiers.max_subgoals, told[-1]
+    if overflow := overflow_in_words(now.views, now.overflowed, most, "--set frontiers.max_subgoals="):
+        console().print(overflow, soft_wrap=True)
 
 
 def _chosen(environment: str | None, recipe: str | None) -> "Recipe":

@@ -144,6 +144,9 @@ def logs_to_dataset(
         str, typer.Option("--split", help="What the dataset is for: training, validation, ...")
     ] = "training",
     views: Annotated[int, typer.Option("--views", min=1, help="Views of each bag, at most.")] = 200,
+    subgoals: Annotated[
+        int, typer.Option("--subgoals", min=1, help="Subgoals of each view that are asked about, the nearest.")
+    ] = 12,
     seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="Of the tasks asked about, and the spacing.")] = 0,
     resolution: Resolution = None,
     radius: Radius = 0.1,
@@ -156,14 +159,21 @@ def logs_to_dataset(
     from potlp_jax.environments.ros.places import load_places
     from potlp_jax.learning.dataset_reading import read_dataset
     from potlp_jax.learning.questions import HELD_OUT
+    from potlp_jax.learning.recording import overflow_in_words
     from potlp_jax.logs.collecting import LogCollectConfig, collect_drives
     from potlp_jax.logs.working_grid import GridConfig
+    from potlp_jax.world.frontiers import FrontierConfig
 
     if len({bag.resolve() for bag in bags}) < len(bags):
         fail("a log is given twice: its views would count twice")
     # `office.places.yaml` are the places of office.
     name = labels.name.split(".")[0] if environment is None else environment
-    collecting = LogCollectConfig(views_per_world=views, seed=seed, held_out=HELD_OUT.get(name, ()))
+    collecting = LogCollectConfig(
+        views_per_world=views,
+        frontiers=FrontierConfig(max_subgoals=subgoals),
+        seed=seed,
+        held_out=HELD_OUT.get(name, ()),
+    )
     with progress_bar() as progress:
         progress.add_task("reading and labelling (the first view compiles)", total=None)
         drives = [_read_drive(bag, labels, reading.config(), GridConfig(resolution, radius)) for bag in bags]
@@ -173,7 +183,8 @@ def logs_to_dataset(
     holds = samples.success > 0
     summary = {
         "dataset": str(out),
-        "views": dict(zip(map(str, bags), counts, strict=True)),
+        "views": {str(bag): counted.views for bag, counted in zip(bags, counts, strict=True)},
+        "overflowed": {str(bag): counted.overflowed for bag, counted in zip(bags, counts, strict=True)},
         "samples": len(holds),
         "successes": int(holds.sum()),
         "propositions": list(samples.metadata.propositions),
@@ -182,8 +193,10 @@ def logs_to_dataset(
         print_json(summary)
     else:
         out_console = console()
-        for bag, count in summary["views"].items():
-            out_console.print(f"{bag}: {count} views")
+        for bag, counted in zip(bags, counts, strict=True):
+            out_console.print(f"{bag}: {counted.views} views")
+            if overflow := overflow_in_words(counted.views, counted.overflowed, subgoals, "--subgoals "):
+                out_console.print(f"{bag}: {overflow}", soft_wrap=True)
         out_console.print(f"{len(holds)} samples, {int(holds.sum())} successes")
         out_console.print(f"wrote {out}")
     if not len(holds):

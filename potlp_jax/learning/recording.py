@@ -300,6 +300,23 @@ def record_views(
     return recorded
 
 
+def overflow_in_words(views: int, overflowed: int, most: int, option: str) -> str:
+    """What is said where views had more subgoals than are recorded; empty where none had.
+
+    Args:
+        views: that were recorded now.
+        overflowed: of these, the views with more subgoals.
+        most: subgoals that are recorded of a view.
+        option: what records more, before the number.
+    """
+    if not overflowed:
+        return ""
+    return (
+        f"{overflowed} of the {views} views recorded now have more than {most} subgoals: the nearest {most} of each "
+        f"are asked about ({option}{2 * most} records more, into an empty folder)"
+    )
+
+
 def _seen_on_the_way(
     seen: Seen,
     pose: Pose,

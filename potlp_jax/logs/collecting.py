@@ -26,6 +26,19 @@ class LogCollectConfig(recording.RecordingConfig):
     views_per_world: int = 200
 
 
+@dataclasses.dataclass(frozen=True)
+class Counted:
+    """What was recorded of a drive.
+
+    Attributes:
+        views: recorded.
+        overflowed: of these, the views of maps with more subgoals than are recorded.
+    """
+
+    views: int
+    overflowed: int
+
+
 def poses_of(drive: Drive) -> Iterator[scenes.Pose]:
     """The poses of a drive at which there is a picture."""
     travelled = np.cumsum([0.0, *step_lengths(drive.path)]).tolist()
@@ -36,7 +49,7 @@ def poses_of(drive: Drive) -> Iterator[scenes.Pose]:
 
 def collect_drives(
     drives: Sequence[Drive], places: Places, folder: Path, environment: str, split: str, config: LogCollectConfig
-) -> list[int]:
+) -> list[Counted]:
     """Write a dataset with a shard for each drive.
 
     Args:
@@ -48,7 +61,7 @@ def collect_drives(
         config: what is recorded.
 
     Returns:
-        The number of views of each drive.
+        What was recorded of each drive.
 
     Raises:
         LogError: no drive, the drives have cells of different sizes, or not one has a picture.
@@ -86,7 +99,7 @@ def collect_drives(
             unexplored=drive.unexplored(),
         )
         write_shard(folder, number, recorder.worlds, recorder.views, recorder.samples, metadata)
-        counts.append(len(recorder.views["view"]))
+        counts.append(Counted(len(recorder.views["view"]), recorder.overflowed))
     return counts
 
 

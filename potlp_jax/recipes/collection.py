@@ -332,18 +332,6 @@ def _drives(
     return policy_drives(world, tasks, Policy(config.driver), job.estimator, settings, key), len(tasks)
 
 
-def overflow_in_words(collected: Collected, config: CollectConfig) -> str:
-    """What is said where views had more subgoals than are recorded; empty where none had."""
-    if not collected.overflowed:
-        return ""
-    most = config.frontiers.max_subgoals
-    return (
-        f"{collected.overflowed} of the {collected.views} views that were recorded now have more than {most} subgoals: "
-        f"the nearest {most} of each are asked about (--set frontiers.max_subgoals={2 * most} records more, into an "
-        "empty folder)"
-    )
-
-
 def summary(samples: Samples) -> str:
     """Size and balance of a dataset, in words."""
     # The mean and not the share of successes: with ``posterior`` a label is a share itself.
