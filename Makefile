@@ -5,7 +5,7 @@ PYTHON ?= $(shell for name in python3.12 python3.11 python3.13 python3.14 python
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test numbers lint site clean
+.PHONY: demo test long numbers lint site clean
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" && $(PYTHON) -c '$(SUPPORTED)' \
@@ -20,8 +20,11 @@ demo: $(VENV)/installed  ## Fire-fighting task 2 in five worlds: a table, both p
 	@echo "Over 750 worlds PO-TLP costs less than the baseline in 100.0 % and the same in 0.0 %: docs/results/table1.md."
 	@echo "Baseline and PO-TLP side by side: out/demo/world-2.png; PO-TLP decision by decision: out/demo/potlp/trial.gif"
 
-test: $(VENV)/installed  ## The whole suite
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+test: $(VENV)/installed  ## The suite, but for the longest tests: under ten minutes on two cores
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not long'
+
+long: $(VENV)/installed  ## The longest tests, but for those that `make numbers` runs
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'long and not numbers'
 
 numbers: $(VENV)/installed  ## Tests that compare numbers and take long to optimise, compiled as users' programs are
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m numbers --optimised

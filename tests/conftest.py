@@ -1,7 +1,7 @@
 """Strict modes for every test, and how each module's programs are compiled.
 
 No silent rank promotion, no silent dtype promotion. Modules marked ``optimised`` are compiled as users' programs are;
-those marked ``numbers`` too by ``make numbers``, which is part of CI.
+those marked ``numbers`` too by ``make numbers``, which is part of CI, as ``make long`` is.
 """
 
 import atexit
@@ -109,6 +109,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers", "numbers: the module compares numbers and takes minutes to optimise; `make numbers` does"
+    )
+    config.addinivalue_line(
+        "markers",
+        "long: the test takes many seconds; `make long` runs it, or `make numbers` where its module has that mark",
     )
     config.addinivalue_line(
         "markers", "optimised: the module compares numbers, so it and the processes it starts run with XLA's optimiser"

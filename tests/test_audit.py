@@ -438,6 +438,7 @@ State: 1 {0}
 NAMES = ["", 'name: "deliver the mail"', 'name: "goal"', 'name: "1"']
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [*NAMES, 'name: "F goal"'])
 def test_a_sweep_of_an_automaton_is_audited_whatever_becomes_of_its_file(tmp_path, monkeypatch, name):
     file, out = tmp_path / "tasks" / "mail.hoa", tmp_path / "out"

@@ -72,6 +72,7 @@ def ran(request):
     return request.param, starts, finished, batch._run_until_one_ends._cache_size() - before
 
 
+@pytest.mark.long
 def test_every_trial_is_what_it_is_alone(ran):
     policy, starts, finished, _ = ran
     assert len(finished) == len(starts)
@@ -89,6 +90,7 @@ def test_every_trial_is_what_it_is_alone(ran):
     assert kept > 0 or not policy.searches
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("policy", [Policy.OPTIMISTIC, Policy.ORACLE, Policy.POTLP])
 def test_lockstep_without_native_kernels_is_slot_by_slot_with_them(policy, monkeypatch):
     # What accelerators run, against what CPUs run.

@@ -266,6 +266,7 @@ print(json.dumps({"folder": str(folder), "hits": sum(hits), "q": repr(plan.q_val
 """
 
 
+@pytest.mark.long
 def test_a_second_process_finds_what_the_first_compiled(tmp_path):
     first, _ = _run(CACHED, XDG_CACHE_HOME=str(tmp_path))
     second, said = _run(CACHED, XDG_CACHE_HOME=str(tmp_path))

@@ -21,6 +21,7 @@ def setup_of(policy, trials):
     return Setup(policy=policy, config=config), asked_by(policy, trials[0], config)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("policy", [Policy.POTLP, Policy.ORACLE, Policy.BASELINE])
 def test_phases_take_the_decisions_of_a_trial(policy, trials):
     decisions = list(decisions_of(trials[0], *setup_of(policy, trials)))
@@ -31,6 +32,7 @@ def test_phases_take_the_decisions_of_a_trial(policy, trials):
     assert end.cell.tolist() == trial.path[-1].tolist()
 
 
+@pytest.mark.long
 def test_what_is_measured_is_in_the_table(trials):
     setup, asked = setup_of(Policy.BASELINE, trials)
     rows = measure(setup, asked, trials, seconds=0.01)

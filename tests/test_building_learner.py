@@ -135,6 +135,7 @@ def params(learner):
     return jax.tree.unflatten(structure, moved)
 
 
+@pytest.mark.long
 def test_answers_in_training_are_those_of_the_estimator_in_a_trial(learner, params, samples):
     batch = _batch(learner, samples)
     # The class that the samples ask for: the goal, without touching the hazard.
@@ -290,6 +291,7 @@ def test_views_that_fill_a_batch_up_count_nothing(learner, params, samples):
     assert losses[1:].tolist() == [0.0, 0.0]
 
 
+@pytest.mark.long
 def test_it_learns_what_only_the_painting_tells(samples, learner):
     config = TrainingConfig(
         steps=150, views_per_batch=4, samples_per_view=5, learning_rate=5e-3, weighting=0.0, patience=0,

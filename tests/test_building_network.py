@@ -100,6 +100,7 @@ def _asked(params, world: World, formula: str = "!hazard U goal"):
     return eyes, belief, subgoals, task
 
 
+@pytest.mark.long
 def test_worlds_that_look_alike_so_far_get_equal_answers(params):
     answers = []
     for world in (_world(), _world(far_letter=2), _world(far_wall=True)):
@@ -228,6 +229,7 @@ def test_a_place_reads_the_squares_around_its_cell(params):
     assert np.array_equal(before, after(4, 9))
 
 
+@pytest.mark.long
 def test_trials_with_the_network_are_the_same_alone_and_in_a_batch(params):
     world = _world()
     assert isinstance(_estimator(params, world), ObservingEstimator)
@@ -249,6 +251,7 @@ def test_trials_with_the_network_are_the_same_alone_and_in_a_batch(params):
         np.testing.assert_array_equal(trial.path, np.asarray(alone.path))
 
 
+@pytest.mark.long
 def test_subgoals_in_one_square_are_told_apart_by_the_cells_around_them(params):
     """Nothing but the cells themselves, as they are, tells two corners of a square of two by two from each other."""
     rng = np.random.default_rng(5)

@@ -29,6 +29,7 @@ NETWORK = NetworkConfig(
 )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("config", [BestFirstConfig(simulations=20), UctConfig(simulations=20)])
 def test_a_search_within_shard_map_is_the_search(config):
     """With ``check_vma`` as it is by default: each loop's carry is marked as varying from its start."""
@@ -42,6 +43,7 @@ def test_a_search_within_shard_map_is_the_search(config):
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [jnp.int8, jnp.uint8, jnp.uint32, jnp.int16])
 def test_cells_and_states_may_be_whole_numbers_of_any_type(kind):
     world, config = TOY.world(0), DecisionConfig(frontiers=FrontierConfig(max_subgoals=4))
@@ -321,6 +323,7 @@ def test_what_has_another_shape_is_refused_by_name():
         assert line.startswith(said)
 
 
+@pytest.mark.long
 def test_no_key_is_used_twice():
     """In a trial and in a batch of trials: keys of worlds, of the camera's disturbance and of the sampling search."""
     settings = TrialConfig(

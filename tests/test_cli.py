@@ -90,6 +90,7 @@ def test_paragraphs_of_help_break_where_the_terminal_does(monkeypatch):
     assert sum(line.strip().startswith("potlp compare") for line in told.splitlines()) == 2
 
 
+@pytest.mark.long
 def test_the_first_tour_shows_what_it_says(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shown = _potlp("--help").stdout
@@ -138,6 +139,7 @@ def test_task_names_a_word_that_was_taken_apart():
     assert "'Fire' is read as F ire" in result.stderr
 
 
+@pytest.mark.long
 def test_a_doubt_is_one_line_of_run_and_of_compare():
     asked = ("toy", "--task", "F (goal & hazard) & X (goal & hazard)", "--policy", "baseline")
     line = "no place in world 0 of toy/validation has goal and hazard together"
@@ -346,6 +348,7 @@ def test_environments_and_policies_of_others_are_run_by_their_names():
     assert data["outcome"] == "satisfied"
 
 
+@pytest.mark.long
 def test_the_search_is_chosen_by_name(tmp_path):
     chosen = ("toy", "-t", "2", "--search", "uct", "--simulations", "30", "--out", tmp_path)
     assert _potlp("run", *chosen, "--policy", "oracle", "--no-animation").exit_code == 0
@@ -475,6 +478,7 @@ def test_decision_of_a_policy_that_does_not_search(tmp_path):
     assert "no tree" in result.stderr
 
 
+@pytest.mark.long
 def test_compare_reports_pairs_and_writes_its_files(tmp_path):
     result = _potlp(
         "compare", "toy", "--task", "2", "--policies", "oracle", "--trials", "3", "--out", tmp_path, "--json", *FAST

@@ -159,6 +159,7 @@ def _times(folder):
     return {path.name: path.stat().st_mtime_ns for path in folder.iterdir() if path.name != "writer.lock"}
 
 
+@pytest.mark.long
 def test_a_killed_collection_continues_and_nothing_is_there_twice(dataset, tmp_path):
     # Types are checked in there as in here: the programs are then the same, and compiled already.
     start = (
@@ -191,6 +192,7 @@ def test_a_killed_collection_continues_and_nothing_is_there_twice(dataset, tmp_p
     assert _times(tmp_path) == before
 
 
+@pytest.mark.long
 def test_several_processes_take_whole_shards(tmp_path):
     # What counts is that the shards that are missing come from other processes.
     config = dataclasses.replace(CONFIG, views_per_world=1)
@@ -407,6 +409,7 @@ def test_labels_by_a_posterior_without_doubt_are_those_of_the_true_map(dataset, 
     pd.testing.assert_frame_equal(mine, its)
 
 
+@pytest.mark.long
 def test_labels_by_a_posterior_are_means_that_are_right_on_average(compiled, tmp_path):
     # Narrow hallways with thin smoke: from the room nobody sees which of them burns.
     family = Firefighting(

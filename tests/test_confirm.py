@@ -31,6 +31,7 @@ def rows_of(folder):
     return facts, rows
 
 
+@pytest.mark.long
 def test_as_many_trials_are_drawn_of_each_policy(sweep):
     _, rows = rows_of(sweep)
     assert Counter(row.item.policy for row in drawn(rows, 5)) == {"known-map": 2, "baseline": 2, "optimistic": 2}

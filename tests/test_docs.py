@@ -76,6 +76,7 @@ def _python_pages():
     return [page for page in PAGES if _blocks(page, "python")]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("page", _python_pages(), ids=_name)
 def test_python_examples_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

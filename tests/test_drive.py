@@ -786,6 +786,7 @@ def test_without_a_map_the_error_says_what_to_look_at():
         driven(Mode.ADVISE, patience=3.0, topics=Topics(map="/other"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(12))
 def test_perturbed_streams_end_well(seed):
     row = run_stream(seed, {})

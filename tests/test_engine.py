@@ -167,6 +167,7 @@ def _begun(*words: str):
         process.wait()
 
 
+@pytest.mark.long
 def test_a_scheduler_that_is_killed_and_comes_back_loses_nothing(tmp_path, caplog):
     address = f"tcp://127.0.0.1:{(port := _free_port())}"
     scheduler = "dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard"

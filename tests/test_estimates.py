@@ -69,6 +69,7 @@ def test_an_estimator_is_asked_for_what_is_ahead():
         assert set(np.flatnonzero(asked[-1])) == classes_after(task, int(state))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("formula", FORMULAS)
 def test_what_is_not_asked_changes_no_value(formula):
     task = task_of(formula)

@@ -101,6 +101,7 @@ def test_subgoals_side_by_side_fail_together_with_what_their_sum_leaves():
     np.testing.assert_allclose(exclusive_chances(chances, subgoals, 0.0), chances, rtol=1e-5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("resolution", [1.0, 0.5])
 def test_answers_equal_the_network_asked_pair_by_pair(world, task, trained, resolution):
     world = dataclasses.replace(world, resolution=jnp.float32(resolution))

@@ -144,6 +144,7 @@ def assert_equal_plan(outputs, plan):
         np.testing.assert_array_equal(outputs[field.name], np.asarray(getattr(plan, field.name)), err_msg=field.name)
 
 
+@pytest.mark.long
 def test_whole_decision_in_a_process_without_the_package(situation, exported, tmp_path):
     key = jax.random.key(7)
     move = decide_jit(
@@ -178,6 +179,7 @@ def test_whole_decision_in_a_process_without_the_package(situation, exported, tm
     np.testing.assert_array_equal(outputs["q_values"], plan.q_values)
 
 
+@pytest.mark.long
 def test_exported_subgoals_are_the_librarys(situation, exported):
     found = load_program(exported, "subgoals", situation.belief.propositions)(**robot_inputs(situation))
     subgoals = jax.jit(frontier_subgoals, static_argnums=4)(
@@ -190,6 +192,7 @@ def test_exported_subgoals_are_the_librarys(situation, exported):
     np.testing.assert_array_equal(found["component"], subgoals.component)
 
 
+@pytest.mark.long
 def test_search_for_any_batch_in_a_process_without_the_package(situation, searches, tmp_path):
     task, batch = situation.task, 3
     rows = [plan_inputs(task, seed) for seed in range(batch)]
@@ -199,6 +202,7 @@ def test_search_for_any_batch_in_a_process_without_the_package(situation, search
         assert_equal_plan({name: outputs[name][row] for name in outputs}, plan_of(task, rows[row], CONFIG.search))
 
 
+@pytest.mark.long
 def test_a_search_that_samples_takes_the_callers_key(situation, searches, tmp_path):
     """Best-first search has no such input: a key would change nothing."""
     search, key = UctConfig(simulations=20), jax.random.key(7)

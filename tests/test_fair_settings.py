@@ -116,6 +116,7 @@ def test_worlds_are_resampled_with_all_of_their_tasks():
     assert alone == pytest.approx((shifts.mean() - 1.96 * error, shifts.mean() + 1.96 * error), abs=0.25 * error)
 
 
+@pytest.mark.long
 def test_a_family_is_run_goes_on_where_it_was_killed_and_is_reported(tmp_path):
     toy = make("toy")
     values = ((), (2.0,), ())

@@ -100,6 +100,7 @@ def test_travel_mostly_keeps_the_state():
     assert 0.4 < np.mean(keeps) < 0.95
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("family", FAMILIES)
 def test_there_is_mostly_a_choice(family):
     counts, finishes = [], []

@@ -43,6 +43,7 @@ def _clock_that_measuring_moves(monkeypatch, seconds):
     monkeypatch.setattr(fitting, "time", types.SimpleNamespace(perf_counter=lambda: passed[0]))
 
 
+@pytest.mark.long
 def test_a_fit_that_its_time_ended_gives_the_same_file_again(tmp_path, monkeypatch):
     # 72 seconds, of which measuring leaves nothing: one step is made.
     _clock_that_measuring_moves(monkeypatch, 71.9999)
@@ -108,6 +109,7 @@ def test_validation_worlds_that_are_learned_from_are_said(validation, said):
     )
 
 
+@pytest.mark.long
 def test_a_file_names_what_the_estimators_before_it_were_fitted_to(tmp_path):
     first, second, third = (_of_worlds(seed, 10 * seed) for seed in range(3))
     validation, once = _of_worlds(9, 0, "validation"), dataclasses.replace(SMALL, epochs=1)

@@ -481,6 +481,7 @@ def corpus(external_data):
     return files, plans, [rasterise(plan, read_kinds(), 0.5) for plan in plans]
 
 
+@pytest.mark.long
 def test_every_plan_of_the_corpora_is_read_whole(corpus):
     files, plans, _ = corpus
     assert len(files) == 42
@@ -555,6 +556,7 @@ def test_a_folder_of_the_corpora_becomes_buildings(external_data):
     assert all(map(np.array_equal, jax.tree.leaves(world), jax.tree.leaves(again)))
 
 
+@pytest.mark.long
 def test_plans_of_the_corpora_load_with_the_places_that_they_have(external_data):
     """No plan is refused for want of some kind of room, and each does what it has places for."""
     files = sorted((external_data / "floorplans").glob("*/*.xml"))

@@ -60,6 +60,7 @@ def test_floor_rows_are_where_the_camera_sees_the_floor():
     assert float(floor_rows(camera, jnp.float32(0.0))) == pytest.approx(rows[0], abs=1e-4)
 
 
+@pytest.mark.long
 def test_the_patch_of_a_cell_shows_that_cell_wherever_it_is():
     """A red floor cell in a large hall: the middle of the patch is red; as it is not where the cell is another one."""
     size, start = 41, (20, 20)

@@ -128,6 +128,7 @@ def test_the_next_length_is_twice_the_last_up_to_the_most():
     assert DecisionConfig(frontiers=FrontierConfig(max_subgoals=3, most_subgoals=3)).grown() is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("policy", [Policy.BASELINE, Policy.ORACLE, Policy.POTLP])
 def test_a_short_array_that_grows_gives_the_trial_of_a_long_one(policy):
     for number in (SOME, MANY):
@@ -164,6 +165,7 @@ def test_an_array_that_has_grown_stays_long_and_only_decisions_are_compiled_anew
     assert compiled(MANY, config) == [0, 0, 0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("policy", [Policy.BASELINE, Policy.ORACLE, Policy.POTLP])
 def test_trials_that_outgrow_a_batch_are_what_they_are_alone(policy):
     numbers = (SOME, FEW, MANY, 0, 1)
@@ -177,6 +179,7 @@ def test_trials_that_outgrow_a_batch_are_what_they_are_alone(policy):
         assert found[number].fallbacks == sum(decision.fallback for decision in alone.decisions)
 
 
+@pytest.mark.long
 def test_in_lockstep_without_native_kernels_they_grow_too(monkeypatch):
     expected = _batch((SOME, FEW), Policy.BASELINE, SHORT)
     monkeypatch.setenv(LOCKSTEP, "1")
@@ -195,6 +198,7 @@ def test_what_a_trial_took_before_it_grew_counts(monkeypatch):
     assert _batch((FEW,), Policy.BASELINE, SHORT, slots=1)[FEW].seconds == 1.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("most", [1, 3])
 def test_beyond_the_most_the_nearest_stay_and_the_trial_is_flagged(most):
     config = _config(2, most)
@@ -207,6 +211,7 @@ def test_beyond_the_most_the_nearest_stay_and_the_trial_is_flagged(most):
         assert _figures(_batch((MANY, FEW), policy, config)[MANY]) == _figures(trial)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("search", [BestFirstConfig(simulations=30), UctConfig(simulations=30)])
 def test_a_replay_decides_with_the_array_that_the_decision_had(search):
     config = _config(2, search=search)
@@ -246,6 +251,7 @@ def test_a_robots_listener_hears_each_decision_once_and_complete():
     assert trial.path == _trial(MANY, Policy.BASELINE, LONG).path
 
 
+@pytest.mark.long
 def test_a_sweeps_rows_are_the_trials_made_again():
     settings = {"sensor": {"range_cells": 5}, "decision": {"frontiers": {"max_subgoals": 1}}}
     work = Work(

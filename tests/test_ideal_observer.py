@@ -108,6 +108,7 @@ def _agree(built, belief, evidence):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("family", [FAMILY, WIDE_PATCHES, Firefighting.toy()], ids=["cell", "patch", "toy"])
 @pytest.mark.parametrize("places", [1, 4])
 def test_drawn_buildings_agree_with_all_that_was_seen(family, places):

@@ -130,6 +130,7 @@ def asked(cells: np.ndarray, letters: np.ndarray, seen: np.ndarray, places: list
     return scenery(belief, imagined, own_within), jnp.asarray(places, jnp.int32), stay
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [0, 1, 16, 17, 20])
 def test_the_first_lanes_have_the_outlook_that_they_have_together(count) -> None:
     cells, letters = house()

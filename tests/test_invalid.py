@@ -275,6 +275,7 @@ def answering_half(belief, subgoals, task):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kernels", ["native", "twins"])
 @pytest.mark.parametrize("mark", ["#", "?"])
 @pytest.mark.parametrize("policy", ["baseline", "optimistic", "potlp"])
@@ -308,6 +309,7 @@ def answering_nan(belief, subgoals, task):
     return Estimates(success_probability=nothing, success_cost=nothing, failure_cost=nothing)
 
 
+@pytest.mark.long
 def test_a_trial_of_a_broken_network_is_flagged_and_its_decisions_say_why(tmp_path):
     world = make("toy").world(0)
     task, key = world.task("!hazard U goal"), jax.random.key(0)

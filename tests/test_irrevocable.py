@@ -153,6 +153,7 @@ def _run(world, task, policy, last=True):
     return run_trial(world, task, policy, jax.random.key(0), config, arrays=task.padded(SIZES), estimator=estimator)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("policy", POLICIES)
 def test_no_branch_is_entered_while_another_way_is_left(policy):
     # The near door begins the branch that needs c, which is nowhere; behind the other door the other branch ends.
@@ -220,6 +221,7 @@ def _run_toy(world, task, last):
     return run_trial(world, task, Policy.POTLP, jax.random.key(0), config, estimator=prior)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("last", [True, False])
 def test_a_batch_decides_as_trials_alone_do(last):
     config = dataclasses.replace(CONFIG, decision=dataclasses.replace(CONFIG.decision, irrevocable_last=last))
@@ -244,6 +246,7 @@ def test_a_batch_heeds_the_setting(last, outcome):
     assert finished.outcome is outcome
 
 
+@pytest.mark.long
 def test_random_pairs_end_satisfied_unless_a_move_was_forced():
     rows = list(run_chunk(0, 24))
     held = [row for row in rows if row["irrevocable_last"]]

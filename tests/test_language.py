@@ -88,6 +88,7 @@ def test_tasks_of_environments_that_are_made_from_files_ship(no_spot):
     assert Task.from_formula("F document & F package", ("document", "kitchen", "package")).dfa.num_states == 4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("environment", "number"), ENVIRONMENT_TASKS)
 def test_the_promised_command_runs_without_spot(environment, number, no_spot):
     # The path that needs no search: what is tested is where tasks come from. In world 2 every task is possible.

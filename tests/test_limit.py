@@ -114,6 +114,7 @@ def test_costs_that_the_second_cannot_have_are_the_firsts():
     np.testing.assert_allclose(other.success_cost, 3.0)
 
 
+@pytest.mark.long
 def test_a_mixture_is_a_pytree_that_goes_through_batches():
     # Each slot has the memories of both parts, and they count on their own.
     task = FAMILY.task("4")

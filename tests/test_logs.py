@@ -424,6 +424,7 @@ def test_a_trial_is_written_replayed_and_viewed(trial, tmp_path):
     assert "choose baseline" in refused.stderr
 
 
+@pytest.mark.long
 def test_the_page_shows_what_the_commands_print(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = (Path(__file__).parents[1] / "docs" / "logs.md").read_text("utf-8")

@@ -117,6 +117,7 @@ def _loop(robot, config):
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("every", "on_the_way"), [(1, True), (2, True), (0, True), (1, False)])
 def test_the_camera_looks_as_often_as_is_said_and_a_batch_and_a_replay_do_the_same(every, on_the_way):
     config = dataclasses.replace(CONFIG, look_every=every)

@@ -111,6 +111,7 @@ def test_a_broken_file_of_the_cache_is_not_loaded(kernels, compiler):
     np.testing.assert_array_equal(_scale(jnp.ones(2, jnp.float32)), [2, 2])
 
 
+@pytest.mark.long
 def test_processes_that_race_all_get_a_whole_library(kernels, compiler):
     with ThreadPoolExecutor(3) as pool:
         files = list(pool.map(lambda _: build.built_library("scale"), range(3)))

@@ -63,6 +63,7 @@ OF_ONE_SHAPE = [name for name in FAMILIES if name != "four" and not name.startsw
 COMMON = functools.reduce(TaskSizes.union, (FAMILIES[name].sizes for name in OF_ONE_SHAPE))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("family", FAMILIES)
 def test_plans_and_trees_of_both_are_equal_to_the_bit(family, monkeypatch):
     if family in OF_ONE_SHAPE:
@@ -77,6 +78,7 @@ def test_plans_and_trees_of_both_are_equal_to_the_bit(family, monkeypatch):
     _assert_equal_trees(trees, expected_trees)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("settings", [{"tree_capacity": 9}, {"max_depth": 3}, {"optimism": 1.0, "guess_failures": 2}])
 def test_both_run_into_the_same_limits_on_twelve_subgoals(settings):
     problems, config = _problems("cubes", 12, 3), BestFirstConfig(simulations=40, **settings)
@@ -89,6 +91,7 @@ def test_both_run_into_the_same_limits_on_twelve_subgoals(settings):
         assert np.any(np.asarray(plans.status) & (Status.TREE_OVERFLOW | Status.DEPTH_OVERFLOW))
 
 
+@pytest.mark.long
 def test_invalid_rows_padded_rows_and_satisfied_rows_are_alike():
     problems = _problems("firefighting", 3, 4)
     problems = dataclasses.replace(
@@ -107,6 +110,7 @@ def test_invalid_rows_padded_rows_and_satisfied_rows_are_alike():
     assert plans.status[2] == Status.ACCEPTING_ROOT
 
 
+@pytest.mark.long
 def test_either_goes_on_with_the_tree_of_the_other():
     problems, keys = _problems("reuse", 3, 2), _keys(2)
     config = BestFirstConfig(simulations=20, tree_capacity=60)
@@ -138,6 +142,7 @@ def test_plans_are_the_same_alone_in_vmap_and_in_scan():
     _assert_equal_plans(alone, jax.tree.map(lambda leaf: leaf[1], expected))
 
 
+@pytest.mark.long
 def test_a_budget_is_an_argument_of_the_compiled_program():
     """What another configuration would give, row by row, in one program of the kernel and one of the twin."""
     problems, config, most = _problems("two", 4, 5), BestFirstConfig(simulations=60), 60

@@ -138,6 +138,7 @@ def test_sources_off_the_map_reach_nothing():
     assert np.isinf(np.asarray(found)).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("range_cells", [0.0, 1.0, 3.5, 9.0, 104.0])
 def test_sight_equals_the_tables(range_cells):
     _needs("sensing")
@@ -149,6 +150,7 @@ def test_sight_equals_the_tables(range_cells):
         _same(jax.vmap(see), maps, cells)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("glances", [False, True])
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.3])
 def test_looks_and_paintings_equal_those_of_their_tables(share, glances):
@@ -181,6 +183,7 @@ def test_looks_and_paintings_equal_those_of_their_tables(share, glances):
         assert any((np.asarray(one.floor) != np.asarray(one.beyond)).any() for one in alone)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_paths_equal_those_walked_in_jax(seed):
     _needs("paths")
@@ -246,6 +249,7 @@ def test_ways_through_squares_equal_those_by_lines(lanes):
         _same(lambda begins, closed: cheapest_ways(ways_to_sides(begins), closed), begins, closed)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["firefighting", "rooms"])
 def test_labels_equal_the_sweeps(name):
     _needs("labels")

@@ -166,6 +166,7 @@ def test_every_input_counts(params):
     assert [name for name, answers in changed.items() if abs(float(answers.success_logit - base)) < 1e-7] == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fovea", [0, 5])
 def test_gradients_reach_every_parameter(fovea):
     network = EstimatorNetwork(dataclasses.replace(CONFIG, fovea=fovea))

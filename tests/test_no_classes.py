@@ -78,6 +78,7 @@ TASKS = {formula: Task.from_formula(formula, propositions=TOY.propositions) for 
 SIZES = functools.reduce(TaskSizes.union, [task.sizes for task in TASKS.values()])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("formula", FORMULAS)
 @pytest.mark.parametrize(("policy", "config"), CASES, ids=["oracle", "network", "network-uct"])
 def test_a_search_ends_as_the_baseline_does(formula, policy, config):
@@ -93,6 +94,7 @@ def test_a_search_ends_as_the_baseline_does(formula, policy, config):
     assert problems_of(trial, task, WORLD) == []
 
 
+@pytest.mark.long
 def test_a_batch_beside_a_task_that_has_classes():
     tasks = [*TASKS.values(), Task.from_formula("F goal", propositions=TOY.propositions)]
     sizes = SIZES.union(tasks[-1].sizes)

@@ -72,6 +72,7 @@ def southern(belief, subgoals, task):
 CASES = [(random_frontier, None), (likeliest_frontier, southern), (Policy.POTLP, southern)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("policy", "estimator"), CASES, ids=["random", "likeliest", "potlp"])
 def test_a_policy_of_ones_own_takes_the_same_path_alone_and_in_a_batch(policy, estimator):
     starts = [Start(world, TASK.arrays, key, name=n) for n, (world, key) in enumerate(zip(WORLDS, KEYS, strict=True))]

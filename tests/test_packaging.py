@@ -74,6 +74,7 @@ def _modules_of(extra: str) -> set[str]:
 
 
 # What each extra is for, and what needs none. Data sets from logs (logs.collecting) need two extras, and are left out.
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("extra", "packages"),
     [

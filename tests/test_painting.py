@@ -93,6 +93,7 @@ def _slow_paint(
     return Painting(floor=jnp.asarray(floor), beyond=jnp.asarray(beyond), distance=jnp.asarray(distance))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("glances", [False, True])
 @pytest.mark.parametrize("unknown_from", [20, 12])
 def test_painting_is_what_a_loop_over_cells_paints(unknown_from, glances):

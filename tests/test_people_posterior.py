@@ -95,6 +95,7 @@ def expected(floor, errand, world, belief, in_sight):
     return chances / total
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("floor", "errand"), [(OFFICES, PEOPLE), (ANY, PARCELS)], ids=["people", "parcels"])
 @pytest.mark.parametrize(
     ("cells", "reach"),

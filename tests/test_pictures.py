@@ -33,6 +33,7 @@ def test_a_picture_is_as_it_was_made_and_not_too_large(name, facts):
     assert len(content) <= MAX_BYTES
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("policy", "words"), [("baseline", "the baseline's path costs"), ("potlp", "PO-TLP's")])
 def test_trials_of_the_pictures_go_the_same_way_today(policy, words, facts):
     trial = picture_trial(policy)

@@ -150,6 +150,7 @@ def test_what_others_forgot_is_named(elsewhere):
     assert empty.task("1").text == empty.task(1).text == "F goal"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "used",
     [
@@ -206,6 +207,7 @@ def test_an_estimator_is_a_function_by_name_or_a_file(elsewhere):
         named_estimator("missing.npz")
 
 
+@pytest.mark.long
 def test_workers_of_a_sweep_find_environments_and_policies_by_the_same_names(elsewhere):
     entries = {
         "environments": ["foreign_worlds:Small"],

@@ -136,6 +136,7 @@ def _as_of_old(options, made):
     return {**options, "mirror": varied.pop("mirror_rows"), **varied}
 
 
+@pytest.mark.long
 def test_a_small_recipe_makes_an_estimator_and_continues(tmp_path):
     (tmp_path / "small.yaml").write_text(json.dumps(SMALL))
     recipe = read_recipe(tmp_path / "small.yaml")
@@ -164,6 +165,7 @@ def test_a_small_recipe_makes_an_estimator_and_continues(tmp_path):
     assert again.best_step == trained.best_step
 
 
+@pytest.mark.long
 def test_rounds_drive_with_what_was_fitted_and_learn_from_all_records(tmp_path):
     building = {"kind": "building", "widths": [4, 4, 6], "blocks": [0, 0, 1], "decoder": 4, "head": 8, "condition": 4}
     rounds = [
@@ -245,6 +247,7 @@ def test_a_round_may_record_otherwise_and_leave_the_records_of_before(monkeypatc
         assert own == usual
 
 
+@pytest.mark.long
 def test_worlds_of_another_family_are_recorded_beside_those_of_the_recipe(tmp_path):
     rounds = [
         {"worlds": 2, "validation_worlds": 2, "views_per_world": 2, "drives": 1, "epochs": 1, "explored": {"worlds": 2}}
@@ -333,6 +336,7 @@ def _potlp(*arguments):
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
+@pytest.mark.long
 def test_the_commands_collect_and_fit_by_a_recipe(tmp_path):
     (tmp_path / "small.yaml").write_text(json.dumps(SMALL))
     told = _potlp("collect", "--recipe", tmp_path / "small.yaml", "--split", "validation", "--out", tmp_path / "data")

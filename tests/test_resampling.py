@@ -121,6 +121,7 @@ def _twice(layer):
     return jnp.repeat(jnp.repeat(layer, 2, axis=0), 2, axis=1)
 
 
+@pytest.mark.long
 def test_answers_do_not_depend_on_how_finely_a_map_is_drawn():
     cells = np.full((16, 24), BeliefMap.UNKNOWN, np.int8)
     cells[1:9, 1:13] = BeliefMap.FREE

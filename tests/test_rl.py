@@ -73,6 +73,7 @@ def test_episodes_of_a_random_agent_end_and_stay_ended(env):
         assert np.all(steps.discount[number][ended[number]] == 0.0)
 
 
+@pytest.mark.long
 def test_the_same_key_gives_the_same_episode_alone_and_in_a_batch(env):
     keys = jax.random.split(jax.random.key(2), 3)
     together = jax.jit(jax.vmap(lambda key: episode(env, key)[1]))(keys)

@@ -268,6 +268,7 @@ def looking(kind):
     return Looking((5, 1))
 
 
+@pytest.mark.long
 def test_an_estimator_that_moves_with_the_map_answers_as_if_it_had_never_grown(caplog):
     def chances(robot, estimator):
         trial = potlp_jax.run_robot(robot, TASK, "potlp", KEY, estimator=estimator)

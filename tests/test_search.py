@@ -82,6 +82,7 @@ def plans(problems):
     return plan_many(problems, keys(len(problems)), BestFirstConfig())
 
 
+@pytest.mark.long
 def test_converges_to_the_exact_solution(problems, solutions):
     """With full optimism a search that ends by itself has seen all that could be better."""
     plans = plan_many(
@@ -167,6 +168,7 @@ def assert_ended_searches_are_exact(plans, solutions):
     return ended.sum()
 
 
+@pytest.mark.long
 def test_an_ended_search_is_exact(rare_successes, rare_solutions):
     plans = plan_many(rare_successes, keys(len(rare_successes)), BestFirstConfig(simulations=400))
     assert assert_ended_searches_are_exact(plans, rare_solutions) > 100
@@ -180,6 +182,7 @@ def test_a_search_ends_where_failures_are_shared_or_rarely_successes(family):
     assert assert_ended_searches_are_exact(plans, [solve_exact(problem) for problem in problems]) > 4
 
 
+@pytest.mark.long
 def test_successes_are_valued_by_what_has_failed():
     """One condition on both steps to acceptance: what has failed at a subgoal fails there for the second step too."""
     coupled = [make_rule_of(family_problem(family, 2, "tuning", 0)).coupled for family in ("shared", "shared-joint")]
@@ -236,6 +239,7 @@ def guesses_at_root(context, terms):
     return guess_outcomes(context.rule, root, jnp.zeros(1), terms.available, chance, success_cost, 24)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("family", ["three-single", "firefighting", "shared-dear"])
 def test_guesses_are_the_cost_of_their_dead_ends_where_nothing_else_costs(family):
     problem = nothing_costs_but_dead_ends(family_problem(family, 3, "tuning", 2))
@@ -275,6 +279,7 @@ def test_what_dead_ends_cost_in_guesses_is_not_discounted():
     assert gaps[1] > 0.1
 
 
+@pytest.mark.long
 def test_a_guess_that_is_all_dead_end_leaves_a_gap():
     """After the only attempt has failed nothing is left but the dead end; still it is a guess until it is examined."""
     problem = nothing_costs_but_dead_ends(family_problem("find", 1, "tuning", 1))
@@ -416,6 +421,7 @@ def test_a_search_does_not_go_on_with_a_tree_of_a_problem_of_another_size():
         jax.eval_shape(lambda: search_tree(problem, key, QUICK, search_tree(larger, key, QUICK)[1])[0].value)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("config", [QUICK, UctConfig(simulations=8)])
 @pytest.mark.parametrize("shape", [(0,), (0, 3), (2, 0)])
 def test_a_batch_may_have_no_rows(shape, config):
@@ -504,6 +510,7 @@ def test_nested_vmap_and_scan_equal_loop():
             assert_same_plans(alone, jax.tree.map(lambda leaf, i=i, j=j: leaf[i, j], scanned))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("formula", ["F(a & X b)", "F((a | b) & X(b | c))"])
 def test_padding_changes_nothing(formula):
     """States, edges, classes, conditions, cubes and subgoals: same choice, same bits."""
@@ -751,6 +758,7 @@ def test_finish_is_chosen_where_it_is_cheapest():
     assert float(plan.value) == 0.5
 
 
+@pytest.mark.long
 def test_many_conditions():
     """More conditions than one word of 32 bits, 16 states, 4 propositions."""
     problem = random_problem("F a & F b & F c & F d", 1, 0, unreachable=0.0)

@@ -629,6 +629,7 @@ def command(tmp_path):
     return [sys.executable, str(tmp_path / "worker.py"), str(tmp_path / "sweep.yaml"), str(tmp_path / "out")]
 
 
+@pytest.mark.long
 def test_killed_after_its_first_trials_it_goes_on_in_two_workers(finished, command, tmp_path):
     # What this run of the tests has compiled serves the workers too.
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": os.environ["POTLP_TEST_CACHE"]}
@@ -655,6 +656,7 @@ def _two_workers_of(process):
 needs_proc = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="processes are found in /proc")
 
 
+@pytest.mark.long
 @needs_proc
 def test_after_sigterm_the_command_ends_with_its_workers_and_says_so(command):
     process = subprocess.Popen([*command, "2"], stderr=subprocess.PIPE, text=True)
@@ -667,6 +669,7 @@ def test_after_sigterm_the_command_ends_with_its_workers_and_says_so(command):
     assert all(process_start(worker) != start for worker, start in zip(workers, starts, strict=True))
 
 
+@pytest.mark.long
 @needs_proc
 def test_a_sweep_goes_on_when_a_worker_is_killed_and_says_so(finished, command, tmp_path):
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": os.environ["POTLP_TEST_CACHE"]}

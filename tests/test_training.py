@@ -302,6 +302,7 @@ def test_the_learning_rate_rises_and_ends_at_zero():
     assert all(a > b for a, b in itertools.pairwise(rates[10:]))
 
 
+@pytest.mark.long
 def test_it_learns_64_samples_whose_label_needs_picture_bearing_and_phi():
     samples = synthetic(16, 4, 8)
     network = _learner(samples, WIDTHS)
@@ -449,6 +450,7 @@ def _start(folder: Path) -> subprocess.Popen[str]:
     )
 
 
+@pytest.mark.long
 def test_killed_and_resumed_it_reaches_the_same_parameters_bit_for_bit(tmp_path):
     straight, broken = tmp_path / "straight", tmp_path / "broken"
     output, _ = _start(straight).communicate(timeout=400)
@@ -542,6 +544,7 @@ def _joined(folder: Path, processes: int = 2) -> None:
             process.kill()
 
 
+@pytest.mark.long
 def test_processes_and_devices_share_a_training_that_another_number_goes_on_with(tmp_path):
     _joined(tmp_path)
     samples, validation = synthetic(8, 5, 10), synthetic(5, 5, 11)
@@ -640,6 +643,7 @@ def test_a_fit_resumes_with_the_estimator_that_it_went_on_from_alone(tmp_path):
             train(network, samples, samples, _config(2), initial=changed, folder=folder)
 
 
+@pytest.mark.long
 def test_the_command_writes_an_estimator_and_resumes(tmp_path):
     from potlp_jax.learning.dataset import write_shard
 

@@ -75,6 +75,7 @@ def _run(world, task, policy, seed, config=CONFIG):
     return run_trial(world, task, policy, jax.random.key(seed), config, arrays=arrays, estimator=UNTRAINED)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("policy", list(Policy))
 def test_trials_keep_their_promises(policy):
     satisfied = 0

@@ -78,6 +78,7 @@ def test_equals_a_literal_version(formula, seed):
     assert int(tree.steps) > QUICK.simulations
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("formula", "seed"), [("F g", 0), ("F a & F b", 1), ("F(a & X b)", 2)])
 def test_converges_to_the_exact_solution(formula, seed):
     """With exploration in proportion to the costs, of which the largest is a dead end (300), as the theory asks."""
@@ -194,6 +195,7 @@ def test_each_action_is_tried_once_first():
     assert np.isfinite(fewer.q_values[fewer.action])
 
 
+@pytest.mark.long
 def test_each_row_has_its_own_budget():
     problem, budgets = shared_shape("F a & F b", 3, unreachable=0.0), [1, 7, 40]
     plan = jax.jit(jax.vmap(lambda budget: plan_actions(problem, jax.random.key(0), QUICK, budget)))
