@@ -522,6 +522,7 @@ def test_a_comparison_is_a_sweep_that_the_other_commands_show(tmp_path):
     assert longer["cells"][0]["world_numbers"] == [4, 5, 6]
 
 
+@pytest.mark.long
 def test_the_trials_in_one_world_are_drawn_side_by_side(tmp_path):
     command = ("compare", "toy", "-t", "2", "--policies", "optimistic", "--trials", "2")
     _json(_potlp(*command, "--json", "--out", tmp_path, "--picture", "1"))

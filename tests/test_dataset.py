@@ -372,6 +372,7 @@ print(batches.per_epoch, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - be
 """
 
 
+@pytest.mark.long
 def test_a_data_set_larger_than_the_memory_allowed_is_read_and_shown_whole(tmp_path):
     """One shard of 160 MB, which does not compress; the reader's memory must not grow by half of it."""
     draw, count = np.random.default_rng(0), 1600

@@ -67,6 +67,7 @@ def test_a_plan_of_before_does_not_say_how_long_measuring_took(tmp_path):
     assert planned_steps(tmp_path, 5, config, _never) == fitting.Planned(10)
 
 
+@pytest.mark.long
 def test_a_file_counts_what_was_learned_from(tmp_path):
     samples, lines = synthetic(8, 6, 0), []
     # The panorama shows every success, and some failures.

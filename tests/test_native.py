@@ -93,6 +93,7 @@ def test_a_program_traced_with_kernels_is_not_taken_for_one_without(kernels, com
     np.testing.assert_array_equal(double(values), [2, 2, 2])
 
 
+@pytest.mark.long
 def test_a_changed_source_or_header_is_compiled_again(kernels, compiler):
     first = build.built_library("scale")
     source = kernels / "scale.cc"
@@ -103,6 +104,7 @@ def test_a_changed_source_or_header_is_compiled_again(kernels, compiler):
     assert len({first, second, third}) == 3
 
 
+@pytest.mark.long
 def test_a_broken_file_of_the_cache_is_not_loaded(kernels, compiler):
     file = build.built_library("scale")
     whole = file.read_bytes()

@@ -202,6 +202,7 @@ def prepared(problem):
     return prepare_jit(batch, jnp.zeros((1, 2), jnp.uint32), BestFirstConfig())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("family", ["shared", "shared-dear"])
 def test_guesses_of_coupled_problems_are_what_the_rule_costs(family):
     context = prepared(family_problem(family, 2, "tuning", 1))
@@ -324,6 +325,7 @@ def test_more_simulations_do_not_mislead_where_dead_ends_are_dear():
         assert np.mean(regret) < 0.01
 
 
+@pytest.mark.long
 def test_the_optimism_gap_says_what_its_description_says(rare_successes, rare_solutions):
     """0: the value is that of a policy, which no optimum exceeds. Above 0: no bound on the error (docs/planner.md)."""
     plans = plan_many(rare_successes, keys(len(rare_successes)), BestFirstConfig(simulations=16))

@@ -118,6 +118,7 @@ def test_a_policy_may_have_settings_of_its_own():
     assert own_settings(same.to_dict()) == {}
 
 
+@pytest.mark.long
 def test_trials_of_a_policy_have_its_settings_and_a_sweep_with_others_is_another(tmp_path):
     sweep = Sweep(_specification(policy_settings={"baseline": {"replan_distance": 2}}), tmp_path)
     sweep.run(Here(), lambda progress: None)
@@ -410,6 +411,7 @@ print(kills)
 """
 
 
+@pytest.mark.long
 def test_killed_many_times_at_random_moments_nothing_is_lost_and_nothing_is_there_twice(tmp_path):
     # The work is a stand-in, so that hundreds of trials and tens of kills take seconds.
     done = subprocess.run([sys.executable, "-c", MANY_KILLS, str(tmp_path)], capture_output=True, text=True)

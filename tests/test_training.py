@@ -609,6 +609,7 @@ def test_resuming_with_other_options_or_data_names_the_difference(tmp_path):
             train(network, training, validation, _config(2), folder=tmp_path)
 
 
+@pytest.mark.long
 def test_a_fit_of_several_data_sets_resumes_with_the_same_ones_alone(tmp_path):
     validation = synthetic(4, 4, 9)
     network = _learner(validation, TINY)

@@ -96,6 +96,7 @@ def test_converges_to_the_exact_solution(formula, seed):
     np.testing.assert_array_equal(many.action, exact.action)
 
 
+@pytest.mark.long
 def test_regret_falls_with_simulations():
     """On tuning problems of the benchmark, in one batch that goes on with its trees."""
     problems = [family_problem("two", 2, "tuning", index) for index in range(12)]
@@ -121,6 +122,7 @@ def test_the_key_drives_the_samples():
     assert not np.array_equal(first[1].children, other[1].children)
 
 
+@pytest.mark.long
 def test_a_search_goes_on_where_it_stopped():
     problem = shared_shape("F a & F b", 3, unreachable=0.1)
     half = UctConfig(simulations=40, tree_capacity=90)
@@ -157,6 +159,7 @@ def test_batched_search_equals_vmap(problems, plans):
     assert_same(batch, plans)
 
 
+@pytest.mark.long
 def test_nested_vmap_equals_loop():
     problem = shared_shape("F a & F b", 3)
     grid = keys(6).reshape(2, 3)
@@ -183,6 +186,7 @@ def test_padding_changes_nothing(formula):
     assert np.isinf(np.delete(np.asarray(padded.q_values), real)).all()
 
 
+@pytest.mark.long
 def test_each_action_is_tried_once_first():
     """An action without a rollout has no mean, and is never chosen."""
     problem = shared_shape("F a & F b", 3, unreachable=0.0)

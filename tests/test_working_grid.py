@@ -42,6 +42,7 @@ def large(tmp_path_factory):
     return write_large(tmp_path_factory.mktemp("maps"))
 
 
+@pytest.mark.long
 def test_a_map_of_4000_squared_pixels_is_planned_on_the_finest_multiple_that_fits(large):
     image_map = load_building(large)
     with pytest.warns(
