@@ -127,6 +127,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="ablations",
         command="python -m eval.ablations --out {out} --views own={all}/own explored={all}/explored "
         "--processes {processes} --report docs/results/ablations",
+        minutes=112,
     ),
     "held-out": Experiment(
         page="estimator",
@@ -179,6 +180,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="delivery",
         command="python -m eval.delivery --out {out} --plans {data}/floorplans --worlds 1000 --plan-worlds 80 "
         "--formula-worlds 40 --processes {processes} --report docs/results/delivery/first1000",
+        minutes=80,
     ),
     "own-delivery": Experiment(
         page="delivery",
@@ -193,16 +195,19 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="delivery",
         command="python -m eval.limit.worst {all}/delivery/generated --out {out} --trials 10 --buildings 8 "
         "--report docs/results/delivery/worst",
+        minutes=3,
     ),
     "worst-office": Experiment(
         page="delivery",
         command="python -m eval.limit.worst {all}/delivery/office --out {out} --trials 10 --buildings 8 "
         "--report docs/results/delivery/worst_office",
+        minutes=5,
     ),
     "worst-school": Experiment(
         page="delivery",
         command="python -m eval.limit.worst {all}/delivery/school --out {out} --trials 10 --buildings 8 "
         "--report docs/results/delivery/worst_school",
+        minutes=13,
     ),
     "real-maps": Experiment(
         page="delivery",
