@@ -213,6 +213,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="delivery",
         command="python -m eval.real_maps --out {out} --maps {data}/maps --worlds 50 --processes {processes} "
         "--report {out}/maps",
+        minutes=50,
     ),
     "worst-floor2": Experiment(
         page="delivery",
