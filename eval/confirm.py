@@ -1,7 +1,7 @@
 """Whether sweeps that were run at earlier commits would come out the same today: some of their trials run again.
 
     python -m eval.confirm out/delivery/generated out/delivery/office --trials 60 --out out/confirm \
-        --report docs/results/confirm
+        --report out/confirm/report
 
 Of every sweep trials are drawn, as many of each policy, and run again with the sweep's own specification. A trial is
 the same if its world, outcome, path, number of decisions and status are. If none of n differs, fewer than 3 in n of
