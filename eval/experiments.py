@@ -219,6 +219,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="delivery",
         command="python -m eval.limit.worst {all}/real-maps/gdc_floor2 --out {out} --trials 10 "
         "--report docs/results/real_maps/floor2_worst",
+        minutes=10,
     ),
     "worst-gdc": Experiment(
         page="delivery",
@@ -232,7 +233,9 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     "worst-intel": Experiment(
         page="delivery",
-        command="python -m eval.limit.worst {all}/real-maps/intel_lab --out {out} --trials 10 --report {out}/worst",
+        command="python -m eval.limit.worst {all}/real-maps/intel_lab --out {out} --trials 10 "
+        "--report docs/results/real_maps/intel_worst",
+        minutes=16,
     ),
     # Each shipped recipe from nothing, and what its stages keep: how long one has to train.
     "recipe-firefighting": Experiment(
