@@ -28,6 +28,7 @@ from potlp_jax.errors import DatasetError, WorldError
 from potlp_jax.learning.dataset import decode, finished_shards, read_metadata, samples_file, views_file
 from potlp_jax.learning.dataset_reading import read_dataset
 from potlp_jax.learning.questions import TaskDistribution
+from potlp_jax.learning.recording import overflow_in_words
 from potlp_jax.learning.scenes import survey
 from potlp_jax.recipes.collection import CollectConfig, collect, collection_of, summary
 from potlp_jax.recipes.exploration import Explorer, ExplorerConfig
@@ -272,9 +273,13 @@ def test_views_with_more_subgoals_than_are_recorded_are_counted(tmp_path):
     collect(GENERATOR, "firefighting", Split.TRAINING, 2, tmp_path / "few", few, tell=told.append)
     collected = told[-1]
     assert 0 < collected.overflowed <= collected.views == len(read_dataset(tmp_path / "few").images)
+    words = overflow_in_words(collected.views, collected.overflowed, 1, "--set frontiers.max_subgoals=")
+    assert words.startswith(f"{collected.overflowed} of the {collected.views} views recorded now have more than 1")
+    assert "--set frontiers.max_subgoals=2" in words
     # What is there already is not looked at again.
     collect(GENERATOR, "firefighting", Split.TRAINING, 2, tmp_path / "few", few, tell=told.append)
     assert (told[-1].views, told[-1].overflowed) == (0, 0)
+    assert overflow_in_words(0, 0, 1, "") == ""
     collect(GENERATOR, "firefighting", Split.TRAINING, 2, tmp_path / "all", CONFIG, tell=told.append)
     assert told[-1].overflowed == 0 < told[-1].views
 
