@@ -67,12 +67,16 @@ class Run:
 
 
 def left_out(run: Run, names: Iterable[str]) -> dict[str, str]:
-    """The experiments that cannot run here, and why."""
-    return {
-        name: "it reads maps or plans of others: name their folder with --data"
-        for name in names
-        if EXPERIMENTS[name].needs_data and run.data is None
-    }
+    """The experiments that cannot run here, and why: they read data of others, or what such experiments write."""
+    missing: dict[str, str] = {}
+    # In the order of the list, in which what is read comes first.
+    for name in names:
+        unwritten = [source for source in EXPERIMENTS[name].reads if source in missing]
+        if EXPERIMENTS[name].needs_data and run.data is None:
+            missing[name] = "it reads maps or plans of others: name their folder with --data"
+        elif unwritten:
+            missing[name] = f"it reads what is left out: {', '.join(unwritten)}"
+    return missing
 
 
 def perform(run: Run, names: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -1,6 +1,7 @@
 """The experiments behind docs/results, which ``eval.all`` runs: a command each, and the page that shows its results."""
 
 import dataclasses
+import re
 from collections.abc import Mapping
 
 
@@ -29,11 +30,20 @@ class Experiment:
         """Whether it reads maps or plans of others."""
         return "{data}" in self.command or "{data}" in self.variables.values()
 
+    @property
+    def reads(self) -> list[str]:
+        """The experiments whose folders it reads."""
+        return re.findall(r"\{all\}/([\w-]+)", self.command)
+
 
 _OTHERS = {"POTLP_EXTERNAL_DATA": "{data}"}
 
 _COLLECTED = "potlp collect firefighting --split validation --out {out} --set staying_sets=3 --set worlds_per_shard=20"
 _DRIVEN = "--set driver=potlp --set estimator=firefighting --set drives=1 --set first_world=5000"
+_DELIVERED = (
+    "--set look_every=1 --set staying_sets=3 --set views_per_world=12 --set spacing=[4,40] --set posterior=8 "
+    "--set nearest=true --set driver=potlp --set estimator=delivery --set drives=1"
+)
 _SHIPPED = "potlp_jax/learning/data/"
 
 EXPERIMENTS: dict[str, Experiment] = {
@@ -185,12 +195,21 @@ EXPERIMENTS: dict[str, Experiment] = {
     "own-delivery": Experiment(
         page="delivery",
         command="potlp collect delivery --split validation --worlds 40 --out {out} --set first_world=1600 "
-        "--set look_every=1 --set staying_sets=3 --set views_per_world=12 --set spacing=[4,40] --set posterior=8 "
-        "--set nearest=true --set driver=potlp --set estimator=delivery --set drives=1",
+        + _DELIVERED,
+    ),
+    "own-office": Experiment(
+        page="delivery",
+        command="potlp collect floorplan:{data}/floorplans/office --split test --worlds 16 --out {out} " + _DELIVERED,
+    ),
+    "own-school": Experiment(
+        page="delivery",
+        command="potlp collect floorplan:{data}/floorplans/school --split test --worlds 16 --out {out} " + _DELIVERED,
     ),
     "d-own": Experiment(
         page="delivery", command="potlp estimator evaluate delivery {all}/own-delivery --ablate all --out {out}"
     ),
+    "d-office": Experiment(page="delivery", command="potlp estimator evaluate delivery {all}/own-office --out {out}"),
+    "d-school": Experiment(page="delivery", command="potlp estimator evaluate delivery {all}/own-school --out {out}"),
     "worst-delivery": Experiment(
         page="delivery",
         command="python -m eval.limit.worst {all}/delivery/generated --out {out} --trials 10 --buildings 8 "

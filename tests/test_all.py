@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -120,7 +119,7 @@ def test_it_goes_on_after_a_kill_once_what_it_had_begun_has_ended(monkeypatch, t
 def test_what_reads_from_another_comes_after_it():
     """The folders below ``{all}`` are those of experiments that are earlier in the list."""
     names = list(EXPERIMENTS)
-    read = [(name, part) for name in names for part in re.findall(r"\{all\}/([\w-]+)", EXPERIMENTS[name].command)]
+    read = [(name, part) for name in names for part in EXPERIMENTS[name].reads]
     assert ("worst", "table1") in read
     assert ("f-own", "own") in read
     for name, part in read:
@@ -131,6 +130,9 @@ def test_what_reads_others_data_is_left_out_by_name(tmp_path):
     without = left_out(Run(out=tmp_path, data=None, processes=1, commit=""), EXPERIMENTS)
     assert {"delivery", "real-maps", "floors"} <= without.keys()
     assert "table1" not in without
+    # Nor is what reads them begun, only to fail.
+    assert without["d-office"] == "it reads what is left out: own-office"
+    assert "d-own" not in without
     assert not left_out(Run(out=tmp_path, data=tmp_path, processes=1, commit=""), EXPERIMENTS)
 
 

@@ -50,6 +50,7 @@ from potlp_jax.sweep.work import Examined, Work
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
+from potlp_jax.trials.record import load_trial
 from potlp_jax.trials.rules import trial_key
 from potlp_jax.types import Status
 from potlp_jax.view.report_page import Cell, Shown, report_page
@@ -727,6 +728,62 @@ def test_the_report_holds_tables_plots_and_replays_of_the_trials_as_they_were(fi
     paths = {path_text(np.array(json.loads(entry)["path"], np.int32)) for entry in data}
     assert len(data) == 2
     assert paths <= {row.path for row in rows}
+
+
+def test_a_trial_of_a_sweep_is_looked_at_as_it_was(finished, tmp_path):
+    told = _potlp("sweep", "trial", finished, "--world", 6, "--out", tmp_path, "--no-animation", "--json")
+    assert told.exit_code == 0, told.stderr
+    # What the report shows: the last policy, where PO-TLP took no part.
+    (row,) = [row for row in _rows(finished) if (row.item.policy, row.item.world) == ("optimistic", 6)]
+    trial = load_trial(tmp_path / "trial.json")
+    assert (trial.policy, trial.world_number, trial.environment) == ("optimistic", 6, "toy/validation")
+    assert (path_text(np.array(trial.path, np.int32)), trial.cost) == (row.path, row.cost)
+    assert json.loads(told.stdout)["files"] == [str(tmp_path / name) for name in ("trial.json", "trial.png")]
+    assert "another trial" not in told.stderr
+    # By the number in the family, and by the formula of the tables; of another policy.
+    for task in ("2", "!hazard U goal"):
+        told = _potlp("sweep", "trial", finished, "--world", 6, "--task", task, "--policy", "baseline")
+        assert told.exit_code == 0, told.stderr
+        assert re.search(r"policy +baseline", told.stdout)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["trial.json", "trial.png"]
+
+
+def test_a_trial_that_goes_otherwise_today_is_said(finished, tmp_path):
+    shutil.copytree(finished, tmp_path / "sweep")
+    store = Store(tmp_path / "sweep" / RESULTS)
+    row = next(row for row in store.rows() if row.item.policy == "baseline")
+    store._connection.execute("DELETE FROM trials WHERE policy = 'baseline' AND world = ?", (row.item.world,))
+    store.finish([dataclasses.replace(row, decisions=row.decisions + 1, commit="0123abc")])
+    store.close()
+    arguments = ("--world", row.item.world, "--policy", "baseline")
+    told = _potlp("sweep", "trial", tmp_path / "sweep", *arguments)
+    assert re.search(rf"cost {row.cost:.2f}.*0123abc", " ".join(told.stderr.split())), told.stderr
+    assert "another trial" not in _potlp("sweep", "trial", finished, *arguments).stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--world", 99), "--world 99: optimistic has no trial there.*it has: 5, 6, 7"),
+        (("--world", 6, "--task", "F hazard"), "--task F hazard: the sweep has no such task; it has: !hazard U goal"),
+        (("--world", 6, "--task", "7"), "toy has no task 7"),
+        (("--world", 6, "--policy", "oracle"), "--policy oracle: the sweep has no such policy; it has: known-map"),
+        (("--world", 6, "--environment", "rooms"), "--environment rooms: the sweep has no such environment.*toy"),
+        (("--world", 6, "--no-animation"), "--no-animation needs --out"),
+    ],
+)
+def test_a_trial_that_the_sweep_does_not_have_is_refused_with_those_that_it_has(finished, arguments, message):
+    told = _potlp("sweep", "trial", finished, *arguments)
+    assert told.exit_code == 2
+    assert re.search(message, " ".join(told.stderr.split())), told.stderr
+
+
+def test_of_several_tasks_one_is_to_be_named(tmp_path):
+    store = Store(tmp_path / RESULTS)
+    store.agree({"specification": _specification(tasks=[1, 2]).to_dict(), "estimator": None})
+    store.close()
+    told = _potlp("sweep", "trial", tmp_path, "--world", 5)
+    assert re.search(r"--task: name one; it has: .*, !hazard U goal", " ".join(told.stderr.split())), told.stderr
 
 
 @pytest.mark.parametrize(

@@ -104,6 +104,12 @@ Propositions = Annotated[
     str | None, typer.Option("--propositions", "-p", help="All propositions, in the order of a letter's bits: a,b.")
 ]
 
+# What is written of one trial.
+TrialFolder = Annotated[
+    Path | None, typer.Option("--out", "-o", help="Folder for trial.json, trial.png and trial.gif.")
+]
+Animation = Annotated[bool, typer.Option(help="Make the animation, the slowest of the three files.")]
+
 # What `potlp run` and `potlp sweep` wrote.
 TrialFile = Annotated[Path, typer.Argument(metavar="TRIAL", help="Folder or file that `potlp run --out` wrote.")]
 SweepFolder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a sweep, as --out named it.")]

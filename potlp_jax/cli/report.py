@@ -41,7 +41,7 @@ def write_report(
 ) -> None:
     """Write a sweep as one page: tables, plots, and the worst and best trials as replays."""
     from potlp_jax.cli.inputs import open_store
-    from potlp_jax.sweep.results import pair_rows, remarks_on_given_up
+    from potlp_jax.sweep.results import pair_rows, remarks_on_given_up, subject_of
     from potlp_jax.sweep.runner import Sweep
     from potlp_jax.sweep.specification import specification_from_store
     from potlp_jax.view.report_page import Cell, report_page
@@ -64,7 +64,7 @@ def write_report(
             rows += found
             pairs = pair_rows(found, policies)
             shown = []
-            for reason, row, baseline in _notable(pairs, _subject(policies), replays):
+            for reason, row, baseline in _notable(pairs, subject_of(policies), replays):
                 # A replay needs the beliefs of every step, which rows do not keep.
                 progress.update(bar, description=f"running world {row.item.world} again")
                 shown.append(_shown(sweep, reason, row, baseline))
@@ -78,12 +78,6 @@ def page_title(folder: Path) -> str:
     # Resolved, for "." has no name.
     name = folder.resolve().name
     return name[:1].upper() + name[1:] if "sweep" in name.lower() else f"Sweep {name}"
-
-
-def _subject(policies: Sequence[str]) -> str:
-    """The policy whose trials are looked at: PO-TLP where it took part, otherwise the last."""
-    # Savings need another policy than the two they are measured between; of several the last named is on trial.
-    return "potlp" if "potlp" in policies else policies[-1]
 
 
 def _notable(pairs: "Sequence[Pair]", policy: str, count: int) -> "Iterator[tuple[str, Row, Row]]":

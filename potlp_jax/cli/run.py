@@ -2,14 +2,13 @@
 
 import contextlib
 import logging
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
-from rich.text import Text
 
 from potlp_jax.cli.group import Command, command_app
 from potlp_jax.cli.options import (
+    Animation,
     CameraName,
     Environment,
     EstimatorName,
@@ -19,24 +18,21 @@ from potlp_jax.cli.options import (
     Simulations,
     SplitName,
     TaskName,
+    TrialFolder,
     WorldNumber,
 )
-from potlp_jax.cli.output import FAILED, console, fail, make_folder, print_json, progress_bar
+from potlp_jax.cli.output import FAILED, make_folder, print_json, progress_bar
 
 if TYPE_CHECKING:
     from potlp_jax.environments.base import Generator
     from potlp_jax.environments.splits import Split
     from potlp_jax.task.task import Task
     from potlp_jax.trials.config import TrialConfig
-    from potlp_jax.trials.record import Trial
 
 logger = logging.getLogger(__name__)
 
 WORLDS_TRIED: int = 20
 """Worlds in which to look for one where the task is possible, after one where it is not."""
-
-# In this order, below the outcome.
-_SHOWN = ("task", "environment", "world", "policy", "steps", "decisions", "fallbacks")
 
 app = command_app()
 
@@ -62,10 +58,8 @@ def run_one(
     policy: PolicyName = None,
     world: WorldNumber = 0,
     split: SplitName = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for trial.json, trial.png and trial.gif.")
-    ] = None,
-    animation: Annotated[bool, typer.Option(help="Make the animation, the slowest of the three files.")] = True,
+    out: TrialFolder = None,
+    animation: Animation = True,
     simulations: Simulations = None,
     search: SearchName = None,
     estimator: EstimatorName = None,
@@ -82,14 +76,14 @@ def run_one(
         setting_changes,
         trial_config,
     )
+    from potlp_jax.cli.trial_files import print_trial, require_folder, write_trial
     from potlp_jax.environments.registry import make
     from potlp_jax.planning.policies import named_policy
     from potlp_jax.trials.loop import run_trial
     from potlp_jax.trials.record import Outcome
     from potlp_jax.trials.rules import trial_key
 
-    if out is None and not animation:
-        fail("--no-animation needs --out: without a folder there is no animation")
+    require_folder(out, animation)
     generator = make(environment)
     chosen_split = read_split(split, generator)
     named = None if policy is None else named_policy(policy)
@@ -113,12 +107,11 @@ def run_one(
             world_number=world,
             estimator=trained,
         )
-    # The record first: should drawing fail, the trial is not lost.
-    files = [] if folder is None else _write(trial, folder, animation)
+    files = [] if folder is None else write_trial(trial, folder, animation)
     if json:
         print_json({**trial.summary(), "files": [str(file) for file in files]})
     else:
-        _print(trial, files)
+        print_trial(trial, files)
     # After the result, because finding out may take a while: each world that is tried is made first.
     if trial.outcome is Outcome.INFEASIBLE:
         logger.warning(_why_infeasible(generator, chosen_split, asked, config, world=world))
@@ -154,52 +147,3 @@ def _why_infeasible(generator: "Generator", split: "Split", task: "Task", config
             tried += 1
     also = f", as in the {tried} worlds that follow" if tried else ""
     return f"with the whole map it is impossible too{also}: check the task"
-
-
-def _write(trial: "Trial", folder: Path, animation: bool) -> list[Path]:
-    from potlp_jax.cli.inputs import RECORD
-    from potlp_jax.cli.view import PAGE
-    from potlp_jax.view.animation import save_animation
-    from potlp_jax.view.maps import draw_trial
-    from potlp_jax.view.style import save_figure
-
-    files = [folder / RECORD, folder / "trial.png"]
-    # What shows an earlier trial would stand beside the record of this one.
-    for shown in ("trial.png", "trial.gif", PAGE):
-        (folder / shown).unlink(missing_ok=True)
-    trial.save(files[0])
-    save_figure(draw_trial(trial), files[1])
-    if animation:
-        files.append(folder / "trial.gif")
-        with progress_bar() as progress:
-            bar = progress.add_task("drawing the animation")
-            save_animation(
-                trial, files[2], progress=lambda done, total: progress.update(bar, completed=done, total=total)
-            )
-    return files
-
-
-def _print(trial: "Trial", files: list[Path]) -> None:
-    from potlp_jax.trials.record import Outcome
-    from potlp_jax.types import status_names
-
-    out = console()
-    # The colour repeats the word, so that nothing is lost without it.
-    colour = "green" if trial.outcome is Outcome.SATISFIED else "red"
-    out.print(Text.assemble((trial.outcome.value, f"bold {colour}"), f"  cost {trial.cost:.2f}"))
-    summary = trial.summary()
-    for name in _SHOWN:
-        out.print(f"{name:12} {summary[name]}")
-    # Flags say that an array or a loop was too small for this trial (`types.Status`); most trials have none.
-    if trial.status:
-        flags = ", ".join(status_names(trial.status)).replace("_", " ")
-        out.print(f"{'status':12} {flags}")
-    for file in files:
-        out.print(f"wrote {file}")
-    # What one would do next with these files; a newcomer need not look it up.
-    if files:
-        # A trial that ended where it began has no decision to explain.
-        command = f"explain {files[0].parent}:0" if trial.decisions else f"view {files[0].parent}"
-        out.print(f"next: potlp {command}", style="dim")
-    else:
-        out.print("add --out FOLDER for the record, a picture and an animation", style="dim")

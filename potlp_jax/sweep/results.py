@@ -5,6 +5,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 from potlp_jax.errors import StoreError
+from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.statistics import SATISFIED, UNRELIABLE, Comparison, TrialResult
 from potlp_jax.sweep.store import Item, Row, Store
 
@@ -110,6 +111,12 @@ def read_results(store: Store) -> Results:
             )
         )
     return Results(specification, tuple(cells), store.broken())
+
+
+def subject_of(policies: Sequence[str]) -> str:
+    """The policy whose trials are looked at: PO-TLP where it took part, otherwise the last."""
+    # Savings need another policy than the two they are measured between; of several the last named is on trial.
+    return Policy.POTLP.value if Policy.POTLP.value in policies else policies[-1]
 
 
 def world_of(pair: Pair) -> int:

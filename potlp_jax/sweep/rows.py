@@ -17,6 +17,7 @@ from potlp_jax.sweep.store import Item, Row
 from potlp_jax.trials.batch import Finished
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import versions as library_versions
+from potlp_jax.trials.record import Trial
 from potlp_jax.world.grid import World, world_digest
 from potlp_jax.world.moves import NEIGHBOURS
 
@@ -59,6 +60,13 @@ def trial_row(
         seconds=trial.seconds,
         world_digest=world_digest(world),
     )
+
+
+def same_trial(row: Row, trial: Trial) -> bool:
+    """Whether a trial that was run once more went as its row says: outcome, path, number of decisions and status."""
+    path = path_text(np.array(trial.path, np.int32))
+    now = (trial.outcome.value, path, len(trial.decisions), trial.status)
+    return (row.outcome, row.path, row.decisions, row.status) == now
 
 
 def trial_budget(world: World, factor: float) -> float:
