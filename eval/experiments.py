@@ -136,7 +136,7 @@ EXPERIMENTS: dict[str, Experiment] = {
     "ablations": Experiment(
         page="ablations",
         command="python -m eval.ablations --out {out} --views own={all}/own explored={all}/explored "
-        "--processes {processes} --report docs/results/ablations",
+        "--processes {processes} --beside docs/results/ablations_first.json --report docs/results/ablations",
         minutes=112,
     ),
     "held-out": Experiment(

@@ -121,6 +121,24 @@ def test_shares_and_points_are_those_of_the_rows(finished):
     assert f"{4 * 4 * 3 * 3} trials were audited: 0 problems" in text
 
 
+def test_a_second_fit_is_told_beside_the_first(finished):
+    """Bold is what both fits tell from none, with the same sign."""
+    found = results_of(finished, ["own"])
+    before = json.loads(json.dumps(found))
+    tasks = before["variants"]["no-map"]["tasks"]
+    tasks["2"]["beside"], tasks["3"]["beside"], tasks["4"]["beside"] = [-8, -12, 2], [9, 4, 12], [-8, -12, -2]
+    del before["variants"]["one-epoch"]
+    beside = finished / "first.json"
+    beside.write_text(json.dumps(before))
+    text = page(found, ["own"], "ablations", beside)
+    assert (
+        "| no-map | **-30, -30** | -30, -8 | -30, +9 | **-30, -8** |\n\n<!-- made: ablations.json, first.json -->"
+        in text
+    )
+    assert text.count("| one-epoch |") == 1
+    assert "second fit" not in page(found, ["own"], "ablations")
+
+
 def test_the_report_is_three_files(finished):
     write_report(finished, ["own"], finished / "ablations")
     assert json.loads((finished / "ablations.json").read_text())["audited"] == 144

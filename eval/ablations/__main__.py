@@ -37,6 +37,9 @@ def main() -> None:
     parser.add_argument("--first-world", type=int, default=7000)
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--report", type=Path, metavar="NAME", help="without suffix: where the results go")
+    parser.add_argument(
+        "--beside", type=Path, metavar="FILE.json", help="what --report wrote of other fits, to compare"
+    )
     parser.add_argument("--as-it-is", action="store_true", help="report what is finished, run nothing")
     options = parser.parse_args()
     views = dict(options.views)
@@ -44,7 +47,7 @@ def main() -> None:
         enable_compilation_cache()
         run(options.out, views, options.worlds, options.first_world, options.processes, options.only)
     if options.report is not None:
-        write_report(options.out, list(views), options.report)
+        write_report(options.out, list(views), options.report, options.beside)
 
 
 if __name__ == "__main__":

@@ -93,13 +93,13 @@ def _costs(rows: Sequence[Row], task: str) -> Costs:
     return {key: costs for key, costs in found.items() if len(costs) == len(POLICIES)}
 
 
-def write_report(out: Path, views: Sequence[str], report: Path) -> None:
-    """NAME.json, NAME.png and NAME.md."""
+def write_report(out: Path, views: Sequence[str], report: Path, beside: Path | None = None) -> None:
+    """NAME.json, NAME.png and NAME.md; ``beside``: the JSON file of other fits of the same networks."""
     found = results_of(out, views)
     report.parent.mkdir(parents=True, exist_ok=True)
     report.with_suffix(".json").write_text(json.dumps(found, indent=1) + "\n")
     draw_times(found, report.with_suffix(".png"))
-    report.with_suffix(".md").write_text(lines_of(page(found, views, report.name), report.parent))
+    report.with_suffix(".md").write_text(lines_of(page(found, views, report.name, beside), report.parent))
 
 
 PAGE: str = """# What each part of the estimator is good for
@@ -110,7 +110,7 @@ of the policy's own, and what does more time bring?
 **Answer.** {answer}
 
 ```sh
-python -m eval.ablations --out out/ablations --views {views} --report docs/results/ablations
+python -m eval.ablations --out out/ablations --views {views}{option} --report docs/results/ablations
 ```
 
 All but the last line are fitted to the same number of views: 1,200 buildings of the explorer, and 400 drives of PO-TLP
@@ -134,7 +134,7 @@ Points of the share beside the whole network, paired by world:
 
 {points}
 <!-- made: {data} -->
-
+{second}
 ![Share of the attainable savings over passes through the views]({picture})
 
 ## In answers
@@ -147,10 +147,30 @@ in its view alone, which are fewer and nearer.
 """
 """The page of results."""
 
+_SECOND = """
+### What a second fit changes
 
-def page(found: Mapping[str, Any], views: Sequence[str], name: str) -> str:
-    """The page about what ``results_of`` gave; ``name``: of the files beside it."""
+The same networks were fitted once before, to as many views and by other code, and drove in the same worlds
+([{beside}]({beside})). Points of the share beside the whole network, of this fit and then of that one; bold where both
+can be told from none and have the same sign:
+
+{points}
+<!-- made: {data}, {beside} -->
+"""
+
+
+def page(found: Mapping[str, Any], views: Sequence[str], name: str, beside: Path | None = None) -> str:
+    """The page about what ``results_of`` gave.
+
+    Args:
+        found: the figures.
+        views: names of the data sets.
+        name: of the files beside the page.
+        beside: the figures of other fits of the same networks, a JSON file in the folder of the page.
+    """
     return PAGE.format(
+        second="" if beside is None else _second(found, name, beside),
+        option="" if beside is None else f" --beside docs/results/{beside.name}",
         answer=_answer(found),
         views=" ".join(f"{of}=out/{of}" for of in views),
         first=found["worlds"][0],
@@ -182,6 +202,32 @@ def _gains(found: Mapping[str, Any]) -> Iterator[str]:
     for variant, entry in found["variants"].items():
         if variant != WHOLE:
             yield f"| {variant} | " + " | ".join(_points(entry["tasks"][task]["beside"]) for task in tasks) + " |"
+
+
+def _second(found: Mapping[str, Any], name: str, beside: Path) -> str:
+    before = json.loads(beside.read_text("utf-8"))
+    points = "".join(f"{line}\n" for line in _both(found["variants"], before["variants"]))
+    return _SECOND.format(points=points, data=f"{name}.json", beside=beside.name)
+
+
+def _both(now: Mapping[str, Any], before: Mapping[str, Any]) -> Iterator[str]:
+    """A line for each network that was fitted twice: its points in both fits."""
+    tasks = list(now[WHOLE]["tasks"])
+    yield "| network | " + " | ".join(f"task {task}" for task in tasks) + " |"
+    yield "|---|" + "---|" * len(tasks)
+    for variant in now:
+        # The shipped network is the same file beside both.
+        if variant in before and variant not in (WHOLE, SHIPPED):
+            pairs = [
+                (now[variant]["tasks"][task]["beside"], before[variant]["tasks"][task]["beside"]) for task in tasks
+            ]
+            yield f"| {variant} | " + " | ".join(_pair(*pair) for pair in pairs) + " |"
+
+
+def _pair(now: Sequence[float], before: Sequence[float]) -> str:
+    text = f"{now[0]:+.0f}, {before[0]:+.0f}"
+    same = all(low > 0 for _, low, _ in (now, before)) or all(high < 0 for _, _, high in (now, before))
+    return f"**{text}**" if same else text
 
 
 def _answers_table(found: Mapping[str, Any], views: Sequence[str]) -> Iterator[str]:
