@@ -151,8 +151,8 @@ _SECOND = """
 ### What a second fit changes
 
 The same networks were fitted once before, to as many views and by other code, and drove in the same worlds
-([{beside}]({beside})). Points of the share beside the whole network, of this fit and then of that one; bold where both
-can be told from none and have the same sign:
+([{beside}]({beside})). Points of the share beside the whole network, of this
+fit and then of that one; bold where both can be told from none and have the same sign:
 
 {points}
 <!-- made: {data}, {beside} -->
