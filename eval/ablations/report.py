@@ -170,7 +170,7 @@ def page(found: Mapping[str, Any], views: Sequence[str], name: str, beside: Path
     """
     return PAGE.format(
         second="" if beside is None else _second(found, name, beside),
-        option="" if beside is None else f" --beside docs/results/{beside.name}",
+        option="" if beside is None else f" --beside {beside}",
         answer=_answer(found),
         views=" ".join(f"{of}=out/{of}" for of in views),
         first=found["worlds"][0],
