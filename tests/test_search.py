@@ -703,10 +703,13 @@ def plan_of_pulls(pulls):
     )
 
 
-def test_tree_is_consistent_with_equation_3():
+# A finished search does not show what bounds were on the way.
+@pytest.mark.parametrize(("simulations", "least_checked"), [(5, 1), (64, 6)])
+def test_tree_is_consistent_with_equation_3(simulations, least_checked):
     """Every Q in the tree is the expectation over its children; every value the minimum over its actions."""
     problem = shared_shape("F a & F b", 3, unreachable=0.1)
-    plan, tree = tree_jit(problem, jax.random.key(0), config=dataclasses.replace(QUICK, optimism=1.0))
+    config = dataclasses.replace(QUICK, optimism=1.0, simulations=simulations)
+    plan, tree = tree_jit(problem, jax.random.key(0), config=config)
     q_values, bounds, floors = (
         np.asarray(values)[: int(tree.size)] for values in (tree.q_values, tree.bounds, tree.floors)
     )
@@ -716,10 +719,10 @@ def test_tree_is_consistent_with_equation_3():
     np.testing.assert_array_equal(floors.min(axis=1), np.minimum(values.leave.floor, values.stay.floor))
     assert np.all(floors <= bounds)
     assert np.all(bounds <= q_values)
-    assert int(plan.visits.sum()) == int(tree.simulations) <= QUICK.simulations
+    assert int(plan.visits.sum()) == int(tree.simulations) <= simulations
     top = tree_top(problem, tree, depth=3, width=4)
     checked = check_equation_3(top)
-    assert checked > 5
+    assert checked >= least_checked
     assert top["actions"][0]["q_value"] == pytest.approx(float(plan.value))
 
 

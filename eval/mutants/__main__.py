@@ -59,8 +59,7 @@ def run_tests(folder: Path, mutant: Mutant) -> tuple[str, str]:
         "PYTHONPATH": str(folder),
         "PYTHONDONTWRITEBYTECODE": "1",
         "HYPOTHESIS_PROFILE": "mutants",
-        # Where a kernel does the work of a function in Python, a fault of the function would change nothing.
-        "POTLP_NATIVE": "1" if Path(mutant.file).parent.name == "kernels" else "0",
+        "POTLP_NATIVE": "1" if mutant.beside_kernels or Path(mutant.file).parent.name == "kernels" else "0",
     }
     done = subprocess.run(
         command, cwd=folder, env=environment, preexec_fn=_limit, capture_output=True, text=True, check=False

@@ -15,6 +15,8 @@ class Mutant:
         new: what stands there in the mutant.
         tests: files of tests; narrow, so that a mutant costs seconds.
         only: names of tests, as ``pytest -k`` takes them; all of the files where it is empty.
+        beside_kernels: the tests compare twins with kernels. Where a kernel does the work of a function in Python, a
+            fault of the function would change nothing: kernels are off for faults in Python without this.
     """
 
     part: str
@@ -24,3 +26,4 @@ class Mutant:
     new: str
     tests: tuple[str, ...]
     only: str = ""
+    beside_kernels: bool = False

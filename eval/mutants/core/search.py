@@ -28,6 +28,7 @@ MUTANTS = (
         "tries = is_due & is_late & ~certifies & jnp.any",
         "tries = is_due & is_late & jnp.any",
         ("tests/test_native_search.py",),
+        beside_kernels=True,
     ),
     Mutant(
         PART,
