@@ -129,7 +129,7 @@ def policies_of(item: dict[str, Any]) -> tuple[str, ...]:
     return tuple(policy for policy in POLICIES if not (sparse and policy == Policy.ORACLE))
 
 
-def run_item(item: dict[str, Any]) -> list[dict[str, Any]]:
+def run_item(item: dict[str, Any], made_by: dict[str, Any]) -> list[dict[str, Any]]:
     """One row per policy, on the first world that is possible for the item's task; one row if none of 50 is."""
     for world, task, environment, world_number, config in possible_world(item):
         run = functools.partial(
@@ -161,18 +161,18 @@ def run_item(item: dict[str, Any]) -> list[dict[str, Any]]:
                     "traits": traits(task),
                     "problems": found,
                     "seconds": time.perf_counter() - begun,
-                    "provenance": provenance(),
+                    "provenance": made_by,
                 }
             )
         return rows
     return [{**item, "impossible": True, "problems": []}]
 
 
-def work(arguments: tuple[dict[str, Any], Path]) -> None:
+def work(arguments: tuple[dict[str, Any], Path, dict[str, Any]]) -> None:
     """Run one item and append its rows; an exception is a row too."""
-    item, out = arguments
+    item, out, made_by = arguments
     try:
-        rows = run_item(item)
+        rows = run_item(item, made_by)
     except Exception:
         rows = [{**item, "exception": traceback.format_exc(), "problems": ["exception"]}]
     with (out / f"{item['suite']}.jsonl").open("a") as file:
@@ -255,8 +255,10 @@ def main() -> None:
     for suite in arguments.suites:
         done = {(row["task"], row["number"]) for row in rows_of(arguments.out, suite)}
         todo += [item for item in items(suite) if (item["task"], item["number"]) not in done]
+    # Of the command: a worker has one of its own.
+    made_by = provenance()
     with multiprocessing.get_context("spawn").Pool(arguments.processes) as pool:
-        for count, _ in enumerate(pool.imap_unordered(work, [(item, arguments.out) for item in todo]), start=1):
+        for count, _ in enumerate(pool.imap_unordered(work, [(item, arguments.out, made_by) for item in todo]), 1):
             print(f"{count}/{len(todo)} items", end="\r", flush=True)
     print(report(arguments.out))
 
