@@ -739,32 +739,87 @@ def test_a_trial_of_a_sweep_is_looked_at_as_it_was(finished, tmp_path):
     assert (trial.policy, trial.world_number, trial.environment) == ("optimistic", 6, "toy/validation")
     assert (path_text(np.array(trial.path, np.int32)), trial.cost) == (row.path, row.cost)
     assert json.loads(told.stdout)["files"] == [str(tmp_path / name) for name in ("trial.json", "trial.png")]
-    assert "another trial" not in told.stderr
-    # By the number in the family, and by the formula of the tables; of another policy.
-    for task in ("2", "!hazard U goal"):
+    assert json.loads(told.stdout)["differs_from_row"] == []
+    assert "not that of" not in told.stderr
+    # By the number in the family, by the formula of the tables, and by one that means the same; of another policy.
+    for task in ("2", "!hazard U goal", "(!(hazard)) U (goal)"):
         told = _potlp("sweep", "trial", finished, "--world", 6, "--task", task, "--policy", "baseline")
         assert told.exit_code == 0, told.stderr
         assert re.search(r"policy +baseline", told.stdout)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["trial.json", "trial.png"]
 
 
-def test_a_trial_that_goes_otherwise_today_is_said(finished, tmp_path):
-    shutil.copytree(finished, tmp_path / "sweep")
-    store = Store(tmp_path / "sweep" / RESULTS)
+@pytest.fixture
+def changed(finished, tmp_path):
+    """A copy of the sweep with a row that says otherwise, in the first world of the baseline; and the row of before."""
+    folder = tmp_path / "sweep"
+    shutil.copytree(finished, folder)
+    store = Store(folder / RESULTS)
     row = next(row for row in store.rows() if row.item.policy == "baseline")
     store._connection.execute("DELETE FROM trials WHERE policy = 'baseline' AND world = ?", (row.item.world,))
-    store.finish([dataclasses.replace(row, decisions=row.decisions + 1, commit="0123abc")])
+    store.finish([dataclasses.replace(row, decisions=row.decisions + 1, status=2, commit="0123abc")])
     store.close()
-    arguments = ("--world", row.item.world, "--policy", "baseline")
-    told = _potlp("sweep", "trial", tmp_path / "sweep", *arguments)
-    assert re.search(rf"cost {row.cost:.2f}.*0123abc", " ".join(told.stderr.split())), told.stderr
-    assert "another trial" not in _potlp("sweep", "trial", finished, *arguments).stderr
+    return folder, row
+
+
+def test_in_what_a_trial_goes_otherwise_today_is_said(finished, changed):
+    folder, row = changed
+    arguments = ("--world", row.item.world, "--policy", "baseline", "--json")
+    told = _potlp("sweep", "trial", folder, *arguments)
+    said = " ".join(told.stderr.split())
+    assert re.search(rf"cost {row.cost:.2f}, by commit 0123abc\); it differs in: decisions, status\.", said), said
+    assert json.loads(told.stdout)["differs_from_row"] == ["decisions", "status"]
+    assert "not that of" not in _potlp("sweep", "trial", finished, *arguments).stderr
+
+
+def test_a_trial_that_is_not_satisfied_ends_with_1_when_it_is_looked_at_too(tmp_path):
+    settings = {"budget_factor": 0.01}
+    run_sweep(_specification(policies=["baseline"], worlds=1, settings=settings), tmp_path, 1)
+    told = _potlp("sweep", "trial", tmp_path, "--world", 5)
+    assert "budget" in told.stdout
+    assert told.exit_code == 1
+
+
+def test_why_there_is_no_trial_is_said(finished, changed, tmp_path):
+    folder, row = changed
+    store = Store(folder / RESULTS)
+    store._connection.execute("DELETE FROM trials WHERE policy = 'baseline'")
+    store.set_broken(row.item, "3 workers that began it died")
+    store.set_possible("toy", row.item.task, {99: False})
+    store.close()
+    for world, message in (
+        (row.item.world, "it was given up: 3 workers that began it died"),
+        (99, "the task is impossible in it"),
+        (6, "the sweep has not run it; there are: none"),
+    ):
+        told = _potlp("sweep", "trial", folder, "--world", world, "--policy", "baseline")
+        assert told.exit_code == 2
+        assert f"--world {world}: baseline has no trial there: {message}" in " ".join(told.stderr.split())
+    # Before anything runs.
+    told = _potlp("sweep", "trial", finished, "--world", 6, "--out", finished / RESULTS)
+    assert "is a file; give a folder" in told.stderr
+    told = _potlp("sweep", "trial", finished / RESULTS, "--world", 6)
+    assert "is a file; give the folder of the sweep" in told.stderr
+
+
+def test_what_a_sweep_was_run_with_is_to_be_put_back(finished, tmp_path):
+    shutil.copytree(finished, tmp_path / "sweep")
+    store = Store(tmp_path / "sweep" / RESULTS)
+    # As of a sweep that asked a file which is gone.
+    facts = store.facts()
+    gone = facts["specification"] | {"estimator": "gone.npz"}
+    store._connection.execute("DELETE FROM facts WHERE name = 'specification'")
+    store.agree({"specification": gone})
+    store.close()
+    told = _potlp("sweep", "trial", tmp_path / "sweep", "--world", 6)
+    assert told.exit_code == 2
+    assert re.search(r"put back what the sweep was run with: .*gone\.npz", " ".join(told.stderr.split()))
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--world", 99), "--world 99: optimistic has no trial there.*it has: 5, 6, 7"),
+        (("--world", 99), "--world 99: optimistic has no trial there: the sweep has not run it; there are: 5, 6, 7"),
         (("--world", 6, "--task", "F hazard"), "--task F hazard: the sweep has no such task; it has: !hazard U goal"),
         (("--world", 6, "--task", "7"), "toy has no task 7"),
         (("--world", 6, "--policy", "oracle"), "--policy oracle: the sweep has no such policy; it has: known-map"),

@@ -122,6 +122,8 @@ def trial_config(changes: Mapping[str, Any], generator: Generator | None = None)
 @contextmanager
 def open_store(folder: Path) -> Iterator[Store]:
     """The store of a sweep that has been begun, closed at the end."""
+    if folder.is_file():
+        fail(f"{folder}: is a file; give the folder of the sweep")
     # Asked first, because opening a store makes one where there is none.
     if not (folder / RESULTS).is_file():
         fail(

@@ -17,8 +17,6 @@ from potlp_jax.cli.options import Animation, ClusterName, Json, SweepFolder, Tri
 from potlp_jax.cli.output import FAILED, console, fail, make_folder, print_json, print_table, progress_bar
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from potlp_jax.engine.engine import Engine
     from potlp_jax.sweep.results import CellResults
     from potlp_jax.sweep.runner import Progress
@@ -29,9 +27,6 @@ logger = logging.getLogger(__name__)
 
 SECONDS_BETWEEN_LINES: float = 10.0
 """Between lines of progress where stderr is no terminal."""
-
-# Enough to see how the worlds are numbered.
-_WORLDS_NAMED = 10
 
 
 class _RunByDefault(TyperGroup):
@@ -247,7 +242,7 @@ def print_cell(out: Console, cell: "CellResults", split: str) -> None:
 
 [cyan]potlp sweep trial out/sweep --task 1 --world 7 --policy baseline --out out/seen[/cyan]
 
-[dim]Then potlp explain out/seen:0, potlp view out/seen.[/dim]
+[dim]Then potlp explain out/seen:0, potlp view out/seen. Ends with exit code 1 if the task was not satisfied.[/dim]
 """,
 )
 def trial(
@@ -268,71 +263,29 @@ def trial(
     json: Json = False,
 ) -> None:
     """Run one trial of a sweep once more, for its record, picture and animation."""
-    from potlp_jax.cli.inputs import open_store
+    from potlp_jax.cli.sweep_trial import chosen_row, opened, warn_of_differences
     from potlp_jax.cli.trial_files import print_trial, require_folder, write_trial
-    from potlp_jax.sweep.results import subject_of
-    from potlp_jax.sweep.rows import same_trial
-    from potlp_jax.sweep.runner import Sweep
-    from potlp_jax.sweep.specification import specification_from_store
+    from potlp_jax.sweep.rows import differences_of
+    from potlp_jax.trials.record import Outcome
 
     require_folder(out, animation)
-    with open_store(folder) as store:
-        specification = specification_from_store(store.specification())
-    environment = _one_of("environment", environment, [cell.environment for cell in specification.cells])
-    task = _task_of(specification, environment, task)
-    policy = _one_of("policy", policy or subject_of(specification.policies), specification.policies)
-    sweep = Sweep(specification, folder, read_only=True)
-    row = _row_of(sweep.store.rows(environment, task), policy, world)
+    sweep = opened(folder)
+    row = chosen_row(sweep, environment, task, policy, world)
     # Another building would be shown as that of the row.
     sweep.require_same_world(row)
+    written_to = None if out is None else make_folder(out)
     with progress_bar() as progress:
         progress.add_task("running the trial (the first decision compiles the planner)", total=None)
         again = sweep.trial(row.item)
-    files = [] if out is None else write_trial(again, make_folder(out), animation)
+    files = [] if written_to is None else write_trial(again, written_to, animation)
+    differing = differences_of(row, again)
     if json:
-        print_json({**again.summary(), "files": [str(file) for file in files]})
+        print_json({**again.summary(), "files": [str(file) for file in files], "differs_from_row": differing})
     else:
         print_trial(again, files)
-    if not same_trial(row, again):
-        logger.warning(
-            f"the row of the sweep has another trial ({row.outcome}, cost {row.cost:.2f}): it was made by commit "
-            f"{row.commit or 'unknown'}, and this version decides otherwise"
-        )
-
-
-def _one_of(option: str, given: str | None, names: "Sequence[str]") -> str:
-    """What was named with an option, or the only name there is."""
-    known = list(dict.fromkeys(names))
-    if given is None and len(known) == 1:
-        return known[0]
-    if given not in known:
-        said = f"--{option}: name one" if given is None else f"--{option} {given}: the sweep has no such {option}"
-        fail(f"{said}; it has: {', '.join(known)}")
-    return given
-
-
-def _task_of(specification: "Specification", environment: str, given: str | None) -> str:
-    """The task of a cell: by the cell's own name for it, or by its number or name in the environment."""
-    from potlp_jax.environments.registry import make
-
-    tasks = [cell.task for cell in specification.cells if cell.environment == environment]
-    if given is not None and given not in tasks:
-        # A sweep keeps formulas, and its file may have had numbers.
-        given = make(environment).formula(given)
-    return _one_of("task", given, tasks)
-
-
-def _row_of(rows: "Sequence[Row]", policy: str, world: int) -> "Row":
-    """The row of a policy in a world; the rows are of one environment and task."""
-    found = {row.item.world: row for row in rows if row.item.policy == policy}
-    if world not in found:
-        some = ", ".join(str(number) for number in list(found)[:_WORLDS_NAMED]) or "none"
-        more = f" and {len(found) - _WORLDS_NAMED} more" if len(found) > _WORLDS_NAMED else ""
-        fail(
-            f"--world {world}: {policy} has no trial there: the task is impossible in it, or not finished; "
-            f"it has: {some}{more}"
-        )
-    return found[world]
+    warn_of_differences(row, differing)
+    if again.outcome is not Outcome.SATISFIED:
+        raise typer.Exit(FAILED)
 
 
 @app.command("export", cls=Command)

@@ -62,11 +62,24 @@ def trial_row(
     )
 
 
-def same_trial(row: Row, trial: Trial) -> bool:
-    """Whether a trial that was run once more went as its row says: outcome, path, number of decisions and status."""
-    path = path_text(np.array(trial.path, np.int32))
-    now = (trial.outcome.value, path, len(trial.decisions), trial.status)
-    return (row.outcome, row.path, row.decisions, row.status) == now
+def differences_of(row: Row, trial: Trial) -> list[str]:
+    """In what a trial that was run once more is not that of its row.
+
+    Args:
+        row: of the store.
+        trial: of the same item.
+
+    Returns:
+        Of outcome, path, number of decisions and of fallbacks, and status those that differ, by name.
+    """
+    now = {
+        "outcome": trial.outcome.value,
+        "path": path_text(np.array(trial.path, np.int32)),
+        "decisions": len(trial.decisions),
+        "fallbacks": trial.summary()["fallbacks"],
+        "status": trial.status,
+    }
+    return [name for name, value in now.items() if getattr(row, name) != value]
 
 
 def trial_budget(world: World, factor: float) -> float:

@@ -102,6 +102,14 @@ _THE_ITEM = "environment = ? AND task = ? AND policy = ? AND world = ?"
 """Condition on the primary key of a trial."""
 
 
+_PUT_BACK = {
+    "specification": "the specification that this one was begun with",
+    "estimator": "the estimator that this one was begun with",
+    "source": "the files that define these, as they were",
+}
+"""By the fact that differs, what a store is gone on with."""
+
+
 class Store:
     """The store in a file. One object per process and thread.
 
@@ -239,7 +247,7 @@ class Store:
             elif given != written[name]:
                 raise StoreError(
                     f"{self.file}: was begun with another {name}: {', '.join(differences(written[name], given))}. "
-                    "Give the sweep a folder of its own, or the specification that this one was begun with"
+                    f"Give the sweep a folder of its own, or put back {_PUT_BACK.get(name, name)}"
                 )
         return missing
 
