@@ -1,5 +1,6 @@
 """Bad files end in one clear line, soon: a few damaged inputs of every kind. ``python -m eval.faults`` makes more."""
 
+import functools
 import io
 import os
 import sqlite3
@@ -450,6 +451,23 @@ def _file_kinds():
 @pytest.mark.parametrize("kind", _file_kinds(), ids=lambda kind: kind.name)
 def test_damaged_files_end_well(kind, tmp_path):
     _assert_good(kind, 8, tmp_path)
+
+
+def _compared_kinds():
+    """Of which what is read from damaged files is compared with what is read from whole ones."""
+    cases = [kind for kind in files.KINDS if isinstance(kind.run, functools.partial) and kind.run.func is files._case]
+    return [kind for kind in cases if kind.run.args[2]]
+
+
+@pytest.mark.parametrize("kind", _compared_kinds(), ids=lambda kind: kind.name)
+def test_what_is_read_twice_is_equal(kind, tmp_path):
+    """Or every damage that is harmless would count as a wrong answer."""
+    (tmp_path / "scratch").mkdir()
+    trees, read, _ = kind.run.args
+    tree = trees(tmp_path / "scratch")[0]
+    once, again = files._whole(tree, read, tmp_path / "scratch"), files._whole(tree, read, tmp_path / "scratch")
+    assert once == again
+    assert once is not None
 
 
 class _LongError(PotlpError):
