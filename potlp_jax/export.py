@@ -145,6 +145,9 @@ def export_planner(task: Task, folder: Path, config: ExportConfig = ExportConfig
             "exporting needs flatbuffers, with which jax writes programs: pip install flatbuffers"
         )
     folder.mkdir(parents=True, exist_ok=True)
+    # Of an earlier export: the manifest of this one would not name them.
+    for earlier in folder.glob("*.jaxexport"):
+        earlier.unlink()
     programs = _programs(task, config)
     files, functions = [], {}
     for program in programs:

@@ -136,6 +136,9 @@ def require_file(path: Path | str, error: type[PotlpError], most: int | None = N
     # A null byte in a name is a ValueError, a name of 5,000 characters an OSError.
     except (OSError, ValueError) as cause:
         why = cause.strerror if isinstance(cause, OSError) else one_line(cause)
+        # The same command means another file from another folder.
+        if isinstance(cause, FileNotFoundError) and not path.is_absolute():
+            why = f"{why}, seen from {one_line(Path.cwd())}"
         raise error.of_file(one_line(path), f"cannot be read ({why})") from cause
     if not stat.S_ISREG(found.st_mode):
         kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a device or pipe"

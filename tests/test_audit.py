@@ -311,6 +311,20 @@ def test_the_command_finds_another_split_and_seed_in_every_row(sweep, change, tm
     assert len({problem["trial"] for problem in found}) == len(rows)
 
 
+def test_a_problem_that_many_trials_share_is_not_shown_for_each(sweep, tmp_path, monkeypatch):
+    monkeypatch.setattr("potlp_jax.cli.audit._SHOWN", 2)
+    _, specification, rows = sweep
+    store = Store(tmp_path / RESULTS)
+    store.agree({"specification": {**specification.to_dict(), "seed": 1}, "estimator": None})
+    store.finish(rows)
+    store.close()
+    result = CliRunner().invoke(app, ["audit", str(tmp_path)])
+    assert result.exit_code == 1
+    assert result.stdout.count("another key") == 3
+    assert f"\n{len(rows) - 2} more trials (--json names them): was made with another key" in result.stdout
+    assert f"{len(rows)} trials, {len(rows)} problems" in result.stdout
+
+
 def test_worlds_of_another_split_are_found_without_a_digest_too(sweep):
     """What other planners deliver is a path alone; the start tells first."""
     _, _, rows = sweep

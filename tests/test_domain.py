@@ -15,7 +15,7 @@ from potlp_jax.environments.rooms import Rooms, RoomsConfig
 from potlp_jax.environments.ros.mapped_rooms import MappedRooms, MappedRoomsConfig
 from potlp_jax.environments.ros.ros_map import RosMap, RosMapConfig
 from potlp_jax.errors import BatchError, EstimatorError, PotlpWarning
-from potlp_jax.learning.domain import Domain
+from potlp_jax.learning.domain import LOGS, Domain
 from potlp_jax.learning.estimator import (
     estimator_for,
     named_estimator,
@@ -121,7 +121,9 @@ def test_on_request_an_estimator_is_asked_anywhere_with_a_note(building):
     world = RosMap(RosMapConfig(building, resolution=0.5, radius=0.0)).world(0)
     parcels = named_estimator("parcels")
     assert any(parcels is estimator for estimator in shipped_estimators())
-    with pytest.warns(PotlpWarning, match="parcels is asked about worlds that it was not made for: .*map:office"):
+    with pytest.warns(
+        PotlpWarning, match="estimator 'parcels' is asked about worlds that it was not made for: .*map:office"
+    ):
         assert estimator_for(PARCELS, _here(world), parcels) is parcels
     assert default_policy(world, given=parcels) is Policy.POTLP
 
@@ -149,6 +151,15 @@ def test_a_robot_of_ones_own_is_of_no_family():
     robot = SimulatedRobot(world, TrialConfig(), jax.random.key(0))
     with pytest.raises(EstimatorError, match="of no named family"):
         run_robot(robot, world.task(TASK), "potlp", jax.random.key(0))
+
+
+def test_what_learned_from_logs_serves_robots_and_their_maps(building):
+    """That is what it was made for."""
+    logs = Domain(LOGS, None, "metres")
+    assert not logs.misfits(Domain.of_robot(0.2))
+    assert not logs.misfits(_here(RosMap(RosMapConfig(building, resolution=0.5, radius=0.0)).world(0)))
+    (misfit,) = logs.misfits(Domain("parcels", None, "metres"))
+    assert misfit == "it learned from worlds of log, and these are of parcels"
 
 
 def test_two_unnamed_families_are_not_the_same():

@@ -861,8 +861,11 @@ def test_the_command_asks_the_estimator_that_is_named(server, monkeypatch, said,
 
     monkeypatch.setattr("potlp_jax.drive.driving.drive_robot", drive_robot)
     arguments = ["--task", TASK.text, "--propositions", ",".join(FLOOR.propositions), *said]
-    CliRunner().invoke(app, ["drive", f"127.0.0.1:{server.port}", *arguments])
-    assert asked == [policy]
+    for pictures in (["--image-topic", "/camera"], []):
+        told = CliRunner().invoke(app, ["drive", f"127.0.0.1:{server.port}", *arguments, *pictures])
+        noted = "--image-topic is of use with an --estimator alone" in " ".join(told.stderr.split())
+        assert noted == bool(pictures and not said)
+    assert asked == [policy] * 2
 
 
 @pytest.mark.parametrize("broken", [False, True])

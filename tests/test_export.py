@@ -218,6 +218,12 @@ def test_a_search_that_samples_takes_the_callers_key(situation, searches, tmp_pa
     assert_equal_plan(outputs, plan_of(situation.task, inputs, search, key))
 
 
+def test_programs_of_an_earlier_export_do_not_stay(situation, tmp_path):
+    (tmp_path / "decide.jaxexport").write_bytes(b"of another task")
+    export_planner(situation.task, tmp_path, ExportConfig(platforms=("cpu",)))
+    assert sorted(file.name for file in tmp_path.glob("*.jaxexport")) == ["plan.jaxexport"]
+
+
 def test_any_batch_and_platforms_are_in_the_manifest(searches):
     entry = manifest_of(searches)["functions"]["plan"]
     assert {value["shape"][0] for value in entry["inputs"] + entry["outputs"]} == {"b"}

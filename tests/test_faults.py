@@ -454,7 +454,7 @@ def test_damaged_files_end_well(kind, tmp_path):
 
 
 def _compared_kinds():
-    """Whose answers of damaged files are compared with those of whole ones: what makes the files and what reads them."""
+    """Where damaged files are compared with whole ones: what makes the files, and what reads them."""
     cases = [kind.run for kind in files.KINDS if isinstance(kind.run, functools.partial)]
     return [run.args[:2] for run in cases if run.func is files._case and run.args[2]]
 

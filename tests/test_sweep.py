@@ -33,12 +33,21 @@ from potlp_jax.engine.writer import only_writer
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, world_key
 from potlp_jax.environments.toy import Toy
-from potlp_jax.errors import ConfigurationError, EngineError, EstimatorError, StoreError, SweepError, WorldError
+from potlp_jax.errors import (
+    ConfigurationError,
+    EngineError,
+    EstimatorError,
+    PotlpError,
+    StoreError,
+    SweepError,
+    WorldError,
+)
 from potlp_jax.planning.policies import Policy
 from potlp_jax.sweep.results import charged_cost, pair_rows, read_results, remarks_on_worlds, world_of
 from potlp_jax.sweep.rows import path_text, read_path, source_commit
 from potlp_jax.sweep.runner import RESULTS, Progress, Sweep, run_sweep
 from potlp_jax.sweep.specification import (
+    _environment,
     configuration_hash,
     own_settings,
     read_specification,
@@ -313,6 +322,43 @@ def test_a_sweep_with_an_estimators_file_is_the_same_from_any_folder(tmp_path, m
     there = specification_from_dict({**SMALL, "estimator": "mine.npz"}, "here", tmp_path)
     monkeypatch.chdir(tmp_path)
     assert specification_from_dict({**SMALL, "estimator": "mine.npz"}, "here") == there
+
+
+def test_maps_lie_beside_the_file_that_names_them(tmp_path, monkeypatch):
+    (tmp_path / "maps").mkdir()
+    for name in ("office.yaml", "office.places.yaml"):
+        (tmp_path / "maps" / name).touch()
+    name = "map:office.yaml,places=office.places.yaml,resolution=0.4"
+    assert _environment(name, tmp_path / "maps") == (
+        f"map:{tmp_path}/maps/office.yaml,places={tmp_path}/maps/office.places.yaml,resolution=0.4"
+    )
+    # What is found as it stands keeps its name, and so does what is no file.
+    monkeypatch.chdir(tmp_path / "maps")
+    assert _environment(name, Path()) == name
+    assert _environment("rooms", tmp_path) == "rooms"
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "maps" / "sweep.yaml").write_text(json.dumps({**SMALL, "environments": ["map:none.yaml"]}))
+    with pytest.raises(PotlpError, match=rf"none\.yaml: cannot be read \(No such file .*, seen from {tmp_path}\)"):
+        read_specification(tmp_path / "maps" / "sweep.yaml")
+
+
+def test_tasks_without_a_finished_world_are_named(tmp_path):
+    store = Store(tmp_path / RESULTS)
+    store.agree({"specification": _specification().to_dict(), "estimator": None})
+    store.close()
+    told = _potlp("sweep", "show", tmp_path)
+    assert "toy, task !hazard U goal: no world that all policies have finished yet" in told.stdout
+
+
+def test_an_interrupted_sweep_says_that_it_goes_on(tmp_path, monkeypatch):
+    def run_sweep(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("potlp_jax.sweep.runner.run_sweep", run_sweep)
+    (tmp_path / "sweep.yaml").write_text(json.dumps(SMALL))
+    told = _potlp("sweep", tmp_path / "sweep.yaml", "--out", tmp_path / "out")
+    assert told.exit_code == 130
+    assert "interrupted; what is finished is kept: the same command goes on" in " ".join(told.stderr.split())
 
 
 def test_other_files_are_no_store(tmp_path):
@@ -926,6 +972,20 @@ def test_progress_says_nothing_twice(monkeypatch, caplog):
             reporter.report(Progress(done, 2))
     reporter.close()
     assert [record.message.partition(" (")[0] for record in caplog.records] == ["0 of 2 trials", "1 of 2 trials"]
+
+
+def test_the_rate_is_that_of_trials_and_not_of_compilation(monkeypatch):
+    times = iter([0.0, 100.0, 110.0])
+    monkeypatch.setattr("potlp_jax.cli.sweep.time.monotonic", lambda: next(times))
+    reporter = _Reporter()
+    # Nothing yet; eight trials after 100 s; four more in 10 s.
+    reporter._done_before = 0
+    assert reporter._rate(Progress(0, 100)) == ""
+    reporter._first = (100.0, 8)
+    assert reporter._rate(Progress(8, 100)) == ""
+    monkeypatch.setattr("potlp_jax.cli.sweep.time.monotonic", lambda: 110.0)
+    assert reporter._rate(Progress(12, 100)) == " (0.40 a second, 4 min remaining)"
+    reporter.close()
 
 
 def test_where_the_loss_is():

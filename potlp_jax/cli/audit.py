@@ -2,6 +2,7 @@
 
 import itertools
 import logging
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
@@ -13,6 +14,9 @@ from potlp_jax.cli.options import Json
 from potlp_jax.cli.output import FAILED, console, fail, print_json, progress_bar
 
 logger = logging.getLogger(__name__)
+
+# One cause, such as another world, makes the same problem in all trials of a sweep.
+_SHOWN = 10
 
 app = command_app()
 
@@ -43,11 +47,22 @@ def audit(
         problems = [{"trial": trial, "problem": problem} for trial, problem in found]
         print_json({"trials": count, "violations": violations, "problems": problems})
     else:
-        for trial, problem in found:
-            console().print(f"{trial}: {problem}", markup=False)
+        for line in _lines(found):
+            console().print(line, markup=False)
         console().print(f"{count} trials, {len(found)} problems, {violations} violations of the task", markup=False)
     if found:
         raise typer.Exit(FAILED)
+
+
+def _lines(found: list[tuple[str, str]]) -> Iterator[str]:
+    """A line a problem; of those that many trials share a few, and how many more there are."""
+    trials = defaultdict(list)
+    for trial, problem in found:
+        trials[problem].append(trial)
+    for problem, of in trials.items():
+        yield from (f"{trial}: {problem}" for trial in of[:_SHOWN])
+        if len(of) > _SHOWN:
+            yield f"{len(of) - _SHOWN} more trials (--json names them): {problem}"
 
 
 def _sweep(folder: Path) -> tuple[int, list[tuple[str, str]]]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import logging
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from potlp_jax.environments.ros.places import Places
     from potlp_jax.trials.record import Decision, Trial
     from potlp_jax.world.grid import BeliefMap
+
+logger = logging.getLogger(__name__)
 
 app = command_app()
 
@@ -163,6 +166,9 @@ def drive(
         silence=silence,
         patience=patience,
     )
+    chosen_policy = policy or (Policy.BASELINE if estimator is None else Policy.POTLP)
+    if names.image_topic and estimator is None and chosen_policy != Policy.POTLP:
+        logger.warning(f"the policy is {chosen_policy}: --image-topic is of use with an --estimator alone")
     asked = read_task(_formula(task, places), known)
     folder = None if out is None else make_folder(out)
     link = RosbridgeLink(robot)
@@ -181,7 +187,7 @@ def drive(
             for trial in drive_robot(
                 link,
                 asked,
-                policy or (Policy.BASELINE if estimator is None else Policy.POTLP),
+                chosen_policy,
                 jax.random.key(0),
                 config,
                 places=places,

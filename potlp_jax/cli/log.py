@@ -326,7 +326,7 @@ def write_log(
     labels = out.with_suffix(".labels.yaml") if chosen is BagFormat.ROS1 else out.with_name(f"{out.name}.labels.yaml")
     count = write_trial(load_trial(record_file(trial)), out, chosen, labels, height)
     console().print(f"wrote {out}: {count} messages")
-    console().print(f"wrote {labels}")
+    console().print(f"wrote {labels}, in metres of the bag's map: its robot starts at [0, 0]")
     console().print(f"next: potlp log inspect {out}", style="dim")
 
 

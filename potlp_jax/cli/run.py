@@ -136,7 +136,10 @@ def _why_infeasible(generator: "Generator", split: "Split", task: "Task", config
 
     # A task without a way back, such as one that forbids what was entered, can be lost by a decision.
     if is_possible(world):
-        return "with the whole map the task is possible in this world: the policy went where it cannot be satisfied"
+        return (
+            "with the whole map the task is possible in this world: the policy knew no move, or went where the task "
+            "cannot be satisfied"
+        )
     # As many as tell a task that is impossible everywhere from a few unlucky worlds.
     tried = 0
     for number in range(world + 1, min(world + WORLDS_TRIED, MAX_INDEX) + 1):

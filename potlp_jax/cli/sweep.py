@@ -109,7 +109,10 @@ def show(folder: SweepFolder, json: Json = False) -> None:
         print_json(results.to_dict())
         return
     for cell in results.cells:
-        print_cell(console(), cell, results.specification["split"])
+        if cell.pairs:
+            print_cell(console(), cell, results.specification["split"])
+        else:
+            console().print(f"{cell.environment}, task {cell.task}: no world that all policies have finished yet")
     for policy, told in own_settings(results.specification).items():
         console().print(f"settings of {policy}: {told}")
     for line in remarks_on_given_up(results.given_up):
@@ -148,11 +151,15 @@ def run_reported(
         processes, cluster: where (``engine.opening.open_engine``).
         retry_broken: begin again the trials that were given up.
     """
+    from potlp_jax.sweep.ending import KEPT
     from potlp_jax.sweep.runner import run_sweep
 
     reporter = _Reporter()
     try:
         run_sweep(specification, folder, processes, reporter.report, cluster, reporter.begun, retry_broken)
+    except KeyboardInterrupt:
+        logger.warning(f"interrupted; {KEPT}")
+        raise
     finally:
         reporter.close()
 
@@ -162,7 +169,8 @@ class _Reporter:
 
     def __init__(self) -> None:
         # Of the monotonic clock: a clock that is set while a sweep runs must not change the rate.
-        self._start, self._done_before, self._last_line = time.monotonic(), -1, 0.0
+        self._first: tuple[float, int] | None = None
+        self._done_before, self._last_line = -1, 0.0
         self._last_said = ""
         self._bar = progress_bar()
         self._task: Any = None
@@ -180,6 +188,9 @@ class _Reporter:
             self._done_before = progress.done
             self._bar.start()
             self._task = self._bar.add_task("trials (the first ones compile)", total=progress.total)
+        if self._first is None and progress.done > self._done_before:
+            # Until then programs were compiled, which says nothing about the trials that follow.
+            self._first = time.monotonic(), progress.done
         text = self._rate(progress)
         self._bar.update(self._task, completed=progress.done, description=f"trials{text}")
         finished = progress.done >= progress.total
@@ -199,10 +210,9 @@ class _Reporter:
         self._bar.stop()
 
     def _rate(self, progress: "Progress") -> str:
-        seconds, done = time.monotonic() - self._start, progress.done - self._done_before
-        # Before the first trial has ended there is no rate, and a guess would be of compilation.
-        if done < 1:
+        if self._first is None or progress.done == self._first[1]:
             return ""
+        seconds, done = time.monotonic() - self._first[0], progress.done - self._first[1]
         remaining = (progress.total - progress.done) * seconds / done
         workers = f"{progress.workers} workers, " if progress.workers != 1 else ""
         return f" ({workers}{done / seconds:.2f} a second, {_duration(remaining)} remaining)"

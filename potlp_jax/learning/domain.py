@@ -61,10 +61,12 @@ class Domain:
 
     def family_misfits(self, here: "Domain") -> tuple[str, ...]:
         """How the kinds of worlds differ, in words."""
-        # A family that nobody named is none that anything is known of.
-        if here.family and here.family == self.family:
+        # A family that nobody named is none that anything is known of. What robots have seen is asked by robots, and on
+        # their maps.
+        of_robots = not here.family or here.family.startswith(_MAPS)
+        if here.family == self.family != "" or (self.family == LOGS and of_robots):
             return ()
-        found = f"are of {here.family}" if here.family else "are of no named family"
+        found = f"are of {here.family}" if here.family else "are a robot's, of no named family"
         return (f"it learned from worlds of {self.family or 'no named family'}, and these {found}",)
 
     def measure_misfits(self, here: "Domain") -> tuple[str, ...]:
@@ -84,6 +86,10 @@ FLOOR: tuple[str, ...] = ("horizon", "far", "fold")
 
 LOGS: str = "log"
 """Family of the worlds that are read from robots' logs."""
+
+
+_MAPS = "map:"
+"""How the families of maps that robots have made begin: each is of its own building."""
 
 
 def unit_of(resolution: float) -> str:

@@ -193,7 +193,7 @@ def estimator_for(
     if misfits:
         # From this one place, so that Python shows it once and not for every trial.
         warnings.warn(
-            f"the estimator {estimator.name} is asked about worlds that it was not made for: {'; '.join(misfits)}",
+            f"estimator {estimator.name!r} is asked about worlds that it was not made for: {'; '.join(misfits)}",
             PotlpWarning,
             stacklevel=1,
         )

@@ -26,6 +26,7 @@ from typing import Any
 from potlp_jax import plugins
 from potlp_jax.codec import config_from_dict, differences, json_copy, read_settings, settings_file, with_settings
 from potlp_jax.environments.base import Generator
+from potlp_jax.environments.families import PREFIXED
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import MAX_INDEX, Split, check_split
 from potlp_jax.errors import PluginError, SpecificationError, TaskError, WorldError
@@ -182,7 +183,7 @@ def specification_from_dict(data: Mapping[str, Any], where: str, folder: Path = 
         if name not in data:
             raise SpecificationError(f"{where}: {name} is missing")
     policies = _policies(_list(data, "policies", where), where)
-    environments = [str(name) for name in _list(data, "environments", where)]
+    environments = [_environment(str(name), folder) for name in _list(data, "environments", where)]
     split = _split(data.get("split", Split.VALIDATION.value), environments, where)
     automata: dict[str, str] = {}
     cells = [
@@ -275,6 +276,21 @@ def _estimator(name: str, folder: Path) -> str:
         # Wherever the command is given from, it is the same sweep.
         return str(beside.resolve())
     return name if is_name else str(beside)
+
+
+def _environment(name: str, folder: Path) -> str:
+    """The name of an environment with files that lie beside the specification; others are as they stand."""
+    prefix = next((prefix for prefix in PREFIXED if name.startswith(prefix)), None)
+    # What is given in the folder of the specification keeps its short name.
+    if prefix is None or folder.resolve() == Path.cwd():
+        return name
+
+    def located(part: str) -> str:
+        option, equals, file = part.rpartition("=")
+        beside = folder / file
+        return f"{option}{equals}{beside.resolve()}" if file and beside.exists() else part
+
+    return prefix + ",".join(located(part) for part in name.removeprefix(prefix).split(","))
 
 
 def _split(name: Any, environments: Sequence[str], where: str) -> Split:

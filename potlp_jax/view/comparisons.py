@@ -98,7 +98,8 @@ def remark_lines(comparison: Comparison) -> list[str]:
     lines += flag_lines(comparison)
     if 0 < satisfied.pairs < FEW_WORLDS:
         known = any(not math.isnan(row.attainable_low) for row in satisfied.rows)
-        told = "the interval says how far the share may be off" if known else "too few for an interval"
+        # In draws of the same world again and again nothing may be left to save.
+        told = "the interval says how far the share may be off" if known else "they tell no interval"
         lines.append(f"{satisfied.pairs} worlds are few: {told}.")
     return lines
 
