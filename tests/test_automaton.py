@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from potlp_jax.errors import TaskError, TaskWarning, UnsatisfiableError
+from potlp_jax.task import hoa
 from potlp_jax.task.automaton import Dfa, canonical_dfa, translate
 from potlp_jax.task.formula import parse_formula
 from potlp_jax.task.hoa import read_hoa, write_hoa
@@ -407,3 +408,19 @@ def test_hoa_needs_no_spot():
         campus |= {f"campus-{size}-1": 2**3, **{f"campus-{size}-{name}": found for name, found in parcels.items()}}
     expected = {**campus, "delivery-1": 2**3, **fire, **parcels, **rooms, "toy-1": 2, "toy-2": 3}
     assert done.stdout.strip() == str(expected)
+
+
+def test_a_long_text_is_not_read_beyond_its_first_mistake(monkeypatch):
+    """Millions of tokens take seconds."""
+    taken = []
+
+    def tokens(text):
+        for token in of_hoa(text):
+            taken.append(token)
+            yield token
+
+    of_hoa = hoa._tokens
+    monkeypatch.setattr(hoa, "_tokens", tokens)
+    with pytest.raises(TaskError, match="line 2: expected a header or --BODY--, found {"):
+        read_hoa("HOA: v1\n" + 1_000_000 * "{")
+    assert len(taken) == 3

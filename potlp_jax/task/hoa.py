@@ -8,8 +8,9 @@ References:
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -31,6 +32,9 @@ _TOKEN = re.compile(
       | (?P<symbol>[\[\](){}!&|])""",
     re.VERBOSE | re.DOTALL,
 )
+_OF_SEVERAL_LINES = ("skip", "string")
+"""Kinds of what may hold the end of a line."""
+
 _ONCE = ("AP:", "Acceptance:", "States:", "name:")
 """Headers of which the format allows one: a second one would silently take the place of the first."""
 
@@ -63,8 +67,7 @@ class HoaAutomaton:
     initial: int
 
 
-@dataclass(frozen=True)
-class _Token:
+class _Token(NamedTuple):
     kind: str
     text: str
     line: int
@@ -154,20 +157,22 @@ def _label(cubes: Sequence[Phi]) -> str:
     return " | ".join(terms)
 
 
-def _tokens(text: str) -> list[_Token]:
+def _tokens(text: str) -> Iterator[_Token]:
     """Splits the text; the last token marks the end."""
-    # The end token repeats for ever (see ``_take``), so that no reader has to check for running out of tokens.
-    tokens: list[_Token] = []
     position, line = 0, 1
-    while position < len(text):
-        match = _TOKEN.match(text, position)
-        if match is None:
-            raise _error(line, f"cannot read {short(text[position : position + 20].partition(chr(10))[0])}")
-        if match.lastgroup != "skip":
-            tokens.append(_Token(str(match.lastgroup), match.group(), line))
-        line += match.group().count("\n")
+    # Found one after the other, as a text of megabytes may be wrong in its first line.
+    match = _TOKEN.match(text)
+    while match is not None:
+        kind, found = str(match.lastgroup), match.group()
+        if kind != "skip":
+            yield _Token(kind, found, line)
+        if kind in _OF_SEVERAL_LINES:
+            line += found.count("\n")
         position = match.end()
-    return [*tokens, _Token("end", "the end of the text", line)]
+        match = _TOKEN.match(text, position)
+    if position < len(text):
+        raise _error(line, f"cannot read {short(text[position : position + 20].partition(chr(10))[0])}")
+    yield _Token("end", "the end of the text", line)
 
 
 def _error(line: int, message: str) -> TaskError:
@@ -177,8 +182,10 @@ def _error(line: int, message: str) -> TaskError:
 class _Reader:
     """Recursive descent over the tokens of one automaton."""
 
-    def __init__(self, tokens: list[_Token]):
-        self._tokens = tokens
+    def __init__(self, tokens: Iterator[_Token]):
+        self._rest = tokens
+        # Kept, because aliases are read once more after the header.
+        self._tokens = [next(tokens)]
         self._position = 0
         self._depth = 0
         self._header = _Header()
@@ -201,13 +208,18 @@ class _Reader:
 
     def _take(self) -> _Token:
         token = self._next
-        self._position += token.kind != "end"
+        # The end repeats for ever, so that no reader has to check for running out of tokens.
+        if token.kind != "end":
+            self._position += 1
+            if self._position == len(self._tokens):
+                self._tokens.append(next(self._rest))
         return token
 
     def _accept(self, text: str) -> bool:
         # A quoted name may read like a keyword.
         found = self._next.text == text and self._next.kind != "string"
-        self._position += found
+        if found:
+            self._take()
         return found
 
     def _expect(self, kind: str, what: str) -> _Token:
