@@ -421,6 +421,6 @@ def test_a_long_text_is_not_read_beyond_its_first_mistake(monkeypatch):
 
     of_hoa = hoa._tokens
     monkeypatch.setattr(hoa, "_tokens", tokens)
-    with pytest.raises(TaskError, match="line 2: expected a header or --BODY--, found {"):
+    with pytest.raises(TaskError, match=r"line 2: expected a header or --BODY--, found \{"):
         read_hoa("HOA: v1\n" + 1_000_000 * "{")
     assert len(taken) == 3
