@@ -256,6 +256,10 @@ EXPERIMENTS: dict[str, Experiment] = {
         "--report docs/results/real_maps/intel_worst",
         minutes=16,
     ),
+    "campus": Experiment(
+        page="delivery",
+        command="python -m eval.campus --out {out} --processes {processes} --report docs/results/delivery/campus",
+    ),
     # Each shipped recipe from nothing, and what its stages keep: how long one has to train.
     "recipe-firefighting": Experiment(
         page="estimator", command="potlp fit --recipe firefighting --out {out} --processes {processes}"
