@@ -332,6 +332,9 @@ def test_maps_lie_beside_the_file_that_names_them(tmp_path, monkeypatch):
     assert _environment(name, tmp_path / "maps") == (
         f"map:{tmp_path}/maps/office.yaml,places={tmp_path}/maps/office.places.yaml,resolution=0.4"
     )
+    (tmp_path / "link").symlink_to(tmp_path / "maps")
+    absolute = f"map:{tmp_path}/link/office.yaml"
+    assert _environment(absolute, tmp_path / "maps") == absolute
     # What is found as it stands keeps its name, and so does what is no file.
     monkeypatch.chdir(tmp_path / "maps")
     assert _environment(name, Path()) == name

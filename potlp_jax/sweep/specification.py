@@ -288,7 +288,8 @@ def _environment(name: str, folder: Path) -> str:
     def located(part: str) -> str:
         option, equals, file = part.rpartition("=")
         beside = folder / file
-        return f"{option}{equals}{beside.resolve()}" if file and beside.exists() else part
+        is_beside = file and not Path(file).is_absolute() and beside.exists()
+        return f"{option}{equals}{beside.resolve()}" if is_beside else part
 
     return prefix + ",".join(located(part) for part in name.removeprefix(prefix).split(","))
 
