@@ -145,9 +145,6 @@ def export_planner(task: Task, folder: Path, config: ExportConfig = ExportConfig
             "exporting needs flatbuffers, with which jax writes programs: pip install flatbuffers"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    # Of an earlier export: the manifest of this one would not name them.
-    for earlier in folder.glob("*.jaxexport"):
-        earlier.unlink()
     programs = _programs(task, config)
     files, functions = [], {}
     for program in programs:
@@ -157,6 +154,9 @@ def export_planner(task: Task, folder: Path, config: ExportConfig = ExportConfig
         files.append(file)
         described = _describe_program(program, exported, file.name)
         functions[program.name] = {**described, "sha256": hashlib.sha256(contents).hexdigest()}
+    # Programs of an earlier export: the manifest of this one does not name them.
+    for earlier in set(folder.glob("*.jaxexport")).difference(files):
+        earlier.unlink()
     automaton = folder / "task.hoa"
     automaton.write_text(task.to_hoa(), "utf-8")
     manifest = folder / MANIFEST
