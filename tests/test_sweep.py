@@ -361,7 +361,11 @@ def test_an_interrupted_sweep_says_that_it_goes_on(tmp_path, monkeypatch):
     (tmp_path / "sweep.yaml").write_text(json.dumps(SMALL))
     told = _potlp("sweep", tmp_path / "sweep.yaml", "--out", tmp_path / "out")
     assert told.exit_code == 130
-    assert "interrupted; what is finished is kept: the same command goes on" in " ".join(told.stderr.split())
+    words = "interrupted; what is finished is kept: the same command goes on"
+    assert words in " ".join(told.stderr.split())
+    # A comparison without a folder keeps nothing.
+    assert words in " ".join(_potlp("compare", "toy", "--out", tmp_path / "compared").stderr.split())
+    assert "interrupted" not in _potlp("compare", "toy").stderr
 
 
 def test_other_files_are_no_store(tmp_path):

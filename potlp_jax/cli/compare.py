@@ -22,7 +22,7 @@ from potlp_jax.cli.options import (
     WorldNumber,
 )
 from potlp_jax.cli.output import console, fail, file_console, make_folder, print_json, to_json
-from potlp_jax.cli.sweep import print_cell, run_reported
+from potlp_jax.cli.sweep import print_cell, run_reported, told_when_interrupted
 
 if TYPE_CHECKING:
     from potlp_jax.environments.base import Generator
@@ -107,7 +107,8 @@ def compare_policies(
     specification = specification_from_dict(entries, "compare")
     warn_of_sweep(specification)
     if out is not None:
-        results = _run(specification, make_folder(out), processes)
+        with told_when_interrupted():
+            results = _run(specification, make_folder(out), processes)
         files = _write(results, out)
     # Without a folder the store is needed only until the results are read from it.
     else:

@@ -5,6 +5,8 @@ import dataclasses
 import json as json_module
 import logging
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -91,7 +93,8 @@ def run(
     if specification.split is Split.TEST:
         warn_of_test_worlds()
     warn_of_sweep(specification)
-    run_reported(specification, make_folder(out), processes, cluster, retry_broken)
+    with told_when_interrupted():
+        run_reported(specification, make_folder(out), processes, cluster, retry_broken)
     # From the store, so that a sweep shows the same tables whether it has just ended or is shown again.
     show(out, json)
 
@@ -151,17 +154,25 @@ def run_reported(
         processes, cluster: where (``engine.opening.open_engine``).
         retry_broken: begin again the trials that were given up.
     """
-    from potlp_jax.sweep.ending import KEPT
     from potlp_jax.sweep.runner import run_sweep
 
     reporter = _Reporter()
     try:
         run_sweep(specification, folder, processes, reporter.report, cluster, reporter.begun, retry_broken)
+    finally:
+        reporter.close()
+
+
+@contextmanager
+def told_when_interrupted() -> Iterator[None]:
+    """Say at Ctrl-C that a sweep whose folder stays can go on."""
+    from potlp_jax.sweep.ending import KEPT
+
+    try:
+        yield
     except KeyboardInterrupt:
         logger.warning(f"interrupted; {KEPT}")
         raise
-    finally:
-        reporter.close()
 
 
 class _Reporter:
