@@ -1,6 +1,7 @@
 """The page of results: what was attacked with how much, and how the cases ended, from the counts of all parts."""
 
 import dataclasses
+import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,9 +91,13 @@ def write_page(counts: Path, results: Path = RESULTS) -> Path:
 def page(results: Path = RESULTS) -> str:
     """The text of the page, from the counts beside it."""
     tallies = {name: read_tally(results / _DATA / f"{name}.json") for name in PARTS if _counted(results, name)}
-    return lines_of(
-        "\n".join([*_head(tallies), *(line for name in tallies for line in _section(name, tallies[name]))]), results
-    )
+    lines = [*_head(tallies), *(line for name in tallies for line in _section(name, tallies[name]))]
+    return lines_of("\n".join(map(_wrapped, lines)), results)
+
+
+def _wrapped(line: str) -> str:
+    """A paragraph in lines of the width that pages have; rows of tables and what stands in code stay as they are."""
+    return line if line.startswith(("|", "<")) else textwrap.fill(line, 120, break_on_hyphens=False)
 
 
 def _counted(results: Path, name: str) -> bool:
