@@ -751,4 +751,4 @@ def test_few_worlds_without_an_interval_promise_none():
     }
     comparison = Comparison.from_results(rows, resamples=50)
     assert all(np.isnan(row.attainable_low) for row in comparison.satisfied.rows)
-    assert remark_lines(comparison)[-1] == "1 worlds are few: too few for an interval."
+    assert remark_lines(comparison)[-1] == "1 worlds are few: they tell no interval."
