@@ -1,4 +1,4 @@
-"""Deliveries in buildings of other families and sizes than those of ``eval.delivery``, from tests that no training saw.
+"""Deliveries in the test worlds of other families and sizes of buildings than those of ``eval.delivery``.
 
     python -m eval.campus --out out/campus
     python -m eval.campus --out out/campus --worlds 20 --families campus-large campus-large-parcels
@@ -8,13 +8,11 @@ it was stopped, also with more worlds. ``--report`` writes NAME.json beside what
 """
 
 import argparse
-import json
 import os
 from pathlib import Path
 
-from eval.delivery import WITHOUT_ORACLE, markdown, results_of, run_group
+from eval.delivery import WITHOUT_ORACLE, results_of, run_group, tell
 from potlp_jax.environments.registry import make
-from potlp_jax.sweep.rows import provenance
 
 FAMILIES = (
     "parcels",
@@ -41,12 +39,7 @@ def main() -> None:
         tasks = list(make(family).tasks.values())
         rows = run_group(options.out / family, family, tasks, WITHOUT_ORACLE, options.worlds, options.processes)
         found[family] = results_of(rows, family, tasks)
-    results = {"groups": found, "provenance": provenance()}
-    print(markdown(results))
-    for group in found.values():
-        print("\n".join(group["problems"]))
-    if options.report is not None:
-        options.report.with_suffix(".json").write_text(json.dumps(results, indent=1) + "\n")
+    tell(found, options.report)
 
 
 if __name__ == "__main__":

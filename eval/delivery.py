@@ -133,6 +133,16 @@ def markdown(results: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def tell(groups: Mapping[str, Mapping[str, Any]], report: Path | None) -> None:
+    """Print the tables and problems of all groups; ``report``: without suffix, where the results go."""
+    results = {"groups": groups, "provenance": provenance()}
+    print(markdown(results))
+    for group in groups.values():
+        print("\n".join(group["problems"]))
+    if report is not None:
+        report.with_suffix(".json").write_text(json.dumps(results, indent=1) + "\n")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of the sweeps")
@@ -157,12 +167,7 @@ def main() -> None:
         formulas = options.out / "formulas"
         rows = run_group(formulas, "delivery", tasks, WITHOUT_ORACLE, options.formula_worlds, options.processes)
         found["other formulas"] = results_of(rows, "delivery", tasks)
-    results = {"groups": found, "provenance": provenance()}
-    print(markdown(results))
-    for group in found.values():
-        print("\n".join(group["problems"]))
-    if options.report is not None:
-        options.report.with_suffix(".json").write_text(json.dumps(results, indent=1) + "\n")
+    tell(found, options.report)
 
 
 if __name__ == "__main__":
