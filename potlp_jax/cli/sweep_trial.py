@@ -85,10 +85,9 @@ def _task_of(specification: "Specification", environment: str, given: str | None
     structure = structure_of(asked)
     for cell in cells:
         of_cell = specification.task_of(cell, generator)
-        # By its language, so that it does not matter how a formula is written.
-        if of_cell.text == asked.text or (
-            structure is not None and same_language(structure, of_cell.dfa, generator.propositions)
-        ):
+        # By its language, so that it does not matter how a formula is written, nor what an automaton is called.
+        is_same = structure is not None and same_language(structure, of_cell.dfa, generator.propositions)
+        if is_same or cell.task == asked.text:
             return cell.task
     return _one_of("task", given, tasks)
 
