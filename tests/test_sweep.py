@@ -981,18 +981,21 @@ def test_progress_says_nothing_twice(monkeypatch, caplog):
     assert [record.message.partition(" (")[0] for record in caplog.records] == ["0 of 2 trials", "1 of 2 trials"]
 
 
-def test_the_rate_is_that_of_trials_and_not_of_compilation(monkeypatch):
-    times = iter([0.0, 100.0, 110.0])
-    monkeypatch.setattr("potlp_jax.cli.sweep.time.monotonic", lambda: next(times))
+def test_the_rate_is_that_of_trials_and_not_of_compilation(monkeypatch, caplog):
+    clock = [0.0]
+    monkeypatch.setattr("potlp_jax.cli.sweep.SECONDS_BETWEEN_LINES", 0.0)
+    monkeypatch.setattr("potlp_jax.cli.sweep.time.monotonic", lambda: clock[0])
     reporter = _Reporter()
-    # Nothing yet; eight trials after 100 s; four more in 10 s.
-    reporter._done_before = 0
-    assert reporter._rate(Progress(0, 100)) == ""
-    reporter._first = (100.0, 8)
-    assert reporter._rate(Progress(8, 100)) == ""
-    monkeypatch.setattr("potlp_jax.cli.sweep.time.monotonic", lambda: 110.0)
-    assert reporter._rate(Progress(12, 100)) == " (0.40 a second, 4 min remaining)"
+    with caplog.at_level("INFO", logger="potlp_jax"):
+        # Eight trials after 100 seconds of compilation, and four more in ten.
+        for clock[0], done in ((0.0, 0), (100.0, 8), (110.0, 12)):
+            reporter.report(Progress(done, 100))
     reporter.close()
+    assert [record.message for record in caplog.records] == [
+        "0 of 100 trials",
+        "8 of 100 trials",
+        "12 of 100 trials (0.40 a second, 4 min remaining)",
+    ]
 
 
 def test_where_the_loss_is():
