@@ -5,11 +5,12 @@
     python -m eval.all --out out/all --data DATA --only table1 limit worst
 
 ``DATA`` is the folder with the maps and floor plans of others; without it the experiments that read them are left out,
-and named. Each experiment is a command of its own, as its page quotes it, and has a log in ``--out``; those that work
-in steps keep them in a folder there. Killed, the same command goes on: what was finished at this commit is not run
-again, and what was begun goes on from its own folder. One that fails is named at the end, and does not stop the others.
-Some commands write their page's data, others print tables: those are in the log, and are carried to the page by hand.
-Experiments that read what another one has written come after it in the list.
+and named, as are those on Slurm where none is started (eval/scale/local_slurm.sh). Each experiment is a command of its
+own, as its page quotes it, and has a log in ``--out``; those that work in steps keep them in a folder there. Killed,
+the same command goes on: what was finished at this commit is not run again, and what was begun goes on from its own
+folder. One that fails is named at the end, and does not stop the others. Some commands write their page's data, others
+print tables: those are in the log, and are carried to the page by hand. Experiments that read what another one has
+written come after it in the list.
 """
 
 import argparse
@@ -67,13 +68,15 @@ class Run:
 
 
 def left_out(run: Run, names: Iterable[str]) -> dict[str, str]:
-    """The experiments that cannot run here, and why: they read data of others, or what such experiments write."""
+    """The experiments that cannot run here, and why: they need what is not there, or read what such ones write."""
     missing: dict[str, str] = {}
     # In the order of the list, in which what is read comes first.
     for name in names:
         unwritten = [source for source in EXPERIMENTS[name].reads if source in missing]
         if EXPERIMENTS[name].needs_data and run.data is None:
             missing[name] = "it reads maps or plans of others: name their folder with --data"
+        elif (needed := EXPERIMENTS[name].needs) is not None and needed not in os.environ:
+            missing[name] = f"it needs a service that {needed} names: start it, and set the variable"
         elif unwritten:
             missing[name] = f"it reads what is left out: {', '.join(unwritten)}"
     return missing

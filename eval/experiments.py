@@ -17,6 +17,7 @@ class Experiment:
             whole since times are kept.
         one_core: whether it measures times, so that it is kept on one core.
         variables: of the environment.
+        needs: a variable that must be there before, of a service that somebody has started; None for none.
     """
 
     page: str
@@ -24,6 +25,7 @@ class Experiment:
     minutes: int | None = None
     one_core: bool = False
     variables: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    needs: str | None = None
 
     @property
     def needs_data(self) -> bool:
@@ -332,6 +334,11 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     "scale-fits": Experiment(
         page="scale", command="python -m eval.scale fits --out {out} --report docs/results/scale/fits"
+    ),
+    "scale-slurm": Experiment(
+        page="scale",
+        command="python -m eval.scale slurm --jobs-killed 5 --out {out} --report docs/results/scale/slurm",
+        needs="SLURM_CONF",
     ),
     "collected": Experiment(
         page="scale",

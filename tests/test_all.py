@@ -126,14 +126,20 @@ def test_what_reads_from_another_comes_after_it():
         assert part in names[: names.index(name)], f"{name} reads {part}"
 
 
-def test_what_reads_others_data_is_left_out_by_name(tmp_path):
+def test_what_needs_something_that_is_not_there_is_left_out_by_name(tmp_path, monkeypatch):
+    monkeypatch.delenv("SLURM_CONF", raising=False)
     without = left_out(Run(out=tmp_path, data=None, processes=1, commit=""), EXPERIMENTS)
     assert {"delivery", "real-maps", "floors"} <= without.keys()
     assert "table1" not in without
     # Nor is what reads them begun, only to fail.
     assert without["d-office"] == "it reads what is left out: own-office"
     assert "d-own" not in without
-    assert not left_out(Run(out=tmp_path, data=tmp_path, processes=1, commit=""), EXPERIMENTS)
+    with_data = Run(out=tmp_path, data=tmp_path, processes=1, commit="")
+    assert left_out(with_data, EXPERIMENTS) == {
+        "scale-slurm": "it needs a service that SLURM_CONF names: start it, and set the variable"
+    }
+    monkeypatch.setenv("SLURM_CONF", str(tmp_path))
+    assert not left_out(with_data, EXPERIMENTS)
 
 
 def test_the_command_says_what_failed_and_what_was_left_out(small, monkeypatch, capsys):
