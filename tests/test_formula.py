@@ -98,6 +98,26 @@ def test_unknown_proposition_names_the_known_ones():
     assert caret_column(message) == 10, "below the word as it was written"
 
 
+@pytest.mark.parametrize("known", [None, ("küche", "Fußweg", "出口")])
+def test_names_beyond_ascii_need_no_quotes(known):
+    assert parse_formula("F küche & F出口", known).propositions == (known or ("küche", "出口"))
+
+
+def test_a_name_with_operators_before_it_is_whole_where_it_is_known():
+    assert parse_formula("F Fußweg", ("Fußweg",)).parsed == 'F"Fußweg"'
+    assert parse_formula("F Fußweg").propositions == ("ußweg",), "as Spot reads Fire"
+
+
+def test_errors_beside_names_beyond_ascii_have_their_column():
+    assert caret_column(error_of("F küche & & a")) == 11
+    assert caret_column(error_of("F küche & G a", ("küche", "a"))) == 11
+    message = error_of("F küchen & F bad", ("küche", "bad"))
+    assert "unknown proposition 'küchen'; did you mean küche?" in message
+    assert caret_column(message) == 3
+    # Signs are operators of Spot's, not names.
+    assert parse_formula("◇a ∧ ◇b").propositions == ("a", "b")
+
+
 def test_unknown_quoted_proposition_has_a_caret():
     assert caret_column(error_of('F a & F"front door"', ("a",))) == 9
 

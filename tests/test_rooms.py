@@ -24,3 +24,9 @@ def test_large_rooms_have_obstacles():
     cells = [int(np.asarray(Rooms(config).world(1).occupied).sum()) for config in (with_one, without)]
     assert dataclasses.replace(with_one, obstacles=0.0) == without
     assert cells[0] - cells[1] >= 9
+
+
+def test_tasks_hold_names_of_any_kind():
+    names = ("my room", "U", "küche", "b")
+    rooms = Rooms(RoomsConfig(propositions=names))
+    assert all(rooms.task(number).propositions == names for number in ("1", "2"))

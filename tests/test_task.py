@@ -240,3 +240,14 @@ def test_a_formula_is_compiled_over_the_propositions_given():
     # Letters: nothing, fire, exit, both. States in the order in which letters lead there: search, fire, exit.
     assert task.dfa.transitions.tolist() == [[0, 1, 2, 2], [1, 1, 1, 1], [2, 2, 2, 2]]
     assert task.dfa.accepting.tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize("name", ["U", "xor", "True", "first_match", "küche", "my room", 'a "b"', "back\\slash"])
+def test_guards_are_formulas_whatever_the_names_are(name):
+    pytest.importorskip("spot")
+    task = Task.from_formula("F b", (name, "b"))
+    guard = task.guard_text([(1, -1)])
+    letters = Task.from_formula(guard, (name, "b"))
+    # Fulfilled by the one letter that holds the name and not b.
+    after = letters.dfa.transitions[letters.dfa.initial]
+    assert letters.dfa.accepting[after].tolist() == [False, True, False, False]

@@ -74,7 +74,17 @@ def test_where_everything_is_held_out_nothing_can_be_drawn():
         TaskDistribution(("a",), ["F a"]).draw(np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("sigma", [("Goal",), ("a", "b"), ("U", "big room", "x")])
+@pytest.mark.parametrize(
+    "sigma",
+    [
+        ("Goal",),
+        ("a", "b"),
+        ("U", "big room", "x"),
+        ("küche", "Fußweg", "出口"),
+        ("true", "False", "xor", "first_match"),
+        ('5" pipe', "a\\b", "it's", "R2.D2"),
+    ],
+)
 def test_names_of_any_kind_can_be_drawn(sigma):
     rng = np.random.default_rng(0)
     for _ in range(30):

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Int32, PRNGKeyArray
 
 from potlp_jax.environments.base import Generator, host_generators
 from potlp_jax.errors import WorldError
+from potlp_jax.task.propositions import in_formula
 from potlp_jax.world.grid import World, make_world, pad_world
 from potlp_jax.world.settings import Settings
 
@@ -88,10 +89,11 @@ class Rooms(Generator):
 
 def _tasks(propositions: tuple[str, ...]) -> dict[str, str]:
     """Find each proposition, in any order (1) and in the order of their names (2)."""
-    ordered = f"F {propositions[-1]}"
-    for name in reversed(propositions[:-1]):
+    names = [in_formula(name) for name in propositions]
+    ordered = f"F {names[-1]}"
+    for name in reversed(names[:-1]):
         ordered = f"F({name} & {ordered})"
-    return {"1": " & ".join(f"F {name}" for name in propositions), "2": ordered}
+    return {"1": " & ".join(f"F {name}" for name in names), "2": ordered}
 
 
 def _walls(rng: np.random.Generator, size: int, room: int) -> list[int]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from potlp_jax.errors import TaskWarning, UnsatisfiableError
 from potlp_jax.task.guards import Phi
-from potlp_jax.task.propositions import require_same_propositions
+from potlp_jax.task.propositions import in_formula, require_same_propositions
 from potlp_jax.task.task import Task, TaskArrays, TaskSizes
 from potlp_jax.types import NO_CLASS
 
@@ -81,7 +81,7 @@ class Question:
 
 def random_formula(rng: np.random.Generator, propositions: Sequence[str]) -> str:
     """A co-safe formula over some of the propositions, in Spot's syntax."""
-    names = [_quoted(name) for name in propositions]
+    names = [in_formula(name) for name in propositions]
     template = _choice(rng, _TEMPLATES)
     # "reach", "turn" and "detour" have the forms of the paper's fire-fighting tasks, "all" that of its delivery task.
     if template == "reach":
@@ -270,8 +270,3 @@ def _pick(rng: np.random.Generator, names: list[str], count: int, replace: bool 
 
 def _choice(rng: np.random.Generator, weights: Mapping[str, float]) -> str:
     return str(rng.choice(list(weights), p=list(weights.values())))
-
-
-def _quoted(name: str) -> str:
-    """The name as Spot reads it: capitals may be operators."""
-    return name if name.isidentifier() and not name[0].isupper() else f'"{name}"'

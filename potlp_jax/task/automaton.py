@@ -55,7 +55,7 @@ def translate(formula: Formula) -> str:
     Raises:
         TaskError: Spot is missing, or the automaton is too large.
     """
-    answer = ask_spot("translate", formula.parsed)
+    answer = ask_spot("translate", formula.quoted)
     check_size(answer["states"], answer["propositions"])
     if answer["hoa"] is None:
         raise TaskError(

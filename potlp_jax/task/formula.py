@@ -31,6 +31,8 @@ LONGEST_EXCERPT: int = 160
 Structure = tuple
 """Nested tuples, such as ``("U", ("true",), ("name", "a"))``: the form of ``task.language.Formula``."""
 
+# Not a sign such as those that Spot reads for "and" and "not".
+_WORD = re.compile(r"[^\W\d]")
 _CARET_INDENT = 4
 """Columns that Spot's error report puts before the formula (``>>> ``)."""
 
@@ -62,13 +64,15 @@ class Formula:
     Attributes:
         text: what the user wrote.
         propositions: Sigma; bit ``i`` of a letter is ``propositions[i]``.
-        parsed: the formula as Spot writes it.
+        quoted: the text that Spot has read, with quotes around names that it would take apart.
+        parsed: the formula as Spot writes it, for people: names such as ``xor`` have no quotes there.
         structure: its negation normal form, in the form of ``task.language``; None where it is large or has operators
             of PSL.
     """
 
     text: str
     propositions: tuple[str, ...]
+    quoted: str
     parsed: str
     structure: Structure | None
 
@@ -106,7 +110,7 @@ def parse_formula(text: str, propositions: Sequence[str] | None = None) -> Formu
     if answer["offender"] is not None:
         raise _not_co_safe(answer["offender"], line, sigma if known is not None else ())
     structure = None if answer["structure"] is None else _frozen(answer["structure"])
-    return Formula(text=text, propositions=sigma, parsed=answer["formula"], structure=structure)
+    return Formula(text, sigma, answer["quoted"], answer["formula"], structure)
 
 
 def _frozen(part: Any) -> Any:
@@ -115,11 +119,11 @@ def _frozen(part: Any) -> Any:
 
 
 def _parse(line: str, known: tuple[str, ...]) -> dict[str, Any]:
-    """What Spot has read, or the first of its complaints."""
+    """What Spot has read, and of what text, or the first of its complaints."""
     quoted, added = _quote_known_names(line, known)
     answer = ask_spot("parse", quoted)
     if "errors" not in answer:
-        return answer
+        return answer | {"quoted": quoted}
     # Spot reports an error in three lines: the formula, carets below it, the message.
     _, carets, message = answer["errors"].splitlines()[:3]
     column = carets.index("^") - _CARET_INDENT
@@ -129,7 +133,7 @@ def _parse(line: str, known: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _quote_known_names(line: str, known: tuple[str, ...]) -> tuple[str, list[int]]:
-    """Quotes known names that Spot would take apart, such as FIRE into F and IRE.
+    """Quotes known names that Spot would take apart, such as FIRE into F and IRE, and words beyond ASCII.
 
     A word stays as it is where Spot's reading is possible too (IRE is known as well).
 
@@ -145,6 +149,10 @@ def _quote_known_names(line: str, known: tuple[str, ...]) -> tuple[str, list[int
             start = sum(map(len, pieces))
             added += [start, start + len(piece) + 1]
             piece = f'"{piece}"'
+        elif not operand.isascii() and _WORD.match(operand):
+            start = sum(map(len, pieces)) + len(piece) - len(operand)
+            added += [start, start + len(operand) + 1]
+            piece = f'{piece.removesuffix(operand)}"{operand}"'
         pieces.append(piece)
     return "".join(pieces), added
 
@@ -152,7 +160,7 @@ def _quote_known_names(line: str, known: tuple[str, ...]) -> tuple[str, list[int
 def unknown_proposition(name: str, known: tuple[str, ...], line: str) -> TaskError:
     """Points at what was written, and lists the known propositions, with the nearest one first."""
     # The name as a whole word, perhaps in quotes, perhaps with operators written in front of it.
-    pattern = rf'(?<![A-Za-z0-9_.])[FGX]*("?)(?P<name>{re.escape(name)})\1(?![A-Za-z0-9_.])'
+    pattern = rf'(?<![\w.])[FGX]*("?)(?P<name>{re.escape(name)})\1(?![\w.])'
     match = re.search(pattern, line)
     column = 1 + (match.start("name") if match else 0)
     word = _word_around(column, line, known)

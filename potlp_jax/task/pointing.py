@@ -11,7 +11,7 @@ import re
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
-WORD_OR_STRING = re.compile(r'"(?:[^"\\]|\\.)*"|[A-Za-z_][A-Za-z0-9_.]*|.')
+WORD_OR_STRING = re.compile(r'"(?:[^"\\]|\\.)*"|[^\W\d][\w.]*|.')
 """Splits a formula into names, quoted names and single characters."""
 
 OPERATOR_PREFIX = re.compile(r"^[FGX]+")
@@ -21,7 +21,7 @@ OPERATOR_PREFIX = re.compile(r"^[FGX]+")
 # but not Fa and XFa.
 _LIKE_A_NAME = re.compile(r"[FGX][A-Z_]*[A-EH-WY-Z][A-Z0-9_]+|[FGX][a-z][A-Za-z0-9_.]+")
 
-_TOKEN = re.compile(r'\s*("(?:[^"\\]|\\.)*"|<->|<=>|->|=>|\[\]|<>|&&|\|\||[!&|^()]|[A-Za-z_][A-Za-z0-9_.]*|[01])')
+_TOKEN = re.compile(r'\s*("(?:[^"\\]|\\.)*"|<->|<=>|->|=>|\[\]|<>|&&|\|\||[!&|^()]|[^\W\d][\w.]*|[01])')
 # How strongly operators bind; those of the strengths 0 and 4 associate to the right.
 _STRENGTH = {"->": 0, "=>": 0, "<->": 0, "<=>": 0, "xor": 1, "^": 1, "|": 2, "||": 2, "&": 3, "&&": 3}
 _STRENGTH |= dict.fromkeys("URWM", 4)

@@ -6,6 +6,7 @@ joins two of them calls ``require_same_propositions`` first. Under jit that happ
 afterwards: names are part of what JAX compiles for, so that another pair of names is traced, and checked, anew.
 """
 
+import re
 from collections.abc import Sequence
 
 from potlp_jax.errors import PropositionsError, TaskError
@@ -21,6 +22,12 @@ TAKE_ITS_NAMES = (
     "take the task from the world, world.task(formula), or give its names, Task.from_formula(formula, names)"
 )
 """What to do where a task meets a world or a belief of other propositions."""
+
+# F, G and X at the start of a name are operators to Spot, single U, R, W, M and V too, and these words in any case.
+_PLAIN_NAME = re.compile(
+    r"(?!(?:[URWMV]|(?i:true|false)|xor|first_match)\Z)[A-EH-WYZa-z_][A-Za-z0-9_]*", flags=re.ASCII
+)
+"""Names that Spot reads as they stand."""
 
 
 def check_propositions(propositions: Sequence[str]) -> tuple[str, ...]:
@@ -44,6 +51,14 @@ def check_propositions(propositions: Sequence[str]) -> tuple[str, ...]:
     if len(names) > MAX_PROPOSITIONS:
         raise TaskError(f"{len(names)} propositions are too many: a task has at most {MAX_PROPOSITIONS}")
     return names
+
+
+def in_formula(name: str) -> str:
+    """A name as it is written in a formula: in double quotes where Spot would read something else without them."""
+    if _PLAIN_NAME.fullmatch(name):
+        return name
+    escaped = name.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'
 
 
 def require_same_propositions(

@@ -21,7 +21,12 @@ from potlp_jax.task.hoa import HoaAutomaton, read_hoa, write_hoa
 from potlp_jax.task.irrevocable import irrevocable_moves
 from potlp_jax.task.language import UnreadableError, names_of, read_formula
 from potlp_jax.task.outcomes import Condition, OutcomeClass, Outcomes, find_outcomes
-from potlp_jax.task.propositions import MAX_PROPOSITIONS, check_propositions, require_same_propositions
+from potlp_jax.task.propositions import (
+    MAX_PROPOSITIONS,
+    check_propositions,
+    in_formula,
+    require_same_propositions,
+)
 from potlp_jax.task.shipped import find_shipped, shipped_hoa
 from potlp_jax.types import NO_CLASS
 
@@ -408,9 +413,8 @@ def _without_spot(
 
 
 def _cube_text(cube: Phi, propositions: Sequence[str]) -> str:
-    """A cube in words; names that Spot would not read as they stand are quoted."""
-    # F, G and X at the start of a name are operators to Spot.
-    names = [name if name.isidentifier() and name[0] not in "FGX" else f'"{name}"' for name in propositions]
+    """A cube in words, names as in a formula."""
+    names = [in_formula(name) for name in propositions]
     return " & ".join(("" if sign > 0 else "!") + names[i] for i, sign in enumerate(cube) if sign) or "true"
 
 
