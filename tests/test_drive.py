@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from eval.live.__main__ import run_stream
 from eval.live.perturbation import Network, Perturbation
 from eval.live.server import RosbridgeServer
-from eval.live.simulator import FLOOR, Behaviour, SimulatedLink, SteppedInbox
+from eval.live.simulator import FLOOR, STEP, Behaviour, SimulatedLink, SteppedInbox
 from potlp_jax.cli import app
 from potlp_jax.cli.drive import _interruption, _write
 from potlp_jax.cli.inputs import RECORD
@@ -209,6 +209,23 @@ def test_a_picture_of_more_than_a_half_circle_is_refused():
     assert refused.startswith(f"{topic}: a picture of 8 x 5 pixels")
 
 
+@pytest.mark.parametrize("suffix", [".png", ".webp", ".bmp", ".jpg", ".tiff"])
+def test_damaged_pictures_are_refused(suffix):
+    topic = "/panorama/compressed"
+    inbox = Inbox(dataclasses.replace(CONFIG, topics=Topics(image=topic)), FLOOR.propositions)
+    pixels = np.random.default_rng(0).integers(0, 256, (32, 64, 3), dtype=np.uint8)
+    whole = cv2.imencode(suffix, pixels)[1].tobytes()
+    damaged = [whole[: len(whole) // 2], whole[:30], b""]
+    # A checksum of PNG that does not fit.
+    damaged += [whole[:100] + bytes([whole[100] ^ 1]) + whole[101:]] if suffix == ".png" else []
+    for number, contents in enumerate(damaged):
+        data = base64.b64encode(contents).decode()
+        inbox.handle(topic, {"header": header(number), "data": data, "format": suffix[1:]})
+        assert sum(inbox.refused.values()) + (inbox.heard.picture is not None) == number + 1
+    # Half of a JPEG shows grey for what is missing, and half of a BMP or TIFF black.
+    assert inbox.heard.picture is None or suffix in (".jpg", ".bmp", ".tiff")
+
+
 @pytest.mark.parametrize(
     "setting", [{"radius": math.inf}, {"radius": math.nan}, {"radius": -0.1}, {"camera_yaw": math.nan}]
 )
@@ -286,6 +303,43 @@ def test_a_clock_that_begins_anew_is_followed():
     assert inbox.heard.scan.occupancy.tolist() == [[0, 0]]
     inbox.handle("/map", grid(3, [[100, 100]]))
     assert inbox.heard.scan.occupancy.tolist() == [[100, 100]]
+
+
+def test_an_update_after_the_clock_began_anew_is_no_old_one():
+    inbox = Inbox(CONFIG, FLOOR.propositions)
+    inbox.handle("/map", grid(1000, [[0, 0]]))
+    inbox.handle("/map_updates", {"header": header(998), "x": 0, "y": 0, "width": 1, "height": 1, "data": [100]})
+    assert inbox.heard.scan.occupancy.tolist() == [[0, 0]]
+    inbox.handle("/map_updates", {"header": header(3), "x": 0, "y": 0, "width": 1, "height": 1, "data": [100]})
+    assert inbox.heard.scan.occupancy.tolist() == [[100, 0]]
+
+
+@pytest.mark.parametrize("topic", ["/tf", "/tf_static"])
+def test_a_pose_that_was_heard_before_the_map_is_known_with_it(topic):
+    inbox = Inbox(CONFIG, FLOOR.propositions)
+    placed = {"transforms": [transform(1, "map", "base_link", 2.0)]}
+    inbox.handle(topic, placed)
+    assert inbox.heard.pose is None
+    inbox.handle("/map", grid(1, [[0]]))
+    assert inbox.heard.pose == (2.0, 0.0, 0.0)
+    assert inbox.take_poses() == ((2.0, 0.0, 0.0),)
+    # Another map is no other pose.
+    inbox.handle("/map", grid(2, [[100]]))
+    assert inbox.heard.maps == 2
+    assert not inbox.heard.poses
+
+
+def test_a_map_in_another_frame_is_another_map():
+    inbox = Inbox(CONFIG, FLOOR.propositions)
+    inbox.handle("/tf_static", {"transforms": [transform(1, "map", "base_link", 2.0)]})
+    inbox.handle("/map", grid(1, [[0]]))
+    inbox.handle("/tf_static", {"transforms": [transform(2, "world", "map", 10.0)]})
+    renamed = grid(3, [[0]])
+    renamed["header"]["frame_id"] = "world"
+    inbox.handle("/map", renamed)
+    assert inbox.heard.frame_id == "world"
+    assert inbox.heard.pose == (12.0, 0.0, 0.0)
+    assert inbox.heard.maps == 2
 
 
 def test_a_wheel_that_turns_is_no_pose():
@@ -645,8 +699,8 @@ def test_a_goal_is_taken_back_again_when_the_robot_is_heard_again():
 
 
 def absurd_map(link):
-    """A map that lies 100 km away."""
-    link._network.send(link.time, "/map", grid(86_400 + link.time, [[0, 0]], x=1e5))
+    """A map that lies 100 km away, newer than what was sent before."""
+    link._network.send(link.time, "/map", grid(86_400 + link.time + STEP / 2, [[0, 0]], x=1e5))
 
 
 def test_a_map_that_cannot_be_laid_is_left_out():
@@ -816,6 +870,20 @@ def test_a_drive_over_a_real_socket(server, mode):
     assert trial.outcome == "satisfied"
     assert server.advertised["/potlp/path"] == "nav_msgs/Path"
     assert bool(server.link.goals) == (mode is Mode.NAVIGATE)
+
+
+def test_a_robot_that_does_not_answer_is_not_asked_again_behind_the_callers_back(monkeypatch):
+    roslibpy = pytest.importorskip("roslibpy")
+    closed = []
+
+    def unanswered(_ros, timeout):
+        raise roslibpy.core.RosTimeoutError("Failed to connect to ROS")
+
+    monkeypatch.setattr(roslibpy.Ros, "run", unanswered)
+    monkeypatch.setattr(roslibpy.Ros, "close", lambda ros, timeout=0: closed.append(ros))
+    with pytest.raises(RobotError, match=r"nobody answers at 127\.0\.0\.1:9"):
+        RosbridgeLink("127.0.0.1:9")
+    assert len(closed) == 1
 
 
 def test_a_goal_is_not_kept_for_later_while_the_connection_is_lost(server):

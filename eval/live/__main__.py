@@ -80,7 +80,7 @@ def newest_by_stamp(link: SimulatedLink) -> tuple[Any, Any]:
             # Of two with one stamp the first that arrived counts.
             if topic == "/map":
                 maps.append((stamp_of(message), -number, scan_of(message).occupancy))
-            elif topic == "/tf" and maps:
+            elif topic == "/tf":
                 poses += [(stamp, -number, matrix[:2, 3]) for _, _, stamp, matrix in transforms_of(message)]
         except RobotError:
             continue

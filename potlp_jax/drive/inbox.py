@@ -9,7 +9,7 @@ gives way.
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -164,9 +164,14 @@ class Inbox:
             self._pixel_stamps = np.where(newer, stamps, self._pixel_stamps)
         frame_id = str(message["header"].get("frame_id", "")).lstrip("/")
         # The same once more is no news: whoever waits for the map goes on waiting.
-        if before is not None and before.frame == scan.frame and np.array_equal(before.occupancy, scan.occupancy):
+        same_frame = before is not None and (before.frame, self._heard.frame_id) == (scan.frame, frame_id)
+        if before is not None and same_frame and np.array_equal(before.occupancy, scan.occupancy):
             return None
-        return replace(self._heard, scan=scan, frame_id=frame_id, maps=self._heard.maps + 1)
+        heard, renamed = self._heard, frame_id != self._heard.frame_id
+        self._heard = replace(heard, scan=scan, frame_id=frame_id, maps=heard.maps + 1)
+        # What was heard before of where the robot is tells its pose in this frame from now on.
+        placed = self._placed() if renamed else None
+        return placed or self._heard
 
     def _update(self, message: Message) -> Heard | None:
         (x, y, values), stamp = update_of(message), stamp_of(message)
@@ -179,7 +184,7 @@ class Inbox:
         if x < 0 or y < 0 or top < 0 or x + width > scan.frame.width:
             raise RobotError("an update that reaches beyond the map")
         area = np.s_[top : top + height, x : x + width]
-        newer = stamp > stamps[area]
+        newer = (stamp > stamps[area]) | (stamp <= stamps[area] - RESTART)
         if not newer.any():
             return None
         occupancy, self._pixel_stamps = scan.occupancy.copy(), stamps.copy()
@@ -203,9 +208,18 @@ class Inbox:
             if self._is_new(f"{parent} to {child}", stamp):
                 self._transforms[(parent, child)], self._edge_heard[(parent, child)] = matrix, now
                 changed.add((parent, child))
+        return self._placed(changed)
+
+    def _placed(self, changed: Collection[Edge] | None = None) -> Heard | None:
+        """The robot where its transforms place it in the map; None where they do not, or where none of it changed.
+
+        Args:
+            changed: transforms that are new; None: the map's frame is.
+        """
         matrix, edges = self._chain()
         # A wheel that turns says nothing of where the robot is, and must not pass for a pose.
-        if matrix is None or not changed & set(edges):
+        news = set(edges) if changed is None else set(edges).intersection(changed)
+        if matrix is None or not news:
             return None
         yaw = float(np.arctan2(matrix[1, 0], matrix[0, 0]))
         return self._with_pose((float(matrix[0, 3]), float(matrix[1, 3]), yaw), self._body_heard(edges))

@@ -143,7 +143,8 @@ def picture_of(message: Message) -> UInt8[np.ndarray, "h w 3"]:
         return np.ascontiguousarray(np.broadcast_to(turned, (height, width, 3)))
     except RobotError:
         raise
-    except (*_FAULTS, PotlpError) as error:
+    # The last three are what libraries of images raise of damaged ones.
+    except (*_FAULTS, PotlpError, OSError, SyntaxError, cv2.error) as error:
         raise RobotError(f"a picture that cannot be read: {short(repr(error))}") from error
 
 
