@@ -8,7 +8,7 @@ the reader's own kind of `PotlpError`. What they see to:
 - sizes are checked before anything is read, unpacked or decoded, against limits that the message names;
 - whatever a parser raises on damaged input, an error of recursion or memory included, becomes one line.
 
-One writer is here, too (`write_whole`): what takes hours to make again is never left half written.
+One writer is here, too (`whole_file`, `write_whole`): what takes long to make again is never left half written.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ import xml.etree.ElementTree as ElementTree
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import yaml
@@ -47,6 +47,9 @@ DEEPEST: int = 50
 
 MOST_VALUES: int = 200_000
 """Values of a YAML file with its aliases written out: ten lines of aliases of aliases can stand for billions."""
+
+TEMPORARY: str = ".tmp"
+"""How the names of files end that were not written to their end."""
 
 # No setting has a longer name, and messages quote names whole.
 _LONGEST_NAME = 100
@@ -337,16 +340,34 @@ def write_whole(path: Path, text: str) -> None:
     Raises:
         OSError: it cannot be written.
     """
+    with whole_file(path) as file:
+        file.write(text.encode())
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[IO[bytes]]:
+    """A file to be written under a temporary name in the same folder, and renamed where the block ends well.
+
+    Args:
+        path: of the file; what is there already is replaced at the end, or stays as it is.
+
+    Yields:
+        What is written to.
+
+    Raises:
+        OSError: it cannot be written.
+    """
     # A link stays one. A pipe or /dev/stdout is written to: a rename would put a file in its place.
     path = path.resolve()
     if path.exists() and not path.is_file():
-        path.write_text(text, "utf-8")
+        with path.open("wb") as file:
+            yield file
         return
     # With the process's number: two that write the same file do not write into one.
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f"{path.name}.{os.getpid()}{TEMPORARY}")
     try:
-        with temporary.open("w", encoding="utf-8") as file:
-            file.write(text)
+        with temporary.open("wb") as file:
+            yield file
             file.flush()
             # Before the rename: otherwise a power cut could leave the name without the contents.
             os.fsync(file.fileno())

@@ -1,6 +1,7 @@
 """Datasets on disk: what is written is read back, by this library and by pandas; what is damaged is named."""
 
 import dataclasses
+import errno
 import subprocess
 import sys
 import tempfile
@@ -261,6 +262,26 @@ def test_values_out_of_range_are_named(tmp_path, column, value, message):
     write_shard(tmp_path, 0, world_columns(7), views, samples, METADATA)
     with pytest.raises(DatasetError, match=message):
         read_dataset(tmp_path)
+
+
+def test_of_missing_values_it_is_said_once_what_to_do(tmp_path):
+    views, samples = _shard(0)
+    samples["phi_stay"] = [[None, 0, 1], *samples["phi_stay"][1:]]
+    write_shard(tmp_path, 0, world_columns(7), views, samples, METADATA)
+    with pytest.raises(DatasetError) as error:
+        read_dataset(tmp_path)
+    assert str(error.value).count("delete all files of the shard") == 1
+
+
+def test_a_shard_that_cannot_be_written_leaves_nothing(tmp_path, monkeypatch):
+    def full(_descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("potlp_jax.files.os.fsync", full)
+    views, samples = _shard(0)
+    with pytest.raises(OSError, match="No space left"):
+        write_shard(tmp_path, 0, world_columns(7), views, samples, METADATA)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_success_has_a_cost(tmp_path):

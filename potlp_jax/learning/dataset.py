@@ -21,12 +21,12 @@ import pyarrow as pa
 from jaxtyping import Bool, Float32, Int8, Int32, UInt8
 
 from potlp_jax.errors import DatasetError
-from potlp_jax.files import reading
+from potlp_jax.files import TEMPORARY, reading
 from potlp_jax.images import decode_image
 from potlp_jax.learning.dataset_metadata import DatasetMetadata, DataSource, data_source
 from potlp_jax.learning.map_images import MAP_COLUMNS, EncodedView, EncodedWorld
 from potlp_jax.learning.on_disk import Entries
-from potlp_jax.learning.shard_files import TEMPORARY, metadata_of, write_table
+from potlp_jax.learning.shard_files import metadata_of, write_table
 
 JPEG_QUALITY: int = 92
 

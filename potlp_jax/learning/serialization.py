@@ -8,7 +8,6 @@ zip's checksums find damage.
 
 import dataclasses
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ import numpy as np
 
 from potlp_jax.codec import config_from_dict, differences
 from potlp_jax.errors import ConfigurationError, EstimatorError, NetworkError, PotlpError
-from potlp_jax.files import read_npz, reading, require_mapping, short
+from potlp_jax.files import read_npz, reading, require_mapping, short, whole_file
 from potlp_jax.learning.architectures import ARCHITECTURES, EstimatorConfig, architecture_of
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.network import Params
@@ -44,7 +43,6 @@ def save_estimator(
         domain: of the worlds that it learned from.
         metadata: any JSON-able mapping: how the estimator was made.
     """
-    # Under a temporary name first: a process that is killed leaves the old estimator or the new one.
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     arrays = named_arrays(params)
@@ -55,15 +53,10 @@ def save_estimator(
         "metadata": metadata,
     }
     header = json.dumps({"format": ESTIMATOR_FORMAT, **description})
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("wb") as file:
-        # Not compressed: random bits of parameters hardly shrink, and the file loads faster.
-        contents: dict[str, Any] = {_HEADER: np.frombuffer(header.encode(), np.uint8), **arrays}
+    # Not compressed: random bits of parameters hardly shrink, and the file loads faster.
+    contents: dict[str, Any] = {_HEADER: np.frombuffer(header.encode(), np.uint8), **arrays}
+    with whole_file(path) as file:
         np.savez(file, **contents)
-        file.flush()
-        # Before the rename: otherwise a power cut could leave the name without the contents.
-        os.fsync(file.fileno())
-    temporary.replace(path)
 
 
 def load_estimator(path: Path | str) -> tuple[Params, EstimatorConfig, Domain, dict[str, Any]]:

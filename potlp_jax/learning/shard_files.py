@@ -1,7 +1,6 @@
 """One Parquet file of a shard: written whole or not at all, and read a piece at a time with every check."""
 
 import contextlib
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,13 +9,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from potlp_jax.errors import DatasetError
-from potlp_jax.files import reading, require_file
+from potlp_jax.files import reading, require_file, whole_file
 from potlp_jax.learning.dataset_metadata import DatasetMetadata
 
 _METADATA_KEY = b"potlp"
-
-TEMPORARY = ".tmp"
-"""Ending of a file that is being written."""
 
 # Rows of a file, and bytes, that are read at once.
 _ROWS = 64
@@ -26,7 +22,7 @@ _REMEDY = "delete all files of the shard and collect or convert it again"
 
 
 def write_table(path: Path, columns: Mapping[str, Any], schema: pa.Schema, metadata: DatasetMetadata) -> None:
-    """Write a file under a temporary name and rename it.
+    """Write a file, all of it or none (``files.whole_file``).
 
     Args:
         path: the file.
@@ -35,15 +31,9 @@ def write_table(path: Path, columns: Mapping[str, Any], schema: pa.Schema, metad
         metadata: what the file says of its dataset.
     """
     table = pa.Table.from_pydict(dict(columns), schema.with_metadata({_METADATA_KEY: metadata.to_json().encode()}))
-    # With the process's number: two that write the same shard by mistake do not write into one file.
-    temporary = path.with_name(f"{path.name}.{os.getpid()}{TEMPORARY}")
-    with temporary.open("wb") as file:
+    with whole_file(path) as file:
         # With checksums of the pages, so that a flipped bit is found when they are read.
         pq.write_table(table, file, compression="zstd", write_page_checksum=True)
-        file.flush()
-        # Before the rename: otherwise a power cut could leave the name without the contents.
-        os.fsync(file.fileno())
-    temporary.replace(path)
 
 
 def metadata_of(path: Path) -> DatasetMetadata:
@@ -117,4 +107,7 @@ def _reading(path: Path) -> Iterator[None]:
         with reading(path, DatasetError, "a shard of a dataset"):
             yield
     except DatasetError as error:
+        # What was found in it says so already.
+        if str(error).endswith(_REMEDY):
+            raise
         raise DatasetError(f"{error}: {_REMEDY}") from error

@@ -9,6 +9,7 @@ from jaxtyping import Bool
 from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.map_settings import DEFAULT_FREE_THRESH, DEFAULT_OCCUPIED_THRESH
 from potlp_jax.errors import MapError
+from potlp_jax.files import whole_file, write_whole
 
 FREE_GREY = 254
 OCCUPIED_GREY = 0
@@ -35,12 +36,14 @@ def save_map(file: Path, free: Bool[np.ndarray, "H W"], frame: GridFrame) -> Pat
     # Binary PGM needs no library and has no compression to get wrong.
     image = file.with_suffix(".pgm")
     pixels = np.where(free, FREE_GREY, OCCUPIED_GREY).astype(np.uint8)
-    image.write_bytes(f"P5\n{frame.width} {frame.height}\n255\n".encode() + pixels.tobytes())
+    with whole_file(image) as pgm:
+        pgm.write(f"P5\n{frame.width} {frame.height}\n255\n".encode() + pixels.tobytes())
     # Quoted, for names may hold what YAML reads as a comment, a key or a list. A text of JSON is one of YAML too, but
     # for characters that are escaped in halves.
     name = json.dumps(image.name, ensure_ascii=False)
     # ``!r`` is the shortest text that reads back as the same float.
-    file.write_text(
+    write_whole(
+        file,
         f"image: {name}\n"
         "mode: trinary\n"
         f"resolution: {frame.resolution!r}\n"
@@ -48,6 +51,5 @@ def save_map(file: Path, free: Bool[np.ndarray, "H W"], frame: GridFrame) -> Pat
         "negate: 0\n"
         f"occupied_thresh: {DEFAULT_OCCUPIED_THRESH}\n"
         f"free_thresh: {DEFAULT_FREE_THRESH}\n",
-        "utf-8",
     )
     return image
