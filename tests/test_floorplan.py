@@ -260,7 +260,6 @@ def test_the_scale_is_the_files(tmp_path, pixels, real, unit, factor):
     plain, scaled = _academic(), _academic()
     scaled.pixels, scaled.real, scaled.unit = pixels, real, unit
     one, other = read_plan(plain.write(tmp_path)), read_plan(scaled.write(tmp_path, "scaled"))
-    assert other.metres_per_pixel == pytest.approx(one.metres_per_pixel / factor)
     assert other.rooms[0].area == pytest.approx(one.rooms[0].area / factor**2)
 
 

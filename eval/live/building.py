@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from potlp_jax.environments.families import MAP_PREFIX
 from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.mapped_rooms import MappedRooms
-from potlp_jax.environments.ros.ros_map import PREFIX, RosMap
+from potlp_jax.environments.ros.ros_map import RosMap
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.trials.config import trial_config_for
 from potlp_jax.trials.robot import photograph
@@ -51,7 +52,7 @@ class Building:
         Raises:
             MapError: the map cannot be used.
         """
-        generator = (RosMap if spec.startswith(PREFIX) else MappedRooms).from_spec(spec)
+        generator = (RosMap if spec.startswith(MAP_PREFIX) else MappedRooms).from_spec(spec)
         building = cls(generator.generate(world_key(Split.TEST, number, generator.name)), generator.clean.frame)
         # Compiled before the robot is there, which would be silent meanwhile.
         building.seen_from(building.start, REACH)

@@ -23,14 +23,28 @@ NAMED: Mapping[str, str] = MappingProxyType(
 )
 """``module:attribute`` of the class (or function without arguments) that makes each family's generator."""
 
+MAP_PREFIX: str = "map:"
+"""How the names of families of worlds on robots' maps begin, whose places their owner chose."""
+
+PARCELS_PREFIX: str = "parcels:"
+"""The same of those in the named rooms of real maps."""
+
+FLOOR_PLAN_PREFIX: str = "floorplan:"
+"""The same of those on real floor plans."""
+
 PREFIXED: Mapping[str, str] = MappingProxyType(
     {
-        "map:": "potlp_jax.environments.ros.ros_map:RosMap.from_spec",
-        "parcels:": "potlp_jax.environments.ros.mapped_rooms:MappedRooms.from_spec",
-        "floorplan:": "potlp_jax.environments.campus.floor_plans:FloorPlans.from_spec",
+        MAP_PREFIX: "potlp_jax.environments.ros.ros_map:RosMap.from_spec",
+        PARCELS_PREFIX: "potlp_jax.environments.ros.mapped_rooms:MappedRooms.from_spec",
+        FLOOR_PLAN_PREFIX: "potlp_jax.environments.campus.floor_plans:FloorPlans.from_spec",
     }
 )
 """Families that are made from a file, by how their names begin: functions of the whole name."""
 
-FAMILIES: tuple[str, ...] = (*NAMED, "map:FILE.yaml", "parcels:FILE.yaml", "floorplan:FILE.xml")
+FAMILIES: tuple[str, ...] = (
+    *NAMED,
+    f"{MAP_PREFIX}FILE.yaml",
+    f"{PARCELS_PREFIX}FILE.yaml",
+    f"{FLOOR_PLAN_PREFIX}FILE.xml",
+)
 """The names as they are shown to users."""

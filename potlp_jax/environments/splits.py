@@ -21,6 +21,7 @@ import zlib
 import jax
 from jaxtyping import PRNGKeyArray
 
+from potlp_jax.environments.families import FLOOR_PLAN_PREFIX, PARCELS_PREFIX
 from potlp_jax.errors import WorldError
 from potlp_jax.precision import in_32_bits
 
@@ -44,13 +45,6 @@ class Split(enum.StrEnum):
     @classmethod
     def _missing_(cls, value: object) -> "Split":
         raise WorldError(f"unknown split {value!r}; choose from: {', '.join(cls)}")
-
-
-FLOOR_PLAN_PREFIX = "floorplan:"
-"""How the names of families of worlds on real floor plans begin."""
-
-PARCELS_PREFIX = "parcels:"
-"""How the names of families of worlds in the named rooms of real maps begin."""
 
 
 def usable_splits(family: str) -> tuple[Split, ...]:

@@ -8,6 +8,7 @@ import dataclasses
 import math
 from collections.abc import Iterator
 
+from potlp_jax.environments.families import MAP_PREFIX
 from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.grid import World
 
@@ -63,7 +64,7 @@ class Domain:
         """How the kinds of worlds differ, in words."""
         # A family that nobody named is none that anything is known of. What robots have seen is asked by robots, and on
         # their maps.
-        of_robots = not here.family or here.family.startswith(_MAPS)
+        of_robots = not here.family or here.family.startswith(MAP_PREFIX)
         if here.family == self.family != "" or (self.family == LOGS and of_robots):
             return ()
         found = f"are of {here.family}" if here.family else "are a robot's, of no named family"
@@ -86,10 +87,6 @@ FLOOR: tuple[str, ...] = ("horizon", "far", "fold")
 
 LOGS: str = "log"
 """Family of the worlds that are read from robots' logs."""
-
-
-_MAPS = "map:"
-"""How the families of maps that robots have made begin: each is of its own building."""
 
 
 def unit_of(resolution: float) -> str:

@@ -76,13 +76,11 @@ class FloorPlan:
         file: where it was read from.
         rooms: in the order of the file.
         doors: every door once. Doors to the outside, which no portal mentions, are left out.
-        metres_per_pixel: the scale of the file.
     """
 
     file: Path
     rooms: tuple[PlanRoom, ...]
     doors: tuple[PlanDoor, ...]
-    metres_per_pixel: float
 
 
 def read_plan(file: Path | str) -> FloorPlan:
@@ -113,7 +111,7 @@ def read_plan(file: Path | str) -> FloorPlan:
     if len(set(ids)) < len(ids):
         twice = next(name for name in ids if ids.count(name) > 1)
         raise MapError(file, f"space {twice}", "the id is given twice")
-    return FloorPlan(file, rooms, tuple(_read_doors(file, spaces, set(ids), scale)), scale)
+    return FloorPlan(file, rooms, tuple(_read_doors(file, spaces, set(ids), scale)))
 
 
 def read_kinds(file: Path | str | None = None) -> Mapping[str, Kind]:

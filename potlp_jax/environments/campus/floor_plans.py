@@ -36,8 +36,8 @@ from potlp_jax.environments.campus.furnishing import (
 )
 from potlp_jax.environments.campus.people_posterior import PeoplePosterior, people_posterior
 from potlp_jax.environments.campus.plan_floor import PlanFloor, rasterise
+from potlp_jax.environments.families import FLOOR_PLAN_PREFIX
 from potlp_jax.environments.options import parse_options
-from potlp_jax.environments.splits import FLOOR_PLAN_PREFIX
 from potlp_jax.errors import MapError, MapWarning, TaskError
 from potlp_jax.task.task import Task
 from potlp_jax.world.grid import World

@@ -134,7 +134,7 @@ class Drawing:
 def _gap(line: Int32[np.ndarray, " N"], middle: float, reach: int, rooms: tuple[int, int]) -> Int[np.ndarray, " M"]:
     """The cells of no room between two rooms that follow each other in a line of cells, nearest to its middle."""
     low = max(int(middle) - reach, 0)
-    window = line[low : int(middle) + reach + 1]
+    window = line[low : max(int(middle) + reach + 1, 0)]
     # Two rooms face each other where one follows the other with nothing but wall between.
     taken = np.flatnonzero(window != NO_ROOM)
     gaps = [

@@ -35,11 +35,11 @@ from potlp_jax.environments.campus.furnishing import (
     furnish,
 )
 from potlp_jax.environments.campus.people_posterior import PeoplePosterior, people_posterior
+from potlp_jax.environments.families import PARCELS_PREFIX
 from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.ros.cleaning import CleanMap, clean_map, warn_of_cut_off
 from potlp_jax.environments.ros.occupancy_map import load_map
 from potlp_jax.environments.ros.places import Region, load_regions
-from potlp_jax.environments.splits import PARCELS_PREFIX
 from potlp_jax.errors import MapError, MapWarning
 from potlp_jax.world.grid import World
 from potlp_jax.world.settings import Settings

@@ -28,10 +28,8 @@ from scipy import ndimage
 from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.map_settings import parse_number, parse_numbers, read_yaml
 from potlp_jax.errors import MapError
-from potlp_jax.files import short
-
-MAX_PROPOSITIONS = 16
-"""As many as a letter has bits."""
+from potlp_jax.files import short, write_whole
+from potlp_jax.task.propositions import MAX_PROPOSITIONS
 
 PLACE_RADIUS = 0.5
 """Metres around a point that count as being there, where nothing gives a radius."""
@@ -160,7 +158,8 @@ def save_places(places: Places, file: Path) -> None:
         fields["start"] = _numbers(places.start)
     if places.tasks:
         fields["tasks"] = dict(places.tasks)
-    file.write_text(yaml.safe_dump(fields, default_flow_style=None, sort_keys=False, allow_unicode=True), "utf-8")
+    # Labels are typed by hand: a full disk must not take those that were there.
+    write_whole(file, yaml.safe_dump(fields, default_flow_style=None, sort_keys=False, allow_unicode=True))
 
 
 def _region_fields(region: Region) -> dict[str, Any]:

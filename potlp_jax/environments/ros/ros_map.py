@@ -18,15 +18,15 @@ from jaxtyping import Int32, PRNGKeyArray
 
 from potlp_jax.environments.base import Generator, host_generators
 from potlp_jax.environments.campus.furnishing import NARROW_DOORS
+from potlp_jax.environments.families import MAP_PREFIX
 from potlp_jax.environments.options import parse_options
 from potlp_jax.environments.ros.buildings import load_building
 from potlp_jax.environments.ros.cleaning import CleanMap, clean_map, warn_of_cut_off
 from potlp_jax.environments.ros.occupancy_map import OccupancyMap
-from potlp_jax.environments.ros.places import MAX_PROPOSITIONS, Places, load_places, place_letters, places_file
+from potlp_jax.environments.ros.places import Places, load_places, place_letters, places_file
 from potlp_jax.errors import MapError, MapWarning
+from potlp_jax.task.propositions import MAX_PROPOSITIONS
 from potlp_jax.world.grid import World, make_world
-
-PREFIX = "map:"
 
 _OPTIONS: Mapping[str, type[str] | type[float]] = MappingProxyType(
     {"places": str, "resolution": float, "radius": float, "level": str}
@@ -87,7 +87,7 @@ class RosMap(Generator):
         self.clean = clean_map(self.image_map, config.resolution, config.radius, places.start, places.source)
         warn_of_cut_off(config.file, self.clean, config.radius)
         # Not the path as typed: the name goes into the keys of its worlds, and a map is the same map from every folder.
-        self.name = f"{PREFIX}{Path(config.file).stem}"
+        self.name = f"{MAP_PREFIX}{Path(config.file).stem}"
         self.propositions = places.names
         self.tasks = dict(places.tasks)
         # Letters and cells do not depend on the key: they are made once, worlds differ in the start.
@@ -144,7 +144,7 @@ def parse_spec(spec: str) -> RosMapConfig:
         MapError: the text is not of that form.
     """
     usage = "write map:FILE.yaml[,places=FILE][,resolution=METRES][,radius=METRES][,level=NAME]"
-    file, values = parse_options(spec, PREFIX, "map", _OPTIONS, usage)
+    file, values = parse_options(spec, MAP_PREFIX, "map", _OPTIONS, usage)
     return RosMapConfig(file, **values)
 
 
