@@ -1,7 +1,9 @@
 """`potlp map`: what it finds on maps whose doors are known, what it writes, and pictures whose metres are right."""
 
+import errno
 import json
 import math
+import shlex
 import warnings
 import xml.etree.ElementTree as ElementTree
 
@@ -17,6 +19,7 @@ from typer.testing import CliRunner
 from potlp_jax.cli import app
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.ros.cleaning import Cause, clean_map
+from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.map_writer import save_map
 from potlp_jax.environments.ros.occupancy_map import load_map
 from potlp_jax.environments.ros.places import Disc, Places, Polygon, load_places, save_places
@@ -439,6 +442,41 @@ def test_preview_writes_pictures(office, tmp_path):
     refused = potlp("map", "preview", office, "--out", tmp_path / "picture.docx")
     assert refused.exit_code == 2
     assert "docx" in refused.stderr
+
+
+def test_a_map_of_specks_alone_is_drawn(tmp_path):
+    small = np.zeros((10, 10), bool)
+    small[1:9, 1:9] = True
+    save_map(tmp_path / "small.yaml", small, GridFrame(10, 10, 0.05, 0.0, 0.0, 0.0))
+    drawn = potlp("map", "preview", tmp_path / "small.yaml", "--radius", "0", "--out", tmp_path / "small.png")
+    assert drawn.exit_code == 0, drawn.stderr
+    assert (tmp_path / "small.png").stat().st_size
+
+
+def test_labels_that_cannot_be_written_leave_those_of_before(office, tmp_path, monkeypatch):
+    labels = tmp_path / "labels.yaml"
+    assert potlp("map", "label", office, "--place", "a=0,5", "--out", labels).exit_code == 0
+    before = labels.read_text("utf-8")
+
+    def full(_descriptor):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("potlp_jax.files.os.fsync", full)
+    assert potlp("map", "label", office, "--add", "--place", "b=6,5", "--out", labels).exit_code != 0
+    assert labels.read_text("utf-8") == before
+    assert [file.name for file in tmp_path.iterdir() if file.name.startswith("labels")] == ["labels.yaml"]
+
+
+@pytest.mark.parametrize("name", ["küche", "my room", "U", "xor", "it's", "Fire"])
+def test_the_next_command_works_for_names_of_any_kind(office, tmp_path, name):
+    labelled = potlp(
+        "map", "label", office, "--place", f"{name}=0,5", "--place", "b=6,5", "--out", tmp_path / "my labels.yaml"
+    )
+    (hint,) = (line for line in labelled.stdout.splitlines() if line.startswith("next: "))
+    command, *rest = shlex.split(hint.removeprefix("next: "))
+    assert (command, rest[0], rest[2]) == ("potlp", "run", "--task")
+    world = make(rest[1])
+    assert world.task(rest[3]).propositions == (name, "b")
 
 
 # All of it.

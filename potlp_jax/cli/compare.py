@@ -1,6 +1,7 @@
 """``potlp compare``: policies in the same worlds. A sweep over one environment and task, shown at once."""
 
 import csv
+import shlex
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,7 +22,7 @@ from potlp_jax.cli.options import (
     TaskName,
     WorldNumber,
 )
-from potlp_jax.cli.output import console, fail, file_console, make_folder, print_json, to_json
+from potlp_jax.cli.output import console, fail, file_console, make_folder, print_json, print_next, to_json
 from potlp_jax.cli.sweep import print_cell, run_reported, told_when_interrupted
 
 if TYPE_CHECKING:
@@ -127,7 +128,7 @@ def compare_policies(
         files.append(_draw(specification, results, out, picture))
     if out is not None and not json:
         console().print(f"wrote {', '.join(file.name for file in files)} in {out}")
-        console().print(f"next: potlp report {out}", style="dim")
+        print_next(console(), shlex.join(["potlp", "report", str(out)]))
 
 
 def _default_policy(

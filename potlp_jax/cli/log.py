@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.util
 import logging
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +14,7 @@ from rich.table import Table
 from potlp_jax.cli.completion import complete_policy
 from potlp_jax.cli.group import Command, command_app
 from potlp_jax.cli.options import EstimatorName, Json, OpenPage, SearchName, Simulations, TrialFile, spread
-from potlp_jax.cli.output import FAILED, console, fail, make_folder, open_page, print_json, progress_bar
+from potlp_jax.cli.output import FAILED, console, fail, make_folder, open_page, print_json, print_next, progress_bar
 from potlp_jax.cli.view import PAGE
 
 if TYPE_CHECKING:
@@ -327,7 +328,7 @@ def write_log(
     count = write_trial(load_trial(record_file(trial)), out, chosen, labels, height)
     console().print(f"wrote {out}: {count} messages")
     console().print(f"wrote {labels}, in metres of the bag's map: its robot starts at [0, 0]")
-    console().print(f"next: potlp log inspect {out}", style="dim")
+    print_next(console(), shlex.join(["potlp", "log", "inspect", str(out)]))
 
 
 def _print_inspection(found: dict[str, Any]) -> None:

@@ -1,5 +1,6 @@
 """``potlp map``: from a ROS map to a world; ``map_report`` has what it prints, ``map_labels`` what it labels."""
 
+import shlex
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,7 +22,7 @@ from potlp_jax.cli.map_report import (
     survey_facts,
 )
 from potlp_jax.cli.options import Json
-from potlp_jax.cli.output import console, fail, print_json
+from potlp_jax.cli.output import console, fail, print_json, print_next
 from potlp_jax.errors import MapWarning
 
 if TYPE_CHECKING:
@@ -154,8 +155,9 @@ def write_clean_map(
     for line in cut_off_lines(clean):
         output.print(f"- {line}")
     output.print(f"wrote {out} and {image}")
-    next_one = f"potlp map label {out} --resolution {clean.frame.resolution:g} --radius 0, then potlp run {world}"
-    output.print(f"next: {next_one} (the radius is in the map already)", style="dim")
+    label = ["potlp", "map", "label", str(out), "--resolution", _number(clean.frame.resolution), "--radius", "0"]
+    then = shlex.join(["potlp", "run", world])
+    print_next(output, f"{shlex.join(label)}, then {then} (the radius is in the map already)")
 
 
 @app.command(
@@ -218,6 +220,7 @@ def label_map(
         places_file,
         save_places,
     )
+    from potlp_jax.task.propositions import in_formula
 
     target = places_file(file, level) if out is None else out
     # Labels are typed by hand; overwriting them by a repeated command would lose work.
@@ -245,9 +248,9 @@ def label_map(
         output.print(f"{name:12} {count} cells, {count * side**2:.1f} m2")
     output.print(f"wrote {target}")
     # A command that works as it stands: a task of the labels, or to reach every place.
-    example = labels.tasks[0][0] if labels.tasks else " & ".join(f"F {name}" for name in labels.names)
+    example = labels.tasks[0][0] if labels.tasks else " & ".join(f"F {in_formula(name)}" for name in labels.names)
     world = _environment(file, None if out is None else target, resolution, radius, level)
-    output.print(f"next: potlp run {world} --task '{example}'", style="dim")
+    print_next(output, shlex.join(["potlp", "run", world, "--task", example]))
 
 
 @app.command(
@@ -303,9 +306,18 @@ def _environment(file: Path, places: Path | None, resolution: float | None, radi
     from potlp_jax.environments.ros.ros_map import RosMapConfig
 
     chosen = {"resolution": resolution, "radius": radius}
-    options = [f"{name}={value:g}" for name, value in chosen.items() if value != getattr(RosMapConfig, name)]
+    options = [
+        f"{name}={_number(value)}"
+        for name, value in chosen.items()
+        if value is not None and value != getattr(RosMapConfig, name)
+    ]
     of_level = [] if level is None else [f"level={level}"]
     return ",".join([f"map:{file}", *([] if places is None else [f"places={places}"]), *options, *of_level])
+
+
+def _number(value: float) -> str:
+    """The shortest text that reads back as the same number."""
+    return short if float(short := f"{value:g}") == value else repr(value)
 
 
 @contextmanager

@@ -46,6 +46,11 @@ def error_console() -> Console:
     return _literal_console(stderr=True)
 
 
+def print_next(output: Console, command: str) -> None:
+    """What one would do next, on one line however long it is: it is copied and run."""
+    output.print(f"next: {command}", style="dim", soft_wrap=True)
+
+
 def file_console(file: TextIO, width: int) -> Console:
     """Writes tables into a text file with lines of up to ``width`` columns: a file has no terminal to ask."""
     return _literal_console(file=file, width=width)

@@ -1,11 +1,12 @@
 """What ``potlp run`` and ``potlp sweep trial`` write and print of one trial."""
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.text import Text
 
-from potlp_jax.cli.output import console, fail, progress_bar
+from potlp_jax.cli.output import console, fail, print_next, progress_bar
 
 if TYPE_CHECKING:
     from potlp_jax.trials.record import Trial
@@ -75,7 +76,8 @@ def print_trial(trial: "Trial", files: list[Path]) -> None:
     # What one would do next with these files; a newcomer need not look it up.
     if files:
         # A trial that ended where it began has no decision to explain.
-        command = f"explain {files[0].parent}:0" if trial.decisions else f"view {files[0].parent}"
-        out.print(f"next: potlp {command}", style="dim")
+        folder = str(files[0].parent)
+        command = ["explain", f"{folder}:0"] if trial.decisions else ["view", folder]
+        print_next(out, shlex.join(["potlp", *command]))
     else:
         out.print("add --out FOLDER for the record, a picture and an animation", style="dim")
