@@ -404,6 +404,7 @@ def test_an_estimator_is_evaluated_on_labels_of_its_own_kind_only():
 def test_the_most_confident_right_and_wrong_answers_are_found():
     samples, predictions = make_samples(12, 200, 12), make_predictions(200, 12, decimals=6)
     chosen = most_confident(samples, predictions, 3)
+    assert {*chosen} == {f"{right} {said}" for right in ("true", "false") for said in ("positives", "negatives")}
     logit = predictions.success_logit
     for name, indices in chosen.items():
         said = name.endswith("positives")

@@ -33,6 +33,8 @@ def test_settings_are_values():
     assert hash(one) == hash(other)
     assert pickle.loads(pickle.dumps(one)) == one
     assert Settings(json.loads(json.dumps(one.to_dict()))) == one
+    within = Settings({"cameras": [{"range_cells": 4}, 2]})
+    assert json.loads(json.dumps(within.to_dict())) == {"cameras": [{"range_cells": 4}, 2]}
     assert hash(Settings({"colour": [1, 2]})) == hash(Settings({"colour": (1, 2)}))
     assert one != NO_SETTINGS
 

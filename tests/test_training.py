@@ -575,6 +575,13 @@ def test_an_address_of_processes_is_checked(address):
         join_processes(address)
 
 
+@pytest.mark.parametrize("size", ["", "1", "none"])
+def test_variables_that_name_no_other_process_leave_a_fit_alone(monkeypatch, size):
+    monkeypatch.setenv("SLURM_STEP_NUM_TASKS", size)
+    monkeypatch.setattr(jax.distributed, "initialize", lambda **_: pytest.fail("it waits for others"))
+    join_processes()
+
+
 def test_rows_of_processes_together_are_the_batch_of_one():
     samples = synthetic(7, 6, 5)
     learner = PanoramaOptions().learner(samples)

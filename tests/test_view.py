@@ -222,6 +222,7 @@ def test_long_names_leave_no_picture(trial, tmp_path):
     figure = draw_trial(long)
     save_figure(figure, tmp_path / "long.png")
     renderer = figure.canvas.get_renderer()
+    assert sum(len(legend.get_texts()) for legend in figure.legends) > 1
     for legend in figure.legends:
         for text in legend.get_texts():
             box = text.get_window_extent(renderer)

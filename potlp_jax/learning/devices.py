@@ -35,7 +35,9 @@ def join_processes(address: str | None = None) -> None:
     Raises:
         TrainingError: the address is none, or not all processes came together.
     """
-    if address is None and max(int(os.environ.get(name, "1")) for name in _SIZES) < 2:
+    sizes = [os.environ.get(name, "") for name in _SIZES]
+    # Empty, or no number: set for something else.
+    if address is None and max((int(size) for size in sizes if size.isdecimal()), default=1) < 2:
         return
     given = {} if address is None else _given(address)
     # Processors have no way to talk to those of other processes by default in all versions of jax.

@@ -26,7 +26,7 @@ def exclusive_chances(chances: Float32[Array, "S C"], subgoals: Subgoals, within
         within: distance in cells between subgoals that exclude each other; static.
 
     Returns:
-        P_S of the same shape, nowhere lower than ``chances``.
+        P_S of the same shape, nowhere lower than ``chances``, but for chances of 1, which become 1 - 1e-6.
     """
     apart = subgoals.cells[:, None] - subgoals.cells[None, :]
     near = jnp.sum(apart**2, axis=2) <= math.floor(within**2)

@@ -6,6 +6,7 @@ pool of tasks, P_S, R_S, R_F and the weights of the loss. ``docs/dataset.md`` de
 """
 
 import dataclasses
+import math
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -87,7 +88,7 @@ class RecordingConfig:
     def __post_init__(self) -> None:
         require_fields(self, ("views_per_world", "classes", "tasks_per_world"), AT_LEAST_ONE, DatasetError)
         require_fields(self, ("seed", "look_every"), NOT_NEGATIVE, DatasetError)
-        if not 0 <= self.spacing[0] <= self.spacing[1]:
+        if not 0 <= self.spacing[0] <= self.spacing[1] < math.inf:
             raise DatasetError(f"spacing is {self.spacing}: give the least and the most, in cells")
         # A sheet of questions goes from one set to another (``question_sheet``).
         if self.staying_sets < 2:

@@ -27,18 +27,13 @@ _THICK = 3
 _SLACK = 1e-4
 
 
-def shape_in(shape: tuple[int, int], scale: float) -> tuple[int, int]:
-    """Rows and columns of a map on other cells; ``scale`` of them are as long as one of its own."""
-    return _places(shape[0], scale)[-1] + 1, _places(shape[1], scale)[-1] + 1
-
-
 def cells_in(cells: Int32[Array, "*B 2"], shape: tuple[int, int], scale: float) -> Int32[Array, "*B 2"]:
     """The cells of the other map in which the middles of these lie.
 
     Args:
         cells: of the one map.
         shape: its rows and columns.
-        scale: as in ``shape_in``.
+        scale: how many cells of the other map are as long as one of this.
 
     Returns:
         Cells of the other map.
@@ -59,7 +54,8 @@ def resampled(
         scale: how many cells of the other map are as long as one of this; static.
 
     Returns:
-        Both, of the shape ``shape_in``; distances of the painting are in cells of the other map.
+        Both, with as many rows and columns as hold the middles of all cells; distances of the painting are in cells of
+        the other map.
     """
     height, width = belief.cells.shape
     shape = (height, width)

@@ -51,7 +51,7 @@ def comparison_table(comparison: Comparison) -> RichTable:
     styles = policy_styles(row.policy for row in satisfied.rows)
     for row, of_all in zip(satisfied.rows, charged.rows, strict=True):
         ended = comparison.outcomes[row.policy].get(SATISFIED, 0)
-        last = (_percent(of_all.attainable_share),) if satisfied.dropped else ()
+        last = (percent(of_all.attainable_share),) if satisfied.dropped else ()
         shown.add_row(_policy_name(row.policy, styles), f"{ended} of {comparison.worlds}", *_cells(row), *last)
     return shown
 
@@ -63,19 +63,20 @@ def _policy_name(policy: str, styles: Mapping[str, PolicyStyle]) -> Text:
 
 
 def _cells(row: PolicyRow) -> tuple[str, ...]:
-    low, high = (_percent(share, unit="") for share in (row.attainable_low, row.attainable_high))
+    low, high = (percent(share, unit="") for share in (row.attainable_low, row.attainable_high))
     # A single world has no standard error.
     error = "" if math.isnan(row.trial_savings_error) else f" ± {100 * row.trial_savings_error:.1f}%"
     return (
         "-" if math.isnan(row.mean_cost) else f"{row.mean_cost:.1f}",
-        _percent(row.attainable_share),
+        percent(row.attainable_share),
         "-" if math.isnan(row.attainable_low) else f"{low} .. {high}%",
-        _percent(row.net_savings),
-        _percent(row.trial_savings, unit="" if error else "%") + error,
+        percent(row.net_savings),
+        percent(row.trial_savings, unit="" if error else "%") + error,
     )
 
 
-def _percent(share: float, unit: str = "%") -> str:
+def percent(share: float, unit: str = "%") -> str:
+    """A share with one digit, "-" where it is NaN."""
     # Adding zero turns a rounded -0.0 into 0.0.
     return "-" if math.isnan(share) else f"{round(100 * share, 1) + 0.0:.1f}{unit}"
 

@@ -118,7 +118,7 @@ def _limits(image_map: OccupancyMap, clean: CleanMap) -> tuple[tuple[float, floa
     labels = component_labels(image_map.free)
     # Specks of free space outside, from stray laser beams, would shrink the building to a corner of the picture.
     shown = (np.bincount(labels.ravel()) * frame.resolution**2 >= SPECK)[labels] & image_map.free
-    rows, cols = np.nonzero(shown)
+    rows, cols = np.nonzero(shown if shown.any() else image_map.free)
     # Rows count from the top, metres from the bottom.
     low = (float(cols.min()), float(frame.height - 1 - rows.max()))
     high = (float(cols.max() + 1), float(frame.height - rows.min()))

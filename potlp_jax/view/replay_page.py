@@ -64,15 +64,16 @@ def embed_json(data: Any) -> str:
 
 def page_style() -> str:
     """The style sheet of replays, for light and dark screens."""
-    return _text("replay.css")
+    return packaged_text("replay.css")
 
 
 def replay_script() -> str:
     """Defines ``mountReplay(element, data)``."""
-    return _text("replay.js")
+    return packaged_text("replay.js")
 
 
-def _text(name: str) -> str:
+def packaged_text(name: str) -> str:
+    """A file that comes with this package."""
     return resources.files("potlp_jax.view").joinpath("data", name).read_text("utf-8")
 
 

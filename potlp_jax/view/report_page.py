@@ -4,13 +4,12 @@ import dataclasses
 import html
 import math
 from collections.abc import Mapping, Sequence
-from importlib import resources
 from typing import Any
 
 from potlp_jax.sweep.results import Pair, compare_pairs, reliable_pairs
 from potlp_jax.sweep.statistics import BASELINE, KNOWN_MAP, Table
-from potlp_jax.view.comparisons import flag_lines, unreliable_lines
-from potlp_jax.view.replay_page import embed_json, page_style, replay_script
+from potlp_jax.view.comparisons import flag_lines, percent, unreliable_lines
+from potlp_jax.view.replay_page import embed_json, packaged_text, page_style, replay_script
 from potlp_jax.view.report_plots import cumulative, savings_by_world, scatter
 from potlp_jax.view.style import INK, PolicyStyle, policy_styles
 
@@ -68,7 +67,7 @@ def report_page(title: str, facts: Sequence[tuple[str, str]], policies: Sequence
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{html.escape(title)}</title>
-<style>{page_style()}{_text("report.css")}</style>
+<style>{page_style()}{packaged_text("report.css")}</style>
 </head>
 <body>
 <main>
@@ -79,14 +78,10 @@ def report_page(title: str, facts: Sequence[tuple[str, str]], policies: Sequence
 </main>
 {"".join(replays)}
 <script>{replay_script()}</script>
-<script>{_text("report.js")}</script>
+<script>{packaged_text("report.js")}</script>
 </body>
 </html>
 """
-
-
-def _text(name: str) -> str:
-    return resources.files("potlp_jax.view").joinpath("data", name).read_text("utf-8")
 
 
 def _section(number: int, cell: Cell, policies: Sequence[str], replays: list[str]) -> str:
@@ -156,8 +151,7 @@ def _policy_cell(policy: str, styles: Mapping[str, PolicyStyle]) -> str:
 
 
 def _percent(share: float) -> str:
-    # Adding zero turns a rounded -0.0 into 0.0.
-    return "-" if math.isnan(share) else f"{100 * share + 0.0:.1f} %"
+    return percent(share, unit=" %")
 
 
 def _interval(low: float, high: float) -> str:

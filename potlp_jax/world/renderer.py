@@ -241,7 +241,8 @@ def _looked(
 def _render_elsewhere(world: World, cell: Int32[Array, "2"], config: CameraConfig) -> UInt8[Array, "rows columns 3"]:
     """The picture of a renderer that is not ours."""
     picture = plugins.load(config.renderer, group=plugins.CAMERAS, kind="camera")(world, cell, config)
-    found, wanted = (picture.dtype, picture.shape), (jnp.uint8, (config.height, config.width, 3))
+    found = getattr(picture, "dtype", type(picture).__name__), getattr(picture, "shape", ())
+    wanted = (jnp.uint8, (config.height, config.width, 3))
     # Shapes are known while jit traces, so the check costs nothing later.
     if found != wanted:
         raise PluginError(

@@ -31,7 +31,7 @@ class Settings(Mapping[str, Any]):
 
     def to_dict(self) -> dict[str, Any]:
         """Plain nested dictionaries, for files."""
-        return {name: value.to_dict() if isinstance(value, Settings) else value for name, value in self.items()}
+        return {name: _thawed(value) for name, value in self.items()}
 
 
 def _frozen(value: Any) -> Any:
@@ -39,6 +39,13 @@ def _frozen(value: Any) -> Any:
     if isinstance(value, Mapping):
         return Settings(value)
     return tuple(map(_frozen, value)) if isinstance(value, list | tuple) else value
+
+
+def _thawed(value: Any) -> Any:
+    """The value without ``Settings``, those within tuples included."""
+    if isinstance(value, Settings):
+        return value.to_dict()
+    return tuple(map(_thawed, value)) if isinstance(value, tuple) else value
 
 
 NO_SETTINGS: Settings = Settings()
