@@ -11,8 +11,9 @@ from typer.testing import CliRunner
 
 import potlp_jax
 from potlp_jax.cli import app
-from potlp_jax.errors import RecordError, RobotError
+from potlp_jax.errors import PotlpError, RecordError, RobotError
 from potlp_jax.learning.labels import TrueMapEstimator
+from potlp_jax.planning.policies import Policy
 from potlp_jax.trials import loop
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import BrokenDriveError
@@ -479,6 +480,12 @@ def test_a_remark_that_cannot_be_had_costs_no_record():
             raise OSError("no voice")
 
     assert driven(Mute())[0].notes == ("noticed of the robot raised OSError: no voice",)
+
+
+@pytest.mark.parametrize("policy", ["known-map", "known_map", Policy.KNOWN_MAP])
+def test_no_robot_knows_the_map(policy):
+    with pytest.raises(PotlpError, match="known-map knows all from the start, and this robot does not"):
+        potlp_jax.run_robot(Rover(), TASK, policy, KEY)
 
 
 def test_a_listener_that_fails_leaves_the_record():

@@ -142,7 +142,7 @@ def drive(
     from potlp_jax.drive.driving import drive_robot
     from potlp_jax.drive.rosbridge import RosbridgeLink
     from potlp_jax.environments.ros.places import load_places
-    from potlp_jax.planning.policies import Policy
+    from potlp_jax.planning.policies import Policy, named_policy
     from potlp_jax.task.reading import read_task
     from potlp_jax.trials.loop import BrokenDriveError
     from potlp_jax.trials.record import Outcome
@@ -167,6 +167,9 @@ def drive(
         patience=patience,
     )
     chosen_policy = policy or (Policy.BASELINE if estimator is None else Policy.POTLP)
+    # Before the robot is asked for anything.
+    if named_policy(chosen_policy) in (Policy.KNOWN_MAP, Policy.ORACLE):
+        fail(f"--policy {chosen_policy}: it knows the true map, which nobody does here; choose another")
     if names.image_topic and estimator is None and chosen_policy != Policy.POTLP:
         logger.warning(f"the policy is {chosen_policy}: --image-topic is of use with an --estimator alone")
     asked = read_task(_formula(task, places), known)

@@ -15,7 +15,7 @@ from potlp_jax.learning.observing import ObservingEstimator
 from potlp_jax.logs.drive import Drive, PanoramaReader
 from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.planning.estimates import Estimator
-from potlp_jax.planning.policies import Policy, PolicyFunction
+from potlp_jax.planning.policies import Policy, PolicyFunction, named_policy
 from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import Task
 from potlp_jax.trials.config import TrialConfig
@@ -143,6 +143,7 @@ def replay(
     Warns:
         PotlpWarning: the estimator given was made for other worlds.
     """
+    policy = named_policy(policy)
     if policy is Policy.KNOWN_MAP:
         raise LogError("the policy known-map knows all from the start: choose baseline, optimistic, oracle or potlp")
     require_same_propositions(

@@ -68,7 +68,7 @@ def run_robot(
             with the error as its last note.
         PropositionsError: the robot's map, task, estimator and ``world`` are not over the same propositions.
         EstimatorError: no estimator is shipped for the task's propositions in such a world.
-        PotlpError: the policy is ``oracle`` and there is no ``world``.
+        PotlpError: the policy is ``oracle`` and there is no ``world``, or ``known-map``, which no robot can follow.
     """
     policy = named_policy(policy)
     watched = WatchedRobot(robot, seconds_per_cell)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int32, PRNGKeyArray
 
-from potlp_jax.errors import RobotError
+from potlp_jax.errors import PotlpError, RobotError
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import TrainedEstimator, identity_of
 from potlp_jax.learning.observing import (
@@ -142,7 +142,7 @@ def drive(
         task: what to do.
         policy: one of the library's, or a function of one's own (``planning.policies.PolicyFunction``).
         key: drives the search where it samples (``UctConfig``).
-        config: settings; the sensor, the camera and ``revealed`` are the simulator's and matter not here.
+        config: settings; the sensor and the camera are the simulator's and matter not here.
         arrays: the task's arrays where they shall be padded; by default ``task.arrays``.
         estimator: what the policy asks, as in ``run_trial``. What worlds without a true map look like is not known: no
             shipped estimator serves them, and one is asked on request only.
@@ -157,16 +157,19 @@ def drive(
     Raises:
         PropositionsError: the robot's map, task, estimator and ``world`` are not over the same propositions.
         EstimatorError: no estimator is shipped for the task's propositions in such a world.
-        PotlpError: the policy is ``oracle`` and there is no ``world``.
+        PotlpError: the policy is ``oracle`` and there is no ``world``, or ``known-map`` and nothing is ``revealed``.
         BrokenDriveError: the robot raised ``RobotError`` after its first observation.
     """
     policy = named_policy(policy)
+    config = TrialConfig() if config is None else config
+    # It would drive as the baseline does, and be recorded under a name that promises the least possible cost.
+    if policy is Policy.KNOWN_MAP and not config.revealed:
+        raise PotlpError("the policy known-map knows all from the start, and this robot does not: choose another")
     # Nothing is asked of the robot's map but its names and shape: the loop observes for itself.
     belief, cell = robot.observe()
     require_same_propositions(
         task.propositions, belief.propositions, asker=f"the task {task.text!r}", knower="the robot's map"
     )
-    config = TrialConfig() if config is None else config
     resolution = float(belief.resolution)
     here = Domain.of_robot(resolution) if world is None else Domain.of_world(world, config.camera)
     asked = rules.estimator_of(policy, task.propositions, here, estimator)
