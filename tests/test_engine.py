@@ -15,6 +15,7 @@ import distributed
 import pytest
 
 from eval.faults.kills import workers_of
+from potlp_jax.engine.cluster import DaskEngine
 from potlp_jax.engine.engine import MOST_KILLED, Broken, Engine, Here
 from potlp_jax.engine.opening import BATCH_SYSTEMS, open_engine
 from potlp_jax.engine.writer import only_writer
@@ -131,6 +132,33 @@ def test_what_a_unit_raises_is_raised_here(two):
     assert list(two.run(squares, 0, [3])) == [(3, [9, 10])]
 
 
+def test_what_a_unit_raises_is_told_once(capfd):
+    with open_engine(2) as engine, pytest.raises(WorldError):
+        list(engine.run(failing, None, [5]))
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def allowed_failures(dask_scheduler):
+    """How many workers may die of a unit."""
+    return dask_scheduler.allowed_failures
+
+
+def test_a_scheduler_is_left_as_it_was_and_asked_for_the_most_meanwhile(two):
+    before = two.client.run_on_scheduler(allowed_failures)
+    # Neither the default, nor what a run asks for.
+    assert before not in (MOST_KILLED - 2, 0)
+    first, second = (two.run(squares, 0, range(6)) for _ in range(2))
+    next(first)
+    next(second)
+    two.prepare("alone", 0, 1)
+    assert two.client.run_on_scheduler(allowed_failures) == MOST_KILLED - 2
+    for run in (first, second):
+        run.close()
+    assert two.client.run_on_scheduler(allowed_failures) == 0
+    two.restore("alone")
+    assert two.client.run_on_scheduler(allowed_failures) == before
+
+
 def test_a_unit_that_kills_its_workers_is_given_up_and_the_others_are_done(two, tmp_path):
     found = dict(two.run(deadly, tmp_path, range(6)))
     assert isinstance(found[3], Broken)
@@ -233,6 +261,55 @@ def test_a_batch_system_that_is_not_here_is_named(monkeypatch):
             open_engine(cluster=f"{name}:workers=1"),
         ):
             pass
+
+
+def test_jobs_have_no_limit_of_dask_and_options_as_they_were_given(monkeypatch):
+    jobqueue = pytest.importorskip("dask_jobqueue")
+    monkeypatch.setattr(shutil, "which", lambda program: f"/usr/bin/{program}")
+    made = []
+
+    class Kept(jobqueue.SLURMCluster):
+        def __init__(self, **options):
+            super().__init__(**options)
+            made.append(self)
+            raise OSError("enough")
+
+    monkeypatch.setattr(jobqueue, "SLURMCluster", Kept)
+    where = "slurm:job_extra_directives=--account=x,cores=4,processes=2,memory=2GB"
+    with pytest.raises(EngineError, match="enough"), open_engine(cluster=where):
+        pass
+    script = made[0].job_script()
+    made[0].close()
+    assert "#SBATCH --account=x\n" in script
+    assert "--cpus-per-task=4\n" in script
+    assert "--nworkers 2" in script
+    # Of two the last one counts.
+    assert script.rindex("--memory-limit 0") > script.index("--memory-limit 0.93GiB")
+    with pytest.raises(EngineError, match="cores: give a whole number of at least 1, found two"):
+        open_engine(cluster="slurm:cores=two").__enter__()
+
+
+def test_workers_that_were_begun_end_where_nobody_can_be_connected_to_them(monkeypatch):
+    closed = []
+
+    class Unreachable(distributed.deploy.cluster.Cluster):
+        def __init__(self):
+            """Nothing is begun."""
+            self._cluster_info = {"name": "unreachable"}
+
+        def __repr__(self):
+            return "Unreachable"
+
+        def close(self, timeout=None):
+            closed.append(self)
+
+    def refuse(*where, **options):
+        raise OSError("timed out")
+
+    monkeypatch.setattr(distributed, "Client", refuse)
+    with pytest.raises(EngineError, match="no Dask scheduler answers"):
+        DaskEngine(Unreachable())
+    assert len(closed) == 1
 
 
 def test_a_scheduler_that_does_not_answer_is_named(monkeypatch):

@@ -65,7 +65,8 @@ def cluster(workers: int) -> Iterator[tuple[str, Kept, list[Kept]]]:
     address = f"tcp://127.0.0.1:{port}"
     python = sys.executable, "-m"
     scheduler = Kept(*python, "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
-    command = (*python, "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard", "--no-nanny")
+    unlimited = "--nthreads", "1", "--memory-limit", "0"
+    command = (*python, "distributed.cli.dask_worker", address, *unlimited, "--no-dashboard", "--no-nanny")
     members = [Kept(*command) for _ in range(workers)]
     try:
         yield address, scheduler, members

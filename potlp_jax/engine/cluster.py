@@ -19,6 +19,7 @@ import signal
 import threading
 import time
 import uuid
+import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, cast
@@ -82,9 +83,14 @@ class DaskEngine:
         self._where, self._cores = where, cores
         self._known: frozenset[str] = frozenset()
         self._looked, self._missed = -math.inf, time.monotonic()
-        self.client = self._connected()
-        """Connected, as far as is known."""
-        self.look_after_workers()
+        try:
+            self.client = self._connected()
+            """Connected, as far as is known."""
+            self.look_after_workers()
+        except BaseException:
+            # Jobs and machines that were begun would go on with nobody to work for.
+            self._close_cluster()
+            raise
 
     @property
     def workers(self) -> int:
@@ -137,6 +143,9 @@ class DaskEngine:
         """End the workers that were begun here; those of a scheduler that was there stay."""
         with contextlib.suppress(Exception):
             self.client.close(timeout=_GRACE)
+        self._close_cluster()
+
+    def _close_cluster(self) -> None:
         if isinstance(self._where, Cluster):
             with contextlib.suppress(Exception):
                 self._where.close(timeout=_GRACE)
@@ -166,13 +175,18 @@ class DaskEngine:
                 scheduler.
             shared: what ``work`` is given beside each unit; picklable.
             deaths: how many workers may die of a unit: at the last of these it is given up. A setting of the scheduler,
-                for everybody who uses it.
+                for everybody who uses it, until ``restore``.
 
         Raises:
             OSError, TimeoutError, FutureCancelledError: the scheduler does not answer (``LOST``).
         """
-        self.client.run_on_scheduler(_give_up_after, deaths)
+        self.client.run_on_scheduler(_give_up_after, deaths, name)
         self.client.register_plugin(_Prepared(name, self._cores, shared))
+
+    def restore(self, name: str) -> None:
+        """Leave workers and scheduler as they were before ``prepare``."""
+        self.client.run_on_scheduler(_give_up_as_before, name)
+        self.client.unregister_worker_plugin(name)
 
     def look_after_workers(self) -> None:
         """Ask who is there, not too often, and say who is gone."""
@@ -198,7 +212,7 @@ class DaskEngine:
         except LOST as error:
             raise EngineError(
                 f"no Dask scheduler answers at {self._where} ({error}): start one with `dask scheduler`, and workers "
-                "with `dask worker --nthreads 1`"
+                "with `dask worker --nthreads 1 --memory-limit 0`"
             ) from error
 
 
@@ -241,7 +255,7 @@ class _Running:
         """Nobody waits for the rest."""
         with contextlib.suppress(Exception):
             self._engine.client.cancel(list(self._units), force=True)
-            self._engine.client.unregister_worker_plugin(self._name)
+            self._engine.restore(self._name)
         self._units.clear()
 
     def _fill(self, remaining: Iterator[Any], most: int) -> None:
@@ -304,9 +318,33 @@ def _done(work: Callable[[Any, Any], Iterable[Any]], name: str, unit: Any) -> li
     return list(work(prepared.shared, unit))
 
 
-def _give_up_after(deaths: int, dask_scheduler: Any) -> None:
+_ALLOWED: weakref.WeakKeyDictionary[Any, dict[str, int]] = weakref.WeakKeyDictionary()
+"""Of a scheduler, in its own process: the deaths that each run allows, and under ``_BEFORE`` those of before."""
+
+_BEFORE = ""
+
+
+def _give_up_after(deaths: int, name: str, dask_scheduler: Any) -> None:
+    allowed = _ALLOWED.setdefault(dask_scheduler, {_BEFORE: dask_scheduler.allowed_failures})
     # Dask counts those that are allowed.
-    dask_scheduler.allowed_failures = deaths - 1
+    allowed[name] = deaths - 1
+    _allow_most(dask_scheduler)
+
+
+def _give_up_as_before(name: str, dask_scheduler: Any) -> None:
+    # A scheduler that came back after it was lost has not been told.
+    if dask_scheduler in _ALLOWED:
+        _ALLOWED[dask_scheduler].pop(name, None)
+        _allow_most(dask_scheduler)
+
+
+def _allow_most(dask_scheduler: Any) -> None:
+    """The most that a run allows: of several that use a scheduler none gives a unit up before it is to."""
+    allowed = _ALLOWED[dask_scheduler]
+    runs = [number for name, number in allowed.items() if name != _BEFORE]
+    dask_scheduler.allowed_failures = max(runs, default=allowed[_BEFORE])
+    if not runs:
+        del _ALLOWED[dask_scheduler]
 
 
 def _addresses(dask_scheduler: Any) -> list[str]:
@@ -325,6 +363,8 @@ class _Prepared(distributed.WorkerPlugin):
 
     def setup(self, worker: Any) -> None:
         """Keep to one core, and to what was compiled before."""
+        # What a unit raises is raised again where its result is asked for, and told there.
+        logging.getLogger("distributed.worker").addFilter(_is_of_workers)
         # An interrupt from the terminal reaches all processes, and the one that asked for the work ends the others. A
         # worker that is a thread of that one has nothing to ignore.
         if threading.current_thread() is threading.main_thread():
@@ -333,3 +373,12 @@ class _Prepared(distributed.WorkerPlugin):
             # Before XLA starts, which then uses one thread.
             os.sched_setaffinity(0, {self._cores[worker.name % len(self._cores)]})
         enable_compilation_cache()
+
+    def teardown(self, worker: Any) -> None:
+        """Let the worker say again what it said before."""
+        logging.getLogger("distributed.worker").removeFilter(_is_of_workers)
+
+
+def _is_of_workers(record: logging.LogRecord) -> bool:
+    """Whether a worker says something else than that a unit raised an error, with its traceback."""
+    return not record.getMessage().startswith("Compute Failed")
