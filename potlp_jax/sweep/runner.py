@@ -265,10 +265,11 @@ def run_sweep(
         return
     with ending_when_asked(), only_writer(folder, StoreError):
         sweep = Sweep(specification, folder)
-        if retry_broken:
-            sweep.store.forget_broken()
         try:
             with open_engine(processes, cluster) as engine:
+                # Not before somebody is there to try them.
+                if retry_broken:
+                    sweep.store.forget_broken()
                 begun(engine)
                 sweep.run(engine, report)
         finally:

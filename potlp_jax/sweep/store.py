@@ -310,9 +310,9 @@ class Store:
 
     def _require_same(self, row: Row) -> None:
         """Raises StoreError where a trial was run twice with different results."""
-        (there,) = self._execute(f"SELECT {_COLUMNS} FROM trials WHERE {_THE_ITEM}", _key(row.item))
+        (there,) = self._checked_rows(f"WHERE {_THE_ITEM}", _key(row.item))
         # As SQLite gives it back, numbers of the same kind.
-        one, other = (_result(_row(entry)) for entry in (there, (*_key(row.item), *_values(row))))
+        one, other = (_result(found) for found in (there, _row((*_key(row.item), *_values(row)))))
         if one != other:
             names = ", ".join(differences(one, other))
             raise StoreError(
@@ -344,26 +344,35 @@ class Store:
 
     def rows(self, environment: str | None = None, task: str | None = None) -> list[Row]:
         """Finished trials of an environment and task (None: of all), ordered by environment, task, policy, world."""
-        found = self._execute(
-            f"SELECT {_COLUMNS}, checksum FROM trials "
+        return self._checked_rows(
             "WHERE environment = coalesce(?, environment) AND task = coalesce(?, task) "
             "ORDER BY environment, task, policy, world",
             (environment, task),
         )
-        for *values, checksum in found:
-            _, _, policy, world, *_ = values
-            self._check(checksum, f"the row of {policy} in world {world}", *values)
-        return [_row(entry[:-1]) for entry in found]
 
     def outer_rows(self, environment: str) -> list[Row]:
         """A row of the first and a row of the last world that have any."""
         return [
-            _row(entry)
+            row
             for order in ("ASC", "DESC")
-            for entry in self._execute(
-                f"SELECT {_COLUMNS} FROM trials WHERE environment = ? ORDER BY world {order} LIMIT 1", (environment,)
-            )
+            for row in self._checked_rows(f"WHERE environment = ? ORDER BY world {order} LIMIT 1", (environment,))
         ]
+
+    def _checked_rows(self, which: str, values: Sequence[Any]) -> list[Row]:
+        """Rows of trials, each compared with its checksum: the one way in which they are read.
+
+        Args:
+            which: the rest of the query, after the table's name.
+            values: of its question marks.
+
+        Raises:
+            StoreError: a row is not what was written.
+        """
+        found = self._execute(f"SELECT {_COLUMNS}, checksum FROM trials {which}", values)
+        for *stored, checksum in found:
+            _, _, policy, world, *_ = stored
+            self._check(checksum, f"the row of {policy} in world {world}", *stored)
+        return [_row(entry[:-1]) for entry in found]
 
     def count(self) -> int:
         """Finished trials."""
