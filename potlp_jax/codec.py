@@ -102,7 +102,7 @@ def settings_from_words(words: Sequence[str]) -> dict[str, Any]:
     """Nested settings from words such as ``camera.height=64``; values are written as in YAML.
 
     Raises:
-        ConfigurationError: a word has no ``=``, or its value is no YAML.
+        ConfigurationError: a word has no ``=``, its value is no YAML, or it sets what another one has set.
     """
     settings: dict[str, Any] = {}
     for word in words:
@@ -118,6 +118,8 @@ def settings_from_words(words: Sequence[str]) -> dict[str, Any]:
             inner = inner.setdefault(part, {})
             if not isinstance(inner, dict):
                 raise ConfigurationError(f"setting {word!r}: {part} has got a value already, so it holds no {name}")
+        if name in inner:
+            raise ConfigurationError(f"setting {word!r}: {name} is set already; give it once")
         try:
             inner[name] = parse_yaml(text)
         # Beside YAML's own errors: a date that does not exist, a number with 5,000 digits.

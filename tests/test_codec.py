@@ -149,6 +149,8 @@ def test_settings_are_read_from_words():
         (["=3"], "'=3': write name=value"),
         (["width=["], "no value as in YAML"),
         (["shape=3", "shape.radius=2"], "shape has got a value already"),
+        (["shape.radius=2", "shape={width: 3}"], "'shape={width: 3}': shape is set already; give it once"),
+        (["width=1", "width=2"], "'width=2': width is set already; give it once"),
     ],
 )
 def test_words_that_are_no_settings_are_named(words, message):
