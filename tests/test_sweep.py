@@ -527,6 +527,16 @@ def test_a_trial_that_kills_its_workers_is_found_listed_and_not_run_for_ever(fin
     assert _rows(tmp_path) == whole
 
 
+def test_what_was_given_up_stays_known_where_nobody_can_try_it_again(tmp_path):
+    store = Store(tmp_path / RESULTS)
+    store.agree({"specification": _specification().to_dict(), "estimator": None})
+    store.set_broken(ITEMS[0], "it died")
+    store.close()
+    with pytest.raises(EngineError, match="unknown"):
+        run_sweep(_specification(), tmp_path, cluster="mars", retry_broken=True)
+    assert Store(tmp_path / RESULTS, read_only=True).broken() == {ITEMS[0]: "it died"}
+
+
 def test_a_world_that_cannot_be_examined_ends_the_sweep(tmp_path, monkeypatch):
     class Dying(_Fragile):
         def run(self, work, shared, units):
@@ -571,6 +581,20 @@ def test_what_was_changed_in_a_store_is_not_taken_for_a_result(table, column, va
     with pytest.raises(StoreError, match=r"results\.sqlite: .* is damaged: its checksum .*another folder") as caught:
         read[table]()
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("column", "value"), [("outcome", "'stuck'"), ("versions", "'{\"jax'"), ("world_digest", "'other'")]
+)
+def test_a_changed_row_is_called_damaged_however_it_is_read(column, value, tmp_path):
+    store = Store(tmp_path / RESULTS)
+    store.finish([_row(ITEMS[0])])
+    store.close()
+    _flip(tmp_path / RESULTS, "trials", column, value)
+    changed = Store(tmp_path / RESULTS)
+    for read in (changed.rows, lambda: changed.outer_rows("toy"), lambda: changed.finish([_row(ITEMS[0])])):
+        with pytest.raises(StoreError, match="is damaged: its checksum"):
+            read()
 
 
 def test_bits_that_flip_in_the_file_end_in_one_line_or_change_nothing(tmp_path):
@@ -1066,6 +1090,20 @@ def test_parquet_without_its_library_fails_with_what_to_install(finished, tmp_pa
     told = _potlp("sweep", "export", finished, "--out", tmp_path / "a.parquet")
     assert told.exit_code == 1
     assert "pip install 'potlp-jax[train]', or write a .csv" in told.stderr
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.parquet"])
+def test_an_export_into_a_folder_that_is_not_there_is_named(finished, tmp_path, name):
+    told = _potlp("sweep", "export", finished, "--out", tmp_path / "gone" / name)
+    assert told.exit_code != 0
+    assert f"gone/{name}: No such file or directory" in told.stderr.replace("\n", "")
+
+
+def test_a_report_into_a_folder_that_is_not_there_is_named_before_trials_run_again(finished, tmp_path, monkeypatch):
+    monkeypatch.setattr(Sweep, "trial", lambda *_: pytest.fail("it runs a trial"))
+    told = _potlp("report", finished, "--out", tmp_path / "gone" / "page.html")
+    assert told.exit_code == 2
+    assert "there is no folder" in told.stderr
 
 
 def test_export_names_status_bits(tmp_path):

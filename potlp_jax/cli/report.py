@@ -52,6 +52,9 @@ def write_report(
     page = out or folder / PAGE
     if page.suffix != ".html":
         fail(f"--out {page}: give a name that ends in .html")
+    # Trials are run again before it is written.
+    if not page.parent.is_dir():
+        fail(f"--out {page}: there is no folder {page.parent}")
     # The sweep of the store itself, whatever the file that began it says by now.
     sweep = Sweep(specification_from_store(specification), folder, read_only=True)
     policies = list(sweep.specification.policies)
@@ -140,7 +143,7 @@ def _facts(facts: dict[str, Any], rows: "Sequence[Row]", given_up: Sequence[str]
             f"{specification['first_world']}",
         ),
         ("policies", ", ".join(specification["policies"])),
-        ("trials", f"{len(rows)}, {sum(row.seconds for row in rows) / 3600:.2f} hours of one core"),
+        ("trials", f"{len(rows)}, {sum(row.seconds for row in rows) / 3600:.2f} hours, added up"),
         *(("trial", line) for line in given_up),
         ("estimator", facts["estimator"] or "-"),
         ("settings", all_of([row.configuration for row in rows])),

@@ -360,4 +360,6 @@ def _write_parquet(rows: list[dict[str, Any]], file: Path) -> None:
     # CSV needs nothing; only the extra for training brings pyarrow.
     except ImportError:
         fail("Parquet files need pyarrow: pip install 'potlp-jax[train]', or write a .csv", FAILED)
-    pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows), file)
+    # Errors of files that pyarrow opens do not say which one.
+    with file.open("wb") as opened:
+        pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows), opened)
