@@ -184,6 +184,14 @@ def test_a_decision_is_replayed_from_its_record():
         replay_decision(trial, 9999)
 
 
+def test_a_record_of_a_task_without_positive_literals_is_read_again(tmp_path):
+    pytest.importorskip("spot")
+    task = Task.from_formula("F !hazard", Toy().propositions, 0)
+    trial = run_trial(Toy().world(0), task, Policy.BASELINE, jax.random.key(0))
+    trial.save(tmp_path / "trial.json")
+    assert load_trial(tmp_path / "trial.json").max_positive_literals == 0
+
+
 def test_a_decision_is_replayed_with_the_edges_that_were_left_out(tmp_path):
     world = Toy().world(0)
     whole, limited = (Task.from_formula("F goal & F hazard", world.propositions, limit) for limit in (None, 1))

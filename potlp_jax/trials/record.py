@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int32
 
-from potlp_jax.checks import COUNT
+from potlp_jax.checks import WHOLE
 from potlp_jax.codec import config_from_dict, finite_or_text
 from potlp_jax.errors import PotlpError, RecordError
 from potlp_jax.files import read_json, reading, short, write_whole
@@ -375,8 +375,8 @@ def _check(trial: Trial) -> None:
             raise ValueError(f"{name} is no text")
     if not (isinstance(trial.config, Mapping) and isinstance(trial.versions, Mapping)):
         raise ValueError("config and versions are no mappings")
-    if not (trial.max_positive_literals is None or COUNT.allows(trial.max_positive_literals)):
-        raise ValueError("max_positive_literals is no whole number of at least 1")
+    if not (trial.max_positive_literals is None or WHOLE.allows(trial.max_positive_literals)):
+        raise ValueError("max_positive_literals is no whole number from 0")
     if not all(type(number) is int and number >= 0 for number in (*trial.word, *trial.states)):
         raise ValueError("word and states are no numbers from 0")
     if not len(trial.path) == len(trial.word) == len(trial.states) > 0:
