@@ -17,7 +17,7 @@ from potlp_jax.export import ANY_BATCH, MANIFEST, ExportConfig, export_planner, 
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.planning.decision import frontier_subgoals
 from potlp_jax.planning.move import MoveKind
-from potlp_jax.planning.policies import Policy, decide_jit
+from potlp_jax.planning.policies import Policy, decide
 from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
@@ -147,7 +147,7 @@ def assert_equal_plan(outputs, plan):
 @pytest.mark.long
 def test_whole_decision_in_a_process_without_the_package(situation, exported, tmp_path):
     key = jax.random.key(7)
-    move = decide_jit(
+    move = jax.jit(decide, static_argnames=("policy", "config"))(
         situation.belief,
         situation.cell,
         situation.state,

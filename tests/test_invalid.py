@@ -17,7 +17,7 @@ from potlp_jax.errors import ProblemError
 from potlp_jax.native import libraries
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.move import Move, MoveKind
-from potlp_jax.planning.policies import decide_jit
+from potlp_jax.planning.policies import decide
 from potlp_jax.planning.problem import PlanningProblem, enumerate_actions, screen
 from potlp_jax.planning.search.api import plan_actions, search
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
@@ -265,7 +265,8 @@ def decided(belief: BeliefMap, cell: tuple[int, int], policy: str, state: int = 
     estimator = jax.tree_util.Partial(answering_half) if policy == "potlp" else None
     config = DecisionConfig(frontiers=FrontierConfig(max_subgoals=2), search=BestFirstConfig(simulations=20))
     arrays, key = task_of(TASK).arrays, jax.random.key(0)
-    return decide_jit(belief, jnp.array(cell), jnp.int32(state), arrays, estimator, key, policy=policy, config=config)
+    compiled = jax.jit(decide, static_argnames=("policy", "config"))
+    return compiled(belief, jnp.array(cell), jnp.int32(state), arrays, estimator, key, policy=policy, config=config)
 
 
 def answering_half(belief, subgoals, task):

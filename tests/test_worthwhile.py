@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import potlp_jax
-from potlp_jax.planning.decision import decide_from_estimates_jit, subgoals_at
+from potlp_jax.planning.decision import decide_from_estimates, subgoals_at
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.move import MoveKind
 from potlp_jax.planning.situation import DecisionConfig, worthwhile
@@ -52,6 +52,9 @@ def test_a_chance_that_is_none_is_still_reported_as_wrong():
     assert int(move.status) & int(Status.INVALID)
 
 
+_compiled = jax.jit(decide_from_estimates, static_argnames="config")
+
+
 def _hallway() -> BeliefMap:
     cells = np.full((3, 42), BeliefMap.OCCUPIED, np.int8)
     cells[1, 1:-1] = BeliefMap.FREE
@@ -67,7 +70,7 @@ def _decide(belief, subgoals, chances, least_chance):
     config = DecisionConfig(frontiers=FrontierConfig(max_subgoals=2), least_chance=least_chance)
     at, state = jnp.array([1, 3], jnp.int32), TASK.arrays.initial
     given = (belief, subgoals, estimates, TASK.arrays, at, state, jax.random.key(0))
-    return decide_from_estimates_jit(*given, config=config)
+    return _compiled(*given, config=config)
 
 
 @pytest.mark.parametrize(("least_chance", "chosen"), [(0.0, 2), (0.02, 2), (0.1, 40)])
@@ -102,9 +105,7 @@ def test_a_subgoal_that_is_barred_is_no_measure_of_others():
     given = subgoals_at(jnp.array([near, barred]), jnp.array([True, True]), *cells.shape)
     config = DecisionConfig(frontiers=FrontierConfig(max_subgoals=2), least_chance=0.5)
     at = jnp.array([1, 4], jnp.int32), task.arrays.initial
-    move = decide_from_estimates_jit(
-        belief, given, _estimates(chances), task.arrays, *at, jax.random.key(0), config=config
-    )
+    move = _compiled(belief, given, _estimates(chances), task.arrays, *at, jax.random.key(0), config=config)
     assert int(move.kind) == MoveKind.ACTION
     assert tuple(np.asarray(move.target_cell)) == near
 

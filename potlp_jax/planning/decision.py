@@ -11,7 +11,6 @@ column ``c`` of the estimates answers outcome class ``c`` of this task.
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int32, PRNGKeyArray
 
@@ -139,7 +138,3 @@ def decide_from_estimates(
     outside = status_if(jnp.any(subgoals.mask & ~is_in_map(subgoals.cells, belief)), Status.INVALID)
     situation = dataclasses.replace(situation, subgoals=given, status=situation.status | outside)
     return search_move(situation.with_status_of(estimates), estimates, key, config, intention)
-
-
-decide_from_estimates_jit = jax.jit(decide_from_estimates, static_argnames="config")
-"""``decide_from_estimates`` compiled: one compilation per configuration and array shapes."""

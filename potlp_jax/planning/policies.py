@@ -373,7 +373,3 @@ def _cut_before_unobserved(path: KnownPath, belief: BeliefMap) -> KnownPath:
     length = jnp.minimum(path.length, jnp.maximum(first_hidden - 1, 0))
     kept = jnp.minimum(index, length)
     return dataclasses.replace(path, cells=path.cells[kept], states=path.states[kept], length=length)
-
-
-decide_jit = jax.jit(decide, static_argnames=("policy", "config"))
-"""``decide`` compiled: one compilation per policy, configuration and array shapes."""

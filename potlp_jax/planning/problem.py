@@ -221,20 +221,6 @@ def enumerate_actions(problem: PlanningProblem) -> Bool[Array, "S E"]:
     return reachable & possible & real & ~task.accepting[state]
 
 
-def action_index(problem: PlanningProblem, subgoal: int, edge: int) -> int:
-    """Index of an action.
-
-    Args:
-      problem: its shapes alone matter.
-      subgoal: where it is attempted.
-      edge: the transition that it tries.
-
-    Returns:
-      ``s * E + e``.
-    """
-    return subgoal * problem.edge_count + edge
-
-
 def take_rows(values: Array, index: Int32[Array, "*N"]) -> Array:
     """``values[index]``; the first row for a negative index: a task has one class at least (``TaskSizes``)."""
     return values[jnp.maximum(index, 0)]

@@ -354,7 +354,9 @@ def _key(history: History, relevant: UInt32[Array, "B Z W"]) -> Int32[Array, "B 
     number = jnp.arange(holds.shape[1] * holds.shape[2], dtype=jnp.uint32).reshape(1, *holds.shape[1:])
     where = jnp.arange(history.visited.shape[1] * history.visited.shape[2], dtype=jnp.uint32)
     visited = mix(history.visited ^ mix(where.reshape(1, *history.visited.shape[1:]) + jnp.uint32(0x51ED270B)))
-    position = mix((history.location * 64 + history.state).astype(jnp.uint32) + jnp.uint32(0x2545F491))
+    # A number for each pair of location and state. 64 is what the twin in native code multiplies by.
+    states = max(64, relevant.shape[1])
+    position = mix((history.location * states + history.state).astype(jnp.uint32) + jnp.uint32(0x2545F491))
     words = []
     # Two words from the same parts with different salts, so that both must collide.
     for salt in (0x9E3779B9, 0xC2B2AE3D):
