@@ -37,9 +37,14 @@ def costs_of(file: Path) -> Costs:
     found: Costs = defaultdict(dict)
     with gzip.open(file, "rt", newline="") as lines:
         for row in csv.DictReader(lines):
-            if row["outcome"] == Outcome.SATISFIED and not status_of(row["status"].split()) & UNRELIABLE:
+            if row["outcome"] == Outcome.SATISFIED and not _status(row["status"]) & UNRELIABLE:
                 found[row["task"], int(row["world"])][row["policy"]] = float(row["cost"])
     return dict(found)
+
+
+def _status(text: str) -> int:
+    # Files of 0.1 hold the bits as a number.
+    return int(text) if text.isdecimal() else status_of(text.split())
 
 
 def changes(before: Costs, after: Costs) -> Iterator[tuple[str, int, int, int]]:

@@ -6,6 +6,7 @@ import gzip
 import pytest
 
 from eval.gains import changes, costs_of, gain, worlds_of_both
+from potlp_jax.types import Status
 
 
 def _table(file, potlp, outcome="satisfied", status=""):
@@ -42,6 +43,10 @@ def test_trials_without_success_and_those_that_were_cut_short_are_in_no_gain(tmp
     assert gain(tables[0], stuck, "F a")[0] == pytest.approx(14 / 20)
     cut_short = _table(tmp_path / "cut.csv.gz", (1, 16), status="tree_overflow")
     assert worlds_of_both(tables[0], cut_short, "F a") == worlds_of_both(*tables, "F b") == []
+    # 0.1 wrote the bits as a number.
+    numbered = _table(tmp_path / "numbers.csv.gz", (1, 16), status=int(Status.TREE_OVERFLOW))
+    assert worlds_of_both(tables[0], numbered, "F a") == []
+    assert worlds_of_both(tables[0], _table(tmp_path / "fine.csv.gz", (1, 16), status="0"), "F a")
     assert worlds_of_both(tables[0], _table(tmp_path / "grew.csv.gz", (1, 16), status="dead_end fallback"), "F a")
 
 
