@@ -368,6 +368,22 @@ def test_an_interrupted_sweep_says_that_it_goes_on(tmp_path, monkeypatch):
     assert "interrupted" not in _potlp("compare", "toy").stderr
 
 
+_ASKED_TO_END = """
+import atexit, time
+atexit.register(time.sleep, 300)
+from potlp_jax.cli import sweep
+from potlp_jax.sweep import runner
+def run_sweep(*_):
+    raise SystemExit(143)
+runner.run_sweep = run_sweep
+sweep.run_reported(None, None, 1)
+"""
+
+
+def test_a_sweep_that_was_asked_to_end_does_not_wait_at_the_end_of_the_interpreter():
+    assert subprocess.run([sys.executable, "-c", _ASKED_TO_END], timeout=60).returncode == 143
+
+
 def test_other_files_are_no_store(tmp_path):
     (tmp_path / "a").write_text("something else, and long enough to be looked at as a header of a file" * 20)
     with pytest.raises(StoreError, match="not a store"):

@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from typing import NoReturn
 
@@ -16,7 +17,7 @@ KEPT: str = "what is finished is kept: the same command goes on"
 
 # With the reading of the store and the end of the process that is less than two seconds.
 _GRACE: float = 1.0
-"""Seconds between asking a process to end and ending it."""
+"""Seconds between asking a process to end, or to tidy up at its end, and ending it."""
 
 
 @contextlib.contextmanager
@@ -45,6 +46,22 @@ def ending_when_asked() -> Iterator[None]:
         writer.close()
         thread.join()
         reader.close()
+
+
+def end_process_soon(code: int) -> None:
+    """End this process in a second, should it not have ended by then.
+
+    At the end of the interpreter Dask waits for processes that it was just beginning, for ten seconds and more.
+
+    Args:
+        code: its exit code.
+    """
+    threading.Thread(target=_end_after_grace, args=(code,), daemon=True).start()
+
+
+def _end_after_grace(code: int) -> NoReturn:
+    time.sleep(_GRACE)
+    os._exit(code)
 
 
 def _end(number: int, frame: object) -> NoReturn:
