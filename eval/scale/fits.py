@@ -164,6 +164,8 @@ def draw(runs: Sequence[Mapping[str, Any]], file: Path) -> None:
     # Beside the curves: they coincide, and a legend on one of them would hide all.
     for line in above.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5)).get_lines():
         line.set_linewidth(2)
+    # Figures of ours take texts literally, and matplotlib writes powers of ten as mathematics.
+    below.yaxis.set_major_formatter("{x:.0e}")
     below.set_ylabel(f"relative difference\nfrom {runs[0]['run']}")
     below.set_xlabel("steps")
     save_figure(figure, file)
