@@ -365,6 +365,7 @@ def test_the_explorer_sees_much_of_the_building_and_walks_through_known_cells(co
         ({"first_world": -4}, "numbered from 0"),
         ({"views_per_world": 0}, "views_per_world is 0; give at least 1"),
         ({"spacing": (9.0, 2.0)}, "give the least and the most"),
+        ({"spacing": (0.0, math.inf)}, "give the least and the most"),
         ({"seed": -1}, "seed is -1"),
         ({"staying_sets": 1}, "staying_sets is 1; give at least 2"),
         ({"image_format": "bmp"}, "image_format is 'bmp'; choose jpeg or png"),

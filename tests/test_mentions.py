@@ -32,7 +32,7 @@ OTHERS = {
     "git": {"--porcelain", "--error-unmatch"},
     "CSS": {"--faint"},
     "XLA": {"--xla"},
-    "dask": {"--nthreads", "--host", "--port", "--no-dashboard", "--no-nanny", "--death-timeout"},
+    "dask": {"--nthreads", "--host", "--port", "--no-dashboard", "--no-nanny", "--death-timeout", "--memory-limit"},
     "Slurm": {"--noheader", "--format", "--full", "--signal", "--user", "--ntasks", "--nodes", "--ntasks-per-node"},
 }
 """Options in our texts that are of others; those of the browser that draws pictures stand in one file of their own."""

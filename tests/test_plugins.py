@@ -3,6 +3,7 @@
 import sys
 from typing import ClassVar
 
+import jax.numpy as jnp
 import pytest
 
 from potlp_jax import plugins
@@ -19,7 +20,9 @@ from potlp_jax.sweep.store import Store
 from potlp_jax.trials.config import trial_config_for
 from potlp_jax.trials.replay import replay_decision
 from potlp_jax.trials.run import run
+from potlp_jax.world.camera import CameraConfig
 from potlp_jax.world.grid import world_digest, world_from_dict, world_to_dict
+from potlp_jax.world.renderer import render
 
 MODULE = """
 import jax.numpy as jnp
@@ -49,6 +52,9 @@ number = 3
 
 def forgets(situation, estimates, key, config, intention):
     nearest(situation, estimates, key, config, intention)
+
+def blind(world, cell, config):
+    pass
 
 class Unnamed(Toy):
     def __init__(self):
@@ -146,6 +152,8 @@ def test_what_others_forgot_is_named(elsewhere):
     empty = make("foreign_worlds:Empty")
     with pytest.raises(WorldError, match="the environment 'small' drew NoneType, expected a World"):
         empty.world(0)
+    with pytest.raises(PluginError, match=r"camera 'foreign_worlds:blind': its picture is NoneType\[\], must be uint8"):
+        render(Toy().world(0), jnp.array([1, 1]), CameraConfig(renderer="foreign_worlds:blind"))
     # In a dictionary a number is a number.
     assert empty.task("1").text == empty.task(1).text == "F goal"
 
