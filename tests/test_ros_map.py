@@ -130,6 +130,7 @@ def test_the_component_of_the_start_is_kept():
     ("resolution", "radius", "message"),
     [
         (0.5, 0.0, "resolution: 0.5 m a cell is finer than the map's 1.0 m a pixel"),
+        (1e9, 0.0, "resolution: 1000000000.0 m a cell is more than the map has"),
         (math.nan, 0.0, "resolution: nan is not a finite number of metres"),
         (1.0, -1.0, "radius: -1.0 is not a finite number of metres"),
         (1.0, math.inf, "radius: inf is not a finite number of metres"),

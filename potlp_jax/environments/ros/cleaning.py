@@ -123,7 +123,7 @@ def clean_map(
         The cells that can be reached, where they lie, and what was lost on the way.
 
     Raises:
-        MapError: the resolution is finer than the map's, nothing is left free, or the start lies outside or is blocked.
+        MapError: the resolution is finer than the map's, or a cell larger than the map, nothing is left free, or the start lies outside or is blocked.
 
     Warns:
         MapWarning: the cells that were chosen are larger than usual.
@@ -137,6 +137,9 @@ def clean_map(
     # Finer cells would invent detail that the map does not have.
     if ratio < 1:
         raise MapError(file, "resolution", f"{resolution} m a cell is finer than the map's {float(pixel)} m a pixel")
+    if ratio > max(image_map.free.shape):
+        rows, columns = (f"{float(count * pixel):g}" for count in image_map.free.shape)
+        raise MapError(file, "resolution", f"{resolution} m a cell is more than the map has, {rows} m by {columns} m")
     inflated = ~inflate(~image_map.free, grown / pixel)
     free = ~resample(~inflated, ratio)
     height, width = free.shape
