@@ -13,6 +13,7 @@ from potlp_jax.cli import app
 from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.splits import Split
 from potlp_jax.environments.toy import Toy
+from potlp_jax.errors import PropositionsError
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.search.config import BestFirstConfig
 from potlp_jax.planning.situation import DecisionConfig
@@ -510,6 +511,32 @@ def test_a_formula_is_what_a_record_is_for_if_its_automaton_is_that_of_the_formu
     assert formula_of(task_of_record(dataclasses.replace(trial, task_text="F c"), WORLD.propositions)) == FORMULA
     misnamed = dataclasses.replace(trial, task_text="F c", task_hoa=other)
     assert formula_of(task_of_record(misnamed, WORLD.propositions)) is None
+
+
+def test_propositions_of_an_automaton_are_those_of_the_world():
+    world = Toy().world(0)
+    named = Task.from_hoa(MAIL.replace("NAMED\n", 'name: "deliver the mail"\n'), tuple(reversed(world.propositions)))
+    with pytest.raises(PropositionsError, match="they differ in order"):
+        problems_of_path(world, [tuple(map(int, world.start))], 0.0, "stuck", named)
+
+
+@pytest.mark.parametrize(
+    ("text", "is_read"), [("~hazard U goal", True), ("F (goal xor hazard | goal)", True), ("F goal=1", False)]
+)
+def test_formulas_in_any_spelling_are_audited_and_what_is_not_read_is_said(tmp_path, text, is_read):
+    trial = run("toy", text, "baseline", 0)
+    assert trial.outcome is Outcome.SATISFIED
+    code, said = _command(trial, tmp_path)
+    assert (code, "the auditor does not read this formula" in said) == (0, not is_read)
+    code, said = _command(dataclasses.replace(trial, outcome=Outcome.STUCK), tmp_path)
+    assert (code, "is not what the word says" in said) == (1, True)
+    sweep, out = tmp_path / "sweep.yaml", tmp_path / "out"
+    sweep.write_text(json.dumps({"environments": ["toy"], "tasks": [text], "policies": ["baseline"], "worlds": 1}))
+    ran = CliRunner().invoke(app, ["sweep", str(sweep), "--out", str(out), "--processes", "1"])
+    assert ran.exit_code == 0, ran.output
+    audited = CliRunner().invoke(app, ["audit", str(out)])
+    assert (audited.exit_code, "2 trials, 0 problems" in audited.output) == (0, True), audited.output
+    assert ("the auditor does not read this formula" in audited.output) == (not is_read)
 
 
 def test_a_wrong_translation_is_judged_by_the_formula(trial, monkeypatch):

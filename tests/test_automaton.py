@@ -40,6 +40,16 @@ OWN_FORMULAS = [
     "F[2:4] a & X[2] b",
     "F[1:](a & !G[0..2] b)",
     "X[!]F[3,1] a | X[0] c",
+    # How strongly operators bind, and Spot's other spellings of them.
+    "F(a xor b | c)",
+    "F(a | b ^ c) & F b",
+    "F(a ^ b & c | b)",
+    "~a U b /\\ F c",
+    "◇(a ∧ ¬b) ∨ ○(b ⊕ c)",
+    "F(a --> b) * F c + F(a => b) ∩ X a",
+    "F(a <--> b) & (F(a ↔ c) ∪ b)",
+    "True U a & !FALSE & F(b → c)",
+    "()a \\/ !□b",
 ]
 
 

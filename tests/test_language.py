@@ -135,6 +135,12 @@ def test_languages_are_equal_here_exactly_where_they_are_to_spot(one, other):
             assert same_language(formula, candidate.dfa, SIGMA) == same(task, candidate), (task.text, candidate.text)
 
 
+@pytest.mark.parametrize("text", ["F(a xor b | a)", "F(a | b ^ a)", "F(a ^ b & a) | b", "F xOR & F a"])
+def test_operators_bind_as_in_spot(text):
+    task = Task.from_formula(text)
+    assert same_language(read_formula(text), task.dfa, task.propositions)
+
+
 @settings(max_examples=150, deadline=None)
 @given(FORMULAS)
 def test_what_spot_finds_not_co_safe_is_not_read(text):

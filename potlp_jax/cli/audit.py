@@ -1,5 +1,6 @@
 """``potlp audit``: trials judged against worlds that are made anew."""
 
+import contextlib
 import itertools
 import logging
 from collections import defaultdict
@@ -92,7 +93,6 @@ def _trial(path: Path) -> tuple[int, list[tuple[str, str]]]:
     from potlp_jax.environments.splits import Split
     from potlp_jax.trials.record import LOG_PREFIX, ROBOT_PREFIX, load_trial
     from potlp_jax.verify.audit import formula_of, problems_of, task_of_record
-    from potlp_jax.verify.semantics import can_be_judged
 
     file = record_file(path)
     trial = load_trial(file)
@@ -106,10 +106,26 @@ def _trial(path: Path) -> tuple[int, list[tuple[str, str]]]:
         fail(f"{file}: does not say from which environment, split and number its world is: {trial.environment!r}")
     generator = make(environment)
     task = task_of_record(trial, generator.propositions)
-    if formula_of(task) is None and can_be_judged(trial.task_text, generator.propositions):
-        logger.warning(
-            f"{file}: the task is called {trial.task_text!r}, and its automaton is not that of this formula: the trial "
-            "is judged by the automaton"
-        )
+    if formula_of(task) is None:
+        _tell_of_automaton(str(file), trial.task_text, generator.propositions)
     problems = problems_of(trial, task, generator.world(trial.world_number, Split(split)))
     return 1, [(str(file), problem) for problem in problems]
+
+
+def _tell_of_automaton(file: str, text: str, propositions: tuple[str, ...]) -> None:
+    """Warn where the automaton of a record decides although its name looks like, or is, a formula."""
+    from potlp_jax.errors import TaskError
+    from potlp_jax.task.formula import parse_formula
+    from potlp_jax.verify.audit import NOT_READ
+    from potlp_jax.verify.semantics import can_be_judged
+
+    if can_be_judged(text, propositions):
+        logger.warning(
+            f"{file}: the task is called {text!r}, and its automaton is not that of this formula: the trial is judged "
+            "by the automaton"
+        )
+        return
+    # A mere name of an automaton is no formula to Spot, either.
+    with contextlib.suppress(TaskError):
+        parse_formula(text, propositions)
+        logger.warning(f"{file}: task {text!r}: {NOT_READ}")

@@ -1,5 +1,6 @@
 """Check the rows of a sweep against worlds that are made anew, by rules that the planner does not share."""
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 
@@ -9,12 +10,14 @@ import numpy as np
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.errors import TaskWarning
 from potlp_jax.sweep.rows import read_path
 from potlp_jax.sweep.specification import Cell, Specification
 from potlp_jax.sweep.store import Row
 from potlp_jax.task.task import Task
 from potlp_jax.trials.rules import trial_key
-from potlp_jax.verify.audit import problems_of_ending, problems_of_path
+from potlp_jax.verify.audit import NOT_READ, problems_of_ending, problems_of_path
+from potlp_jax.verify.semantics import can_be_judged
 from potlp_jax.world.grid import World, world_digest
 
 
@@ -37,6 +40,9 @@ def audit_rows(
     Returns:
         Each row with one sentence for each of its problems, ordered by environment and world; rows without any are not
         among them. A sentence about a violation of the task begins with ``violates``.
+
+    Warns:
+        TaskWarning: a formula is not read here, so that its rows are judged by the automaton that Spot makes of it.
     """
     # Making a world takes longer than judging a trial in it: each is made once, for the trials of all policies.
     made: tuple[str, int] | None = None
@@ -51,9 +57,18 @@ def audit_rows(
         made = (environment, number)
         name = (environment, row.item.task)
         if name not in tasks:
-            automaton = automata.get(row.item.task)
-            tasks[name] = row.item.task if automaton is None else Task.from_hoa(automaton, generator.propositions)
+            tasks[name] = _task_of(row.item.task, automata.get(row.item.task), generator.propositions)
         yield from ((row, problem) for problem in problems_of_row(row, world, tasks[name], seed))
+
+
+def _task_of(text: str, automaton: str | None, propositions: tuple[str, ...]) -> str | Task:
+    """What the rows of a task are judged by: its formula, or an automaton."""
+    if automaton is not None:
+        return Task.from_hoa(automaton, propositions)
+    if can_be_judged(text, propositions):
+        return text
+    warnings.warn(f"task {text!r}: {NOT_READ}", TaskWarning, stacklevel=3)
+    return Task.from_formula(text, propositions)
 
 
 def audit_items(rows: Sequence[Row], specification: Specification) -> Iterator[tuple[Row, str]]:

@@ -120,9 +120,9 @@ def _tokens(text: str) -> list[str]:
         if match is None or len(tokens) == MAX_TOKENS:
             raise UnreadableError(text)
         kind, token = str(match.lastgroup), match.group(str(match.lastgroup))
-        if kind == "name" and token.lower() in ("true", "false", "xor"):
+        if kind == "name" and token.lower() in ("true", "false"):
             token = token.lower()
-        elif kind == "name":
+        elif kind == "name" and token != "xor":
             token = f'"{token}'
         elif kind == "quoted":
             token = '"' + re.sub(r"\\(.)", r"\1", token[1:-1])
@@ -147,8 +147,8 @@ def _release(f: Formula, g: Formula) -> Formula:
 _BINARY: dict[str, tuple[int, bool, Callable[[Formula, Formula], Formula]]] = {
     "->": (0, True, lambda f, g: ("or", _not(f), g)),
     "<->": (0, True, _iff),
-    "xor": (1, False, lambda f, g: _not(_iff(f, g))),
-    "|": (2, False, lambda f, g: ("or", f, g)),
+    "|": (1, False, lambda f, g: ("or", f, g)),
+    "xor": (2, False, lambda f, g: _not(_iff(f, g))),
     "&": (3, False, lambda f, g: ("and", f, g)),
     "U": (4, True, lambda f, g: ("U", f, g)),
     "M": (4, True, lambda f, g: ("U", g, ("and", f, g))),

@@ -23,7 +23,7 @@ _LIKE_A_NAME = re.compile(r"[FGX][A-Z_]*[A-EH-WY-Z][A-Z0-9_]+|[FGX][a-z][A-Za-z0
 
 _TOKEN = re.compile(r'\s*("(?:[^"\\]|\\.)*"|<->|<=>|->|=>|\[\]|<>|&&|\|\||[!&|^()]|[^\W\d][\w.]*|[01])')
 # How strongly operators bind; those of the strengths 0 and 4 associate to the right.
-_STRENGTH = {"->": 0, "=>": 0, "<->": 0, "<=>": 0, "xor": 1, "^": 1, "|": 2, "||": 2, "&": 3, "&&": 3}
+_STRENGTH = {"->": 0, "=>": 0, "<->": 0, "<=>": 0, "|": 1, "||": 1, "xor": 2, "^": 2, "&": 3, "&&": 3}
 _STRENGTH |= dict.fromkeys("URWM", 4)
 _SPELLINGS = {"<>": "F", "[]": "G"}
 _TO_THE_RIGHT = (0, 4)

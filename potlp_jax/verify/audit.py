@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Int32
 
 from potlp_jax.errors import TaskError, TaskWarning
+from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import Task
 from potlp_jax.trials.record import NEVER_SEEN, Outcome, Trial
 from potlp_jax.verify.semantics import can_be_judged, has_language_of, word_satisfies, word_violates
@@ -94,6 +95,10 @@ def problems_of_path(
 
     Returns:
         One sentence for each problem. One about a violation of the task begins with ``violates``.
+
+    Raises:
+        PropositionsError: a task that is judged by its automaton is not over the world's propositions.
+        TaskError: a text is no co-safe formula over the world's propositions.
     """
     cells = [(int(row), int(column)) for row, column in path]
     start = (int(world.start[0]), int(world.start[1]))
@@ -125,9 +130,16 @@ def _judged(task: str | Task, propositions: tuple[str, ...], word: Sequence[int]
     formula = formula_of(task) if isinstance(task, Task) else task
     if formula is None:
         assert isinstance(task, Task)
+        require_same_propositions(task.propositions, propositions)
         states = _states_of(task, word)
         return any(task.dfa.accepting[state] for state in states), bool(task.dfa.trap[states[-1]])
     return word_satisfies(formula, propositions, word), word_violates(formula, propositions, word)
+
+
+NOT_READ: str = (
+    "the auditor does not read this formula, as those of PSL; trials are judged by the automaton that Spot makes of it"
+)
+"""What is said of such a task."""
 
 
 # Tasks are compared by identity, and all trials of a sweep ask for the same few.
@@ -135,8 +147,9 @@ def _judged(task: str | Task, propositions: tuple[str, ...], word: Sequence[int]
 def formula_of(task: Task) -> str | None:
     """The formula by which a task is judged; None for an automaton of which its table alone says what is to be done.
 
-    A task that was made from a formula is judged by it, whatever its automaton. The name of an automaton may be
-    anything, also a formula of another language: it counts only where the languages are equal.
+    A task that was made from a formula is judged by it, whatever its automaton, but for operators of PSL, which are not
+    read here. The name of an automaton may be anything, also a formula of another language: it counts only where the
+    languages are equal.
     """
     if task.structure is not None:
         is_formula = can_be_judged(task.text, task.propositions)

@@ -4,11 +4,12 @@
 * ``word_satisfies`` and ``word_violates`` tell whether a finite word decides a co-safe formula, whatever follows.
 * ``has_language_of`` tells whether an automaton is one of a co-safe formula.
 
-Syntax: ``! & | -> <-> xor ^ X F G U R V W M true false 1 0 [] <>``, also ``&& || => <=>``, names, "quoted names" and
-parentheses; ``X[n]``, ``F[n:m]``, ``G[n:m]`` and, without an end, ``F[n:]`` and ``G[n:]`` (also ``..`` or ``,`` for the
-colon, ``$`` for no end, and ``!``, which changes nothing on infinite words). A word that begins with F, G or X is a
-name where it is a proposition, and what is left of it without these letters is none. ``U R V W M`` and ``->`` associate
-to the right and bind as in Spot: from weak to strong ``-> <->``, ``xor``, ``|``, ``&``, ``U R W M``, ``X F G !``.
+Syntax: ``! & | -> <-> xor X F G U R V W M true false 1 0``, with Spot's other spellings of them (``_SPELLINGS``),
+names, "quoted names" and parentheses; ``X[n]``, ``F[n:m]``, ``G[n:m]`` and, without an end, ``F[n:]`` and ``G[n:]``
+(also ``..`` or ``,`` for the colon, ``$`` for no end, and ``!``, which changes nothing on infinite words). A word that
+begins with F, G or X is a name where it is a proposition, and what is left of it without these letters is none. ``U R V
+W M`` and ``->`` associate to the right and bind as in Spot: from weak to strong ``-> <->``, ``|``, ``xor``, ``&``, ``U
+R W M``, ``X F G !``.
 
 A letter is an integer whose bit i is set where ``propositions[i]`` is true.
 
@@ -31,15 +32,26 @@ from potlp_jax.errors import TaskError
 Formula = tuple
 """Nested tuples: ("true",), ("false",), ("name", p), ("not", f), ("X", f), ("and", f, g), ("U", f, g), ..."""
 
-# Longer operators stand before their own beginnings, such as "<->" before "<>".
-_TOKEN = re.compile(
-    r'\s*("(?:[^"\\]|\\.)*"|<->|<=>|->|=>|\[\]|\[[^][]+\]|<>|&&|\|\||[!&|^()01]|[A-Za-z_][A-Za-z0-9_.]*)'
-)
+# Spot reads all of these spellings, and tasks are written for Spot.
+_SPELLINGS = {
+    "!": "~ ¬",
+    "&": "&& * /\\ ∧ ∩",
+    "|": "|| + \\/ ∨ ∪",
+    "xor": "^ ⊕",
+    "->": "=> --> → ⟶ ⇒ ⟹",
+    "<->": "<=> <--> ↔ ⇔",
+    "F": "<> ◇ ⋄ ♢",
+    "G": "[] □ ⬜ ◻",
+    "X": "() ○ ◯",
+    "R": "V",
+}
+_ALIASES = {alias: operator for operator, aliases in _SPELLINGS.items() for alias in aliases.split()}
+# Longer operators stand before their own beginnings, such as "<->" before "<>"; words are names or operators.
+_SIGNS = sorted((sign for sign in [*_ALIASES, "!", "&", "|", "->", "<->"] if not sign.isalpha()), key=len, reverse=True)
+_TOKEN = re.compile(r'\s*("(?:[^"\\]|\\.)*"|\[[^][]+\]|' + "|".join(map(re.escape, _SIGNS)) + r"|[()01]|[^\W\d][\w.]*)")
 # How often in "X[3]", from when to when in "F[2:5]"; "!" and "$" as in Spot.
 _COUNT = re.compile(r"\[\s*(\d*)\s*!?\s*\]")
 _BOUNDS = re.compile(r"\[\s*(\d*)\s*(?::|\.\.|,|to)\s*(\d*|\$)\s*!?\s*\]")
-# Spot reads all of these spellings, and tasks are written for Spot.
-_ALIASES = {"&&": "&", "||": "|", "=>": "->", "<=>": "<->", "[]": "G", "<>": "F", "^": "xor", "V": "R"}
 _CONSTANTS = {"1": ("true",), "true": ("true",), "0": ("false",), "false": ("false",)}
 
 
@@ -179,7 +191,7 @@ class _Parser:
             if match is None:
                 raise TaskError(f"formula {text!r}: cannot read {text[position:]!r}")
             token = match.group(1)
-            tokens += [token] if _is_whole_name(token, known) else _split_operators(token)
+            tokens += [token] if _is_whole_name(token, known) else _parts_of(token)
             position = match.end()
         self.tokens = [_ALIASES.get(token, token) for token in tokens] + [""]
 
@@ -193,23 +205,23 @@ class _Parser:
         return self.tokens.pop(0) if self.tokens[0] in texts else None
 
     def formula(self) -> Formula:
-        left = self.exclusive()
+        left = self.disjunction()
         # Recursion on the right-hand side alone makes an operator associate to the right.
         if operator := self.take("->", "<->"):
             return (operator, left, self.formula())
         return left
 
     # Operators of equal strength that associate to the left are a loop, not a recursion.
-    def exclusive(self) -> Formula:
-        left = self.disjunction()
-        while self.take("xor"):
-            left = ("xor", left, self.disjunction())
+    def disjunction(self) -> Formula:
+        left = self.exclusive()
+        while self.take("|"):
+            left = ("or", left, self.exclusive())
         return left
 
-    def disjunction(self) -> Formula:
+    def exclusive(self) -> Formula:
         left = self.conjunction()
-        while self.take("|"):
-            left = ("or", left, self.conjunction())
+        while self.take("xor"):
+            left = ("xor", left, self.conjunction())
         return left
 
     def conjunction(self) -> Formula:
@@ -235,7 +247,7 @@ class _Parser:
                 raise TaskError(f"formula {self.text!r}: ')' is missing before {self.tokens[0]!r}")
             return inner
         token = self.tokens.pop(0)
-        if not re.match(r'["A-Za-z_01]', token):
+        if not re.match(r'["01]|[^\W\d]', token):
             raise TaskError(f"formula {self.text!r}: expected a formula, found {token or 'its end'!r}")
         if token in _CONSTANTS:
             return _CONSTANTS[token]
@@ -275,11 +287,13 @@ def _is_whole_name(token: str, known: Sequence[str]) -> bool:
     return token in known and operand not in ("", token, *known)
 
 
-def _split_operators(token: str) -> list[str]:
-    """``XFa`` is X F a, as in Spot; names such as F1 or X2 are names."""
+def _parts_of(token: str) -> list[str]:
+    """``XFa`` is X F a, as in Spot; names such as F1 or X2 are names, and FALSE is a constant."""
+    if token.lower() in _CONSTANTS:
+        return [token.lower()]
     # A digit after the letter makes it a name, any other letter an operator in front of one.
-    if re.fullmatch(r"[FGX][A-Za-z_].*|[FGX]", token):
-        return [token[0], *(_split_operators(token[1:]) if len(token) > 1 else [])]
+    if re.fullmatch(r"[FGX][^\W\d].*|[FGX]", token):
+        return [token[0], *(_parts_of(token[1:]) if len(token) > 1 else [])]
     return [token]
 
 

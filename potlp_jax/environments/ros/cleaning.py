@@ -123,7 +123,8 @@ def clean_map(
         The cells that can be reached, where they lie, and what was lost on the way.
 
     Raises:
-        MapError: the resolution is finer than the map's, or a cell larger than the map, nothing is left free, or the start lies outside or is blocked.
+        MapError: the resolution is finer than the map's, a cell larger than the map, nothing is left free, or the start
+            lies outside or is blocked.
 
     Warns:
         MapWarning: the cells that were chosen are larger than usual.
