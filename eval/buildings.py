@@ -32,6 +32,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from eval.large_map import write_large_map
+from eval.limit.rows import append_row, read_rows
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.base import Generator, host_generators
 from potlp_jax.environments.campus.delivery import PARCELS_FAMILY, scaled_to
@@ -263,7 +264,7 @@ def main() -> None:
     if options.out is None:
         parser.error("--out is missing: the file of the rows")
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    rows = [json.loads(line) for line in options.out.read_text("utf-8").splitlines()] if options.out.exists() else []
+    rows = read_rows(options.out)
     done = {row["source"] for row in rows}
     for family, source in sources(options.data, options.most):
         if source in done:
@@ -271,8 +272,7 @@ def main() -> None:
         file = source if family == "generated" else str(options.data / source)
         row = {"family": family, "source": source, **in_own_process(file, options.worlds)}
         rows.append(row)
-        with options.out.open("a", encoding="utf-8") as out:
-            out.write(json.dumps(row) + "\n")
+        append_row(options.out, row)
         print(source, row.get("error", row.get("memory_mib")), flush=True)
     summary = report(rows)
     print(markdown(summary))

@@ -288,6 +288,10 @@ def _names(data: Any, location: Sequence[str | int]) -> Iterator[str]:
 def _hint_at(kind: Any, location: Sequence[str | int]) -> Any:
     """The type at a location; ``Any`` below a type that is neither a configuration nor a choice among several."""
     for part in location:
+        # An entry of a list: all have one type.
+        if isinstance(part, int):
+            kind = next(iter(typing.get_args(kind)), Any)
+            continue
         choices = typing.get_args(kind) if isinstance(kind, types.UnionType) else (kind,)
         classes = [choice for choice in choices if dataclasses.is_dataclass(choice)]
         # A member of a union has its name in the location, a field of a configuration its own.

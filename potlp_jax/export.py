@@ -48,6 +48,9 @@ from potlp_jax.world.grid import BeliefMap
 FORMAT: int = 2
 """Version of the folder's layout."""
 
+PROGRAMS: tuple[str, ...] = ("plan", "subgoals", "decide")
+"""Names of the programs that an export may have."""
+
 MANIFEST: str = "manifest.json"
 PLATFORMS: tuple[str, ...] = ("cpu", "cuda")
 ANY_BATCH: str = "any"
@@ -154,9 +157,10 @@ def export_planner(task: Task, folder: Path, config: ExportConfig = ExportConfig
         files.append(file)
         described = _describe_program(program, exported, file.name)
         functions[program.name] = {**described, "sha256": hashlib.sha256(contents).hexdigest()}
-    # Programs of an earlier export: the manifest of this one does not name them.
-    for earlier in set(folder.glob("*.jaxexport")).difference(files):
-        earlier.unlink()
+    # Programs of an earlier export: the manifest of this one does not name them. Other files are somebody's own.
+    for name in PROGRAMS:
+        if (earlier := folder / f"{name}.jaxexport") not in files:
+            earlier.unlink(missing_ok=True)
     automaton = folder / "task.hoa"
     automaton.write_text(task.to_hoa(), "utf-8")
     manifest = folder / MANIFEST

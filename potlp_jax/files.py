@@ -357,12 +357,13 @@ def whole_file(path: Path) -> Iterator[IO[bytes]]:
     Raises:
         OSError: it cannot be written.
     """
-    # A link stays one. A pipe or /dev/stdout is written to: a rename would put a file in its place.
-    path = path.resolve()
+    # A pipe or /dev/stdout is written to: a rename would put a file in its place.
     if path.exists() and not path.is_file():
         with path.open("wb") as file:
             yield file
         return
+    # A link stays one.
+    path = path.resolve()
     # With the process's number: two that write the same file do not write into one.
     temporary = path.with_name(f"{path.name}.{os.getpid()}{TEMPORARY}")
     try:

@@ -17,6 +17,7 @@ from potlp_jax.recipes.collection import CollectConfig
 from potlp_jax.recipes.fitting import ESTIMATOR, FitConfig
 from potlp_jax.sweep.runner import RESULTS
 from potlp_jax.sweep.store import Item, Row
+from potlp_jax.types import Status
 
 WHOLE = VARIANTS["whole"]
 
@@ -119,6 +120,23 @@ def test_shares_and_points_are_those_of_the_rows(finished):
     assert "| no-map | -30.0 (-30 to -30) |" in text
     assert "| whole | own | 10 | 0.750 | 0.900 | 0.010 | 0.50 | 0.25 |" in text
     assert f"{4 * 4 * 3 * 3} trials were audited: 0 problems" in text
+
+
+def test_trials_that_gave_up_or_were_cut_short_gain_nothing(finished, monkeypatch):
+    def read_rows(folder):
+        rows = rows_of(60.0 if folder.name == "whole" else 55.0)
+        # Cheap, because it gave up; and cheap, because the search had no memory left.
+        given_up = {"outcome": "stuck", "cost": 1.0} if folder.name == "no-map" else {}
+        spoilt = [
+            dataclasses.replace(row, **given_up) if (row.item.policy, row.item.world) == (POLICIES[-1], 7000) else row
+            for row in rows
+        ]
+        cut = int(Status.TREE_OVERFLOW) if folder.name == "no-map" else 0
+        return [dataclasses.replace(row, status=cut) if row.item.world == 7003 else row for row in spoilt]
+
+    monkeypatch.setattr(report, "read_rows", read_rows)
+    # The third world alone is left: 5 of 50 gained.
+    assert results_of(finished, ["own"])["variants"]["no-map"]["tasks"]["3"]["beside"] == pytest.approx([10.0] * 3)
 
 
 def test_a_second_fit_is_told_beside_the_first(finished):

@@ -45,6 +45,7 @@ class Polygon:
 @dataclasses.dataclass(frozen=True)
 class Drawing:
     shape: Circle | Polygon = Circle(2.0)
+    others: tuple[Circle, ...] = ()
     colour: Colour = Colour.RED
     width: int | None = None
     height: int | float = 1
@@ -75,7 +76,8 @@ def test_settings_of_another_kind_start_from_its_defaults():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"widht": 3}, "here: unknown field 'widht'; known: shape, colour, width, height, filled, limit"),
+        ({"widht": 3}, "here: unknown field 'widht'; known: shape, others, colour, width, height, filled, limit"),
+        ({"others": [{"radius": 1}, {"raduis": 2}]}, "here.others.1: unknown field 'raduis'; known: radius, kind"),
         ({"width": "3"}, 'here.width: give a whole number or null, found "3"'),
         ({"width": True}, "here.width: give a whole number or null, found true"),
         ({"width": 1.5}, "here.width: give a whole number or null, found 1.5"),

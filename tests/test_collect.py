@@ -449,3 +449,19 @@ def test_families_that_do_not_say_what_they_can_be_give_no_such_labels(tmp_path)
         collect(Contradicting(GENERATOR.config), "firefighting", Split.TRAINING, 2, tmp_path / "wrong", config)
     with pytest.raises(DatasetError, match="posterior is -1"):
         dataclasses.replace(CONFIG, posterior=-1)
+
+
+def test_drives_sense_and_choose_as_what_is_recorded(tmp_path, monkeypatch):
+    asked = []
+
+    def drives(world, tasks, policy, estimator, settings, key):
+        asked.append(settings)
+        return [Explorer(world, tasks, np.random.default_rng(0), CONFIG.explorer).poses() for _ in tasks]
+
+    monkeypatch.setattr("potlp_jax.recipes.collection.policy_drives", drives)
+    frontiers = dataclasses.replace(CONFIG.frontiers, min_size=1)
+    config = dataclasses.replace(CONFIG, driver="baseline", drives=1, frontiers=frontiers)
+    collect(GENERATOR, "firefighting", Split.TRAINING, 2, tmp_path, config)
+    settings, _ = asked
+    assert settings.sensor == CONFIG.explorer.sensor != SensorConfig()
+    assert settings.decision.frontiers == frontiers != CollectConfig().frontiers

@@ -220,8 +220,10 @@ def test_a_search_that_samples_takes_the_callers_key(situation, searches, tmp_pa
 
 def test_programs_of_an_earlier_export_do_not_stay(situation, tmp_path):
     (tmp_path / "decide.jaxexport").write_bytes(b"of another task")
+    (tmp_path / "network.jaxexport").write_bytes(b"of another library")
     export_planner(situation.task, tmp_path, ExportConfig(platforms=("cpu",)))
-    assert sorted(file.name for file in tmp_path.glob("*.jaxexport")) == ["plan.jaxexport"]
+    # Nor is what is somebody's own removed.
+    assert sorted(file.name for file in tmp_path.glob("*.jaxexport")) == ["network.jaxexport", "plan.jaxexport"]
 
 
 def test_any_batch_and_platforms_are_in_the_manifest(searches):

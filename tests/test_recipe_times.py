@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+from potlp_jax.errors import TrainingError
 from potlp_jax.recipes.times import TIMES, Times, read_times
 
 
@@ -28,6 +29,14 @@ def test_what_earlier_runs_spent_counts(tmp_path):
         pass
     assert read_times(file)[0, "training"] == pytest.approx(150, abs=5)
     assert read_times(file)[0, "fit"] == 7
+
+
+@pytest.mark.parametrize("contents", [b"0,fit\n", b"\x00" * 40, b"stage,step,seconds\n", b"\xff\xfe"])
+def test_times_that_are_damaged_are_named(tmp_path, contents):
+    file = tmp_path / TIMES
+    file.write_bytes(contents)
+    with pytest.raises(TrainingError, match=r"times\.csv"):
+        Times(file)
 
 
 def test_a_step_that_fails_took_its_time(tmp_path):

@@ -3,6 +3,8 @@
 import dataclasses
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -211,6 +213,11 @@ def test_a_decision_is_replayed_with_the_edges_that_were_left_out(tmp_path):
     (tmp_path / "trial.json").write_text(json.dumps({**data, "checksum": record_checksum(data)}))
     before = dataclasses.replace(read, max_positive_literals=None)
     assert load_trial(tmp_path / "trial.json").to_dict() == before.to_dict()
+
+
+def test_what_is_written_whole_may_go_into_a_pipe():
+    code = "from pathlib import Path; from potlp_jax.files import write_whole; write_whole(Path('/dev/stdout'), 'all')"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout == b"all"
 
 
 def test_a_record_that_cannot_be_written_leaves_the_one_before(tmp_path, monkeypatch):

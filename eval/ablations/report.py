@@ -18,7 +18,9 @@ from potlp_jax.planning.policies import Policy
 from potlp_jax.recipes.fitting import ESTIMATOR
 from potlp_jax.sweep.rows import provenance
 from potlp_jax.sweep.runner import RESULTS
+from potlp_jax.sweep.statistics import UNRELIABLE
 from potlp_jax.sweep.store import Row
+from potlp_jax.trials.record import Outcome
 from potlp_jax.view.style import new_figure, save_figure
 
 SHIPPED: str = "shipped"
@@ -88,7 +90,8 @@ def _beside(whole: Sequence[Row], other: Sequence[Row], task: str) -> list[float
 def _costs(rows: Sequence[Row], task: str) -> Costs:
     found: Costs = {}
     for row in rows:
-        if row.item.task == task:
+        # Of a trial that gave up, or was cut short, nobody knows what it would have cost.
+        if row.item.task == task and row.outcome == Outcome.SATISFIED and not row.status & UNRELIABLE:
             found.setdefault((task, row.item.world), {})[row.item.policy] = row.cost
     return {key: costs for key, costs in found.items() if len(costs) == len(POLICIES)}
 

@@ -137,7 +137,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("docs/results/planner") / "native.json")
     options = parser.parse_args()
     if not is_usable("search"):
-        raise SystemExit(f"the kernel is not used: {status()[0].reason}")
+        reason = next(library.reason for library in status() if library.name == "search")
+        raise SystemExit(f"the kernel is not used: {reason}")
     families = FAMILIES[:1] if options.quick else FAMILIES
     batches = (1, 16) if options.quick else (1, 16, 64, 256)
     rows = []

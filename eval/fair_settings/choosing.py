@@ -29,9 +29,9 @@ def compare(rows: Sequence[Row], possible: set[tuple[str, int]]) -> dict[str, An
         possible: tasks and worlds in which the known map suffices to satisfy the task.
 
     Returns:
-        JSON-able: ``settings``, by difference to the default; the ``default``; the ``best`` of those that have finished
-        what the default has; ``confirmed``: its figures in the worlds that did not choose it, None where it has not run
-        there; the one that is ``chosen``; the default's ``trials`` and ``worlds``.
+        JSON-able: ``settings``, by difference to the default; the ``default``; the ``best`` of those that have as many
+        trials as the default, none of which was cut short; ``confirmed``: its figures in the worlds that did not choose
+        it, None where it has not run there; the one that is ``chosen``; the default's ``trials`` and ``worlds``.
     """
     if len(estimators := {row["estimator"] for row in rows}) > 1:
         raise ConfigurationError(

@@ -63,7 +63,7 @@ def _tables(found: Mapping[str, Any], name: str) -> Iterator[str]:
             yield ""
             yield f"Tasks {', '.join(entry['tasks'])} in {compared['worlds']} worlds."
             if any(row["trials"] < compared["trials"] for row in compared["settings"]):
-                yield "A setting with fewer trials than the default is not finished, and cannot be chosen yet."
+                yield "A setting with fewer trials than the default is not finished, or had some cut short: not chosen."
             if policy in SEARCHING and entry["estimators"]:
                 yield f"Estimator: {', '.join(entry['estimators'])}."
             yield ""

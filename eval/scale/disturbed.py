@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import random
+import shutil
 import signal
 import socket
 import subprocess
@@ -116,7 +117,7 @@ def on_a_scheduler(out: Path, kills: Mapping[str, int], workers: int = 4, seed: 
     sweeps = 0
     with cluster(workers) as (address, scheduler, members):
         while left:
-            folder = out / f"disturbed-{sweeps}"
+            folder = _emptied(out / f"disturbed-{sweeps}")
             command = (*SWEEP_COMMAND, str(file), "--out", str(folder), "--cluster", address, "--json")
             driver = Kept(*command, log=out / "driver.log")
             try:
@@ -145,16 +146,18 @@ def on_a_batch_system(out: Path, where: str, kills: int, seed: int = 0) -> dict[
     file, whole = undisturbed(out)
     draw, left, sweeps = random.Random(seed), kills, 0
     while left:
-        folder = out / f"batch-{sweeps}"
+        folder = _emptied(out / f"batch-{sweeps}")
         command = [*SWEEP_COMMAND, str(file), "--out", str(folder), "--cluster", where, "--json"]
-        log = out / "driver.log"
+        log, others = out / "driver.log", _processes_with("distributed.cli.dask_worker")
         with log.open("a") as errors:
             driver = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors)
         since: dict[int, float] = {}
         while driver.poll() is None:
             time.sleep(draw.expovariate(1 / 2.0))
             now = time.monotonic()
-            since = {job: since.get(job, now) for job in _processes_with("distributed.cli.dask_worker")}
+            # Of this sweep alone: workers of others may be on the same machine.
+            workers = _processes_with("distributed.cli.dask_worker") - others
+            since = {job: since.get(job, now) for job in workers}
             settled = [job for job, began in since.items() if now - began > _SETTLED]
             if left and settled:
                 with contextlib.suppress(ProcessLookupError):
@@ -166,12 +169,18 @@ def on_a_batch_system(out: Path, where: str, kills: int, seed: int = 0) -> dict[
     return {"cluster": where, "kills": kills, "sweeps": sweeps, "rows": len(whole), "lost": 0, "different": 0}
 
 
-def _processes_with(words: str) -> list[int]:
-    found = []
+def _emptied(folder: Path) -> Path:
+    """A folder without a sweep of before, which would be found finished and be disturbed in nothing."""
+    shutil.rmtree(folder, ignore_errors=True)
+    return folder
+
+
+def _processes_with(words: str) -> set[int]:
+    found = set()
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):
             if words.encode() in path.read_bytes():
-                found.append(int(path.parent.name))
+                found.add(int(path.parent.name))
     return found
 
 

@@ -323,8 +323,12 @@ def _drives(
     if config.driver == "explorer":
         return [Explorer(world, pool[: config.pursued], rng, config.explorer).poses()], 1
     tasks, key = pool[: config.drives], jax.random.fold_in(jax.random.key(config.seed), index)
+    usual = trial_config_for(world)
+    # Maps and subgoals as they are recorded, also where a recipe names others than the family's.
     settings = dataclasses.replace(
-        trial_config_for(world),
+        usual,
+        sensor=config.explorer.sensor,
+        decision=dataclasses.replace(usual.decision, frontiers=config.frontiers),
         camera=config.camera,
         disturbance=config.disturbance,
         look_every=config.look_every,

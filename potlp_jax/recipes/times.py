@@ -7,6 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from potlp_jax.errors import TrainingError
+from potlp_jax.files import read_text, reading, write_whole
+
 TIMES: str = "times.csv"
 """In the folder of a recipe that is followed: the stage, its step, and how many seconds all runs spent on it."""
 
@@ -57,11 +60,8 @@ class Times:
 
     def _write(self) -> None:
         self._file.parent.mkdir(parents=True, exist_ok=True)
-        written = self._file.with_suffix(".tmp")
         lines = [f"{stage},{step},{seconds:.1f}\n" for (stage, step), seconds in self._spent.items()]
-        written.write_text("".join(lines), "utf-8")
-        # Who is killed here leaves the whole file of before.
-        written.replace(self._file)
+        write_whole(self._file, "".join(lines))
 
 
 def read_times(file: Path) -> dict[tuple[int, str], float]:
@@ -72,9 +72,13 @@ def read_times(file: Path) -> dict[tuple[int, str], float]:
 
     Returns:
         In the order in which the steps began.
+
+    Raises:
+        TrainingError: the file is damaged, or of something else.
     """
     found: dict[tuple[int, str], float] = {}
-    with file.open(newline="", encoding="utf-8") as lines:
+    lines = read_text(file, TrainingError).splitlines()
+    with reading(file, TrainingError, "the times of a recipe"):
         for stage, step, spent in csv.reader(lines):
             key = (int(stage), step)
             found[key] = found.get(key, 0.0) + float(spent)
