@@ -132,4 +132,13 @@ MUTANTS = (
         ("tests/test_resampling.py",),
         "painted_where",
     ),
+    Mutant(
+        PART,
+        "drives of a collection sense as trials do",
+        "potlp_jax/recipes/collection.py",
+        "        sensor=config.explorer.sensor,\n        decision",
+        "        decision",
+        ("tests/test_collect.py",),
+        "drives_sense",
+    ),
 )
