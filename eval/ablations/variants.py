@@ -4,8 +4,8 @@ import dataclasses
 
 FAMILY: str = "firefighting"
 
-_COMMON = ("views_per_world=5", "spacing=[10,120]", "staying_sets=3", "worlds_per_shard=20")
-_EXPLORER = (*_COMMON, "pursued=2", "look_every=0")
+_COMMON = ("spacing=[10,120]", "staying_sets=3", "worlds_per_shard=20")
+_EXPLORER = (*_COMMON, "views_per_world=5", "pursued=2", "look_every=0")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int32
 
-from potlp_jax.errors import TaskError, TaskWarning
-from potlp_jax.task.propositions import require_same_propositions
+from potlp_jax.errors import PropositionsError, TaskError, TaskWarning
 from potlp_jax.task.task import Task
 from potlp_jax.trials.record import NEVER_SEEN, Outcome, Trial
 from potlp_jax.verify.semantics import can_be_judged, has_language_of, word_satisfies, word_violates
@@ -130,7 +129,8 @@ def _judged(task: str | Task, propositions: tuple[str, ...], word: Sequence[int]
     formula = formula_of(task) if isinstance(task, Task) else task
     if formula is None:
         assert isinstance(task, Task)
-        require_same_propositions(task.propositions, propositions)
+        if task.propositions != propositions:
+            raise PropositionsError(f"the task is over {task.propositions}, the world over {propositions}")
         states = _states_of(task, word)
         return any(task.dfa.accepting[state] for state in states), bool(task.dfa.trap[states[-1]])
     return word_satisfies(formula, propositions, word), word_violates(formula, propositions, word)
