@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from eval.limit.rows import append_row, read_rows
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.errors import TaskError, TaskWarning
 from potlp_jax.planning.estimates import Estimates
@@ -277,7 +278,7 @@ def report(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _read(path: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in path.read_text("utf-8").splitlines()] if path.exists() else []
+    return [row for chunk in read_rows(path) for row in chunk]
 
 
 def main() -> None:
@@ -291,10 +292,8 @@ def main() -> None:
     done = 1 + max((row["pair"] for row in _read(arguments.out)), default=-1)
     for first in range(done, arguments.pairs, CHUNK):
         count = min(CHUNK, arguments.pairs - first)
-        rows = list(run_chunk(first, count))
-        # A chunk is written whole, so that what is in the file is complete.
-        with arguments.out.open("a", encoding="utf-8") as file:
-            file.writelines(json.dumps(row) + "\n" for row in rows)
+        # A chunk is one line, so that what a kill has cut off is run again as a whole.
+        append_row(arguments.out, list(run_chunk(first, count)))
         print(f"{first + count} pairs", flush=True)
     summary = report(_read(arguments.out))
     for entry in summary["policies"]:

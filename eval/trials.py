@@ -15,8 +15,6 @@ JSON lines that were packed with ``gzip``.
 
 import argparse
 import functools
-import gzip
-import json
 import multiprocessing
 import os
 import time
@@ -30,6 +28,7 @@ import jax
 import numpy as np
 
 from eval.formulas import random_tasks, traits
+from eval.limit.rows import append_row, read_rows
 from potlp_jax.cache import enable_compilation_cache
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.rooms import Rooms
@@ -175,23 +174,17 @@ def work(arguments: tuple[dict[str, Any], Path, dict[str, Any]]) -> None:
         rows = run_item(item, made_by)
     except Exception:
         rows = [{**item, "exception": traceback.format_exc(), "problems": ["exception"]}]
-    with (out / f"{item['suite']}.jsonl").open("a") as file:
-        file.write("".join(json.dumps(row) + "\n" for row in rows))
+    append_row(out / f"{item['suite']}.jsonl", rows)
 
 
 def rows_of(out: Path, suite: str) -> list[dict[str, Any]]:
     """Rows written so far; a line cut off by a kill is dropped, its item runs again."""
     path = out / f"{suite}.jsonl"
     packed = path.with_suffix(".jsonl.gz")  # as docs/results keeps them
-    text = path.read_text() if path.exists() else ""
-    if packed.exists():
-        text = gzip.decompress(packed.read_bytes()).decode() + text
-    rows = []
-    for line in text.splitlines():
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue
+    rows: list[dict[str, Any]] = []
+    # The rows of an item stand on one line; in files of before each has its own.
+    for found in (*read_rows(packed), *read_rows(path)):
+        rows += found if isinstance(found, list) else [found]
     return rows
 
 

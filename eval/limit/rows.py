@@ -2,7 +2,7 @@
 
 import gzip
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,8 @@ from potlp_jax.trials.record import Outcome
 ROWS = "trials.jsonl"
 
 
-def read_rows(file: Path) -> list[dict[str, Any]]:
-    """Rows written so far, packed or not; a line that was cut off by a kill is left out, and its trial runs again."""
+def read_rows(file: Path) -> list[Any]:
+    """What ``append_row`` has written so far, packed or not, without a line that a kill has cut off: it runs again."""
     if not file.exists():
         return []
     contents = gzip.decompress(file.read_bytes()) if file.suffix == ".gz" else file.read_bytes()
@@ -30,8 +30,8 @@ def charged(row: Mapping[str, Any]) -> float:
     return row["cost"] if row["outcome"] == Outcome.SATISFIED else row["budget"]
 
 
-def append_row(file: Path, row: Mapping[str, Any]) -> None:
-    """Write a row behind the others; makes the folder and the file where they are missing."""
+def append_row(file: Path, row: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> None:
+    """Write a row, or several that belong together, behind the others; makes folder and file where they lack."""
     file.parent.mkdir(parents=True, exist_ok=True)
     with file.open("a", encoding="utf-8") as stream:
         # A new line first: the last one may have been cut off by a kill.
