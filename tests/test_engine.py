@@ -147,16 +147,25 @@ def test_a_scheduler_is_left_as_it_was_and_asked_for_the_most_meanwhile(two):
     before = two.client.run_on_scheduler(allowed_failures)
     # Neither the default, nor what a run asks for.
     assert before not in (MOST_KILLED - 2, 0)
-    first, second = (two.run(squares, 0, range(6)) for _ in range(2))
-    next(first)
-    next(second)
-    two.prepare("alone", 0, 1)
-    assert two.client.run_on_scheduler(allowed_failures) == MOST_KILLED - 2
-    for run in (first, second):
-        run.close()
+    first, second = (contextlib.closing(two.run(squares, 0, range(6))) for _ in range(2))
+    with first as one, second as other:
+        next(one)
+        next(other)
+        two.prepare("alone", 0, 1)
+        assert two.client.run_on_scheduler(allowed_failures) == MOST_KILLED - 2
     assert two.client.run_on_scheduler(allowed_failures) == 0
     two.restore("alone")
     assert two.client.run_on_scheduler(allowed_failures) == before
+
+
+def test_a_run_that_outlives_its_engine_asks_nobody(monkeypatch):
+    with open_engine(2) as engine:
+        run = engine.run(squares, 0, range(6))
+        next(run)
+    # As where an error keeps it until after its engine is closed: who asked would wait.
+    for name in ("cancel", "run_on_scheduler"):
+        monkeypatch.setattr(engine.client, name, lambda *_, **__: pytest.fail("its scheduler is gone"))
+    run.close()
 
 
 def test_a_unit_that_kills_its_workers_is_given_up_and_the_others_are_done(two, tmp_path):

@@ -253,9 +253,11 @@ class _Running:
 
     def cancel(self) -> None:
         """Nobody waits for the rest."""
+        # One that was closed first, as where an error ends everything, would never answer.
         with contextlib.suppress(Exception):
-            self._engine.client.cancel(list(self._units), force=True)
-            self._engine.restore(self._name)
+            if self._engine.client.status != "closed":
+                self._engine.client.cancel(list(self._units), force=True)
+                self._engine.restore(self._name)
         self._units.clear()
 
     def _fill(self, remaining: Iterator[Any], most: int) -> None:
