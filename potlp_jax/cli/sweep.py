@@ -154,14 +154,16 @@ def run_reported(
         processes, cluster: where (``engine.opening.open_engine``).
         retry_broken: begin again the trials that were given up.
     """
-    from potlp_jax.sweep.ending import end_process_soon
+    from potlp_jax.sweep.ending import ENDED, end_process_soon
     from potlp_jax.sweep.runner import run_sweep
 
     reporter = _Reporter()
     try:
         run_sweep(specification, folder, processes, reporter.report, cluster, reporter.begun, retry_broken)
     except SystemExit as asked:
-        end_process_soon(int(asked.code or 0))
+        # A plug-in may exit, too, as it likes.
+        if asked.code == ENDED:
+            end_process_soon()
         raise
     finally:
         reporter.close()

@@ -12,6 +12,9 @@ from typing import NoReturn
 
 logger = logging.getLogger(__name__)
 
+ENDED: int = 128 + signal.SIGTERM
+"""What a shell reports of a process that the signal has ended."""
+
 KEPT: str = "what is finished is kept: the same command goes on"
 """What messages say about rows."""
 
@@ -48,30 +51,26 @@ def ending_when_asked() -> Iterator[None]:
         reader.close()
 
 
-def end_process_soon(code: int) -> None:
-    """End this process in a second, should it not have ended by then.
+def end_process_soon() -> None:
+    """End this process, which was asked to end, in a second, should it not have ended by then.
 
-    At the end of the interpreter Dask waits for processes that it was just beginning, for ten seconds and more.
-
-    Args:
-        code: its exit code.
+    At the end of the interpreter Dask waits for processes that it was just beginning, for many seconds.
     """
-    threading.Thread(target=_end_after_grace, args=(code,), daemon=True).start()
+    threading.Thread(target=_end_after_grace, daemon=True).start()
 
 
-def _end_after_grace(code: int) -> NoReturn:
+def _end_after_grace() -> NoReturn:
     time.sleep(_GRACE)
-    os._exit(code)
+    os._exit(ENDED)
 
 
 def _end(number: int, frame: object) -> NoReturn:
     logger.warning(f"ended by {signal.Signals(number).name}; {KEPT}")
-    # What a shell reports of a process that a signal has ended.
-    raise SystemExit(128 + number)
+    raise SystemExit(ENDED)
 
 
 def _end_late(reader: socket.socket, ended: threading.Event) -> None:
     """Wait for SIGTERM, and end the process if nothing else has a while after it. Ends when the other side closes."""
     while signals := reader.recv(1):
         if signals[0] == signal.SIGTERM and not ended.wait(_GRACE):
-            os._exit(128 + signal.SIGTERM)
+            os._exit(ENDED)
