@@ -141,9 +141,11 @@ def listing() -> str:
     for name, experiment in EXPERIMENTS.items():
         rows.append((name, experiment.page, str(experiment.minutes or "?"), experiment.command))
     names, pages = (max(len(row[column]) for row in rows) for column in (0, 1))
-    return "\n".join(
-        f"{name:{names}}  {page:{pages}}  {minutes:>7}  {command}" for name, page, minutes, command in rows
-    )
+    lines = [f"{name:{names}}  {page:{pages}}  {minutes:>7}  {command}" for name, page, minutes, command in rows]
+    known = [experiment.minutes for experiment in EXPERIMENTS.values() if experiment.minutes]
+    unknown = len(EXPERIMENTS) - len(known)
+    lines.append(f"Together {sum(known) / 60:.0f} hours, and {unknown} experiments that were not run in one go.")
+    return "\n".join(lines)
 
 
 def main() -> int:

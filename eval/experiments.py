@@ -151,16 +151,23 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="panorama",
         command="python -m eval.table1 --estimator firefighting-panorama --out {out} --processes {processes} "
         "--report docs/results/panorama/test",
+        minutes=32,
     ),
-    "panorama-export": Experiment(page="panorama", command="potlp sweep export {all}/panorama --out {out}/rows.csv"),
+    "panorama-export": Experiment(
+        page="panorama",
+        command="potlp sweep export {all}/panorama --out {out}/rows.csv",
+        minutes=1,
+    ),
     "panorama-rows": Experiment(
         page="panorama",
         command="python -m eval.compact_rows {all}/panorama-export/rows.csv docs/results/panorama/rows.csv.gz",
+        minutes=1,
     ),
     "held-out-panorama": Experiment(
         page="panorama",
         command="python -m eval.held_out docs/results/panorama/rows.csv.gz --estimator firefighting-panorama "
         "--out {out} --processes {processes} --report docs/results/panorama/held_out",
+        minutes=8,
     ),
     # The rows of all families go to one folder.
     "fair": Experiment(
@@ -198,6 +205,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="delivery",
         command="potlp collect delivery --split validation --worlds 40 --out {out} --set first_world=1600 "
         + _DELIVERED,
+        minutes=2,
     ),
     "own-office": Experiment(
         page="delivery",
@@ -208,7 +216,9 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="potlp collect floorplan:{data}/floorplans/school --split test --worlds 16 --out {out} " + _DELIVERED,
     ),
     "d-own": Experiment(
-        page="delivery", command="potlp estimator evaluate delivery {all}/own-delivery --ablate all --out {out}"
+        page="delivery",
+        command="potlp estimator evaluate delivery {all}/own-delivery --ablate all --out {out}",
+        minutes=2,
     ),
     "d-office": Experiment(page="delivery", command="potlp estimator evaluate delivery {all}/own-office --out {out}"),
     "d-school": Experiment(page="delivery", command="potlp estimator evaluate delivery {all}/own-school --out {out}"),
@@ -246,11 +256,13 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="delivery",
         command="python -m eval.limit.worst {all}/real-maps/gdc_3ne --out {out} --trials 10 "
         "--report docs/results/real_maps/gdc_worst",
+        minutes=1,
     ),
     "worst-uma": Experiment(
         page="delivery",
         command="python -m eval.limit.worst {all}/real-maps/uma_rooms --out {out} --trials 10 "
         "--report docs/results/real_maps/uma_worst",
+        minutes=1,
     ),
     "worst-intel": Experiment(
         page="delivery",
@@ -308,6 +320,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="trials",
         command="python -m eval.trials firefighting rooms maps revealed --processes {processes} --out {out}",
         variables=_OTHERS,
+        minutes=25,
     ),
     "live": Experiment(
         page="live",
@@ -318,19 +331,34 @@ EXPERIMENTS: dict[str, Experiment] = {
     "live-recorded": Experiment(
         page="live",
         command="python -m eval.live.recorded --out {out} --maps {data}/maps --report docs/results/live/recorded",
+        minutes=12,
     ),
-    "faults-files": Experiment(page="faults", command="python -m eval.faults files --cases 5000 --out {out}"),
+    "faults-files": Experiment(
+        page="faults",
+        command="python -m eval.faults files --cases 5000 --out {out}",
+        minutes=6,
+    ),
     "faults-texts": Experiment(page="faults", command="python -m eval.faults texts --cases 100000 --out {out}"),
-    "faults-formulas": Experiment(page="faults", command="python -m eval.faults formulas --cases 1000 --out {out}"),
+    "faults-formulas": Experiment(
+        page="faults",
+        command="python -m eval.faults formulas --cases 1000 --out {out}",
+        minutes=17,
+    ),
     "faults-kills": Experiment(page="faults", command="python -m eval.faults kills --cases 300 --out {out}"),
     "scale-overhead": Experiment(
-        page="scale", command="python -m eval.scale overhead --out {out} --report docs/results/scale/overhead"
+        page="scale",
+        command="python -m eval.scale overhead --out {out} --report docs/results/scale/overhead",
+        minutes=1,
     ),
     "scale-store": Experiment(
-        page="scale", command="python -m eval.scale store --out {out} --report docs/results/scale/store"
+        page="scale",
+        command="python -m eval.scale store --out {out} --report docs/results/scale/store",
+        minutes=1,
     ),
     "scale-kills": Experiment(
-        page="scale", command="python -m eval.scale kills --out {out} --report docs/results/scale/kills"
+        page="scale",
+        command="python -m eval.scale kills --out {out} --report docs/results/scale/kills",
+        minutes=8,
     ),
     "scale-fits": Experiment(
         page="scale", command="python -m eval.scale fits --out {out} --report docs/results/scale/fits"
@@ -345,11 +373,13 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="potlp collect firefighting --split training --worlds 10000 --out {out} --processes {processes} "
         "--set first_world=60000 --set spacing=[0,8] --set look_every=0 --set staying_sets=3 --set pursued=1 "
         "--set worlds_per_shard=50 --set views_per_world=4",
+        minutes=13,
     ),
     "scale-reading": Experiment(
         page="scale",
         command="python -m eval.scale reading --data {all}/collected --validation {all}/means --out {out} "
         "--report docs/results/scale/reading",
+        minutes=6,
     ),
     "mutants": Experiment(page="mutants", command="python -m eval.mutants --report docs/results/mutants"),
     # Those that measure times come last: nothing else of this list runs beside them.
@@ -360,18 +390,21 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="speed",
         command="python -m eval.bench.decision --worlds 2 --out docs/results/speed/after.json",
         one_core=True,
+        minutes=3,
     ),
     "decision-twins": Experiment(
         page="speed",
         command="python -m eval.bench.decision --worlds 2 --out docs/results/speed/before.json",
         one_core=True,
         variables={"POTLP_NATIVE": "0"},
+        minutes=6,
     ),
     "decision-estimators": Experiment(
         page="speed",
         command="python -m eval.bench.decision --worlds 2 --policies potlp --estimators firefighting-panorama "
         "firefighting --out docs/results/speed/estimators.json",
         one_core=True,
+        minutes=1,
     ),
     "distances": Experiment(
         page="planner",
@@ -382,7 +415,9 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     "native": Experiment(page="planner", command="python -m eval.bench.native", one_core=True, minutes=7),
     "ended": Experiment(
-        page="planner", command="python -m eval.bench.ended --instances 60 --simulations 500 --seconds 2 --out {out}"
+        page="planner",
+        command="python -m eval.bench.ended --instances 60 --simulations 500 --seconds 2 --out {out}",
+        minutes=1,
     ),
     "regret": Experiment(
         page="planner",
@@ -395,6 +430,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         command="python -m eval.bench.regret --planners best-first po-uct po-uct-numba po-uct-pomdp-py mctx --families "
         "find firefighting two three-single --subgoals 8 --instances 8 --seconds 2 --budgets 30 300 1000 --out {out}",
         one_core=True,
+        minutes=7,
     ),
     "optimism": Experiment(
         page="planner",
@@ -402,11 +438,13 @@ EXPERIMENTS: dict[str, Experiment] = {
         "--subgoals 4 8 --instances 8 --seconds 2 --budgets 30 300 1000 10000 --families find three-single "
         "three-joint two firefighting reuse random cubes shared rare extreme cheap dear clustered four --out {out}",
         one_core=True,
+        minutes=17,
     ),
     "throughput": Experiment(
         page="planner",
         command="python -m eval.bench.throughput --batches 1 64 --simulations 300 --repeats 3 --out {out}",
         one_core=True,
+        minutes=1,
     ),
 }
 """By the name that ``--only`` takes, in the order in which they run."""
