@@ -38,7 +38,7 @@ from potlp_jax.world.grid import World
 from potlp_jax.world.moves import length_of
 
 SLOTS: int = 8
-"""Trials that run at a time; what is best on a CPU (docs/sweeps.md)."""
+"""Trials that run at a time; what was best on a CPU."""
 
 
 @dataclasses.dataclass(frozen=True)

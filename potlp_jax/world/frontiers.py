@@ -64,8 +64,8 @@ class FrontierConfig:
     """How frontiers become subgoals.
 
     Attributes:
-        max_subgoals: length of the array of subgoals. Where there are more components the nearest stay, and the
-            overflow is flagged.
+        max_subgoals: length of the array of subgoals with which a trial begins (``most_subgoals``). Where an array does
+            not grow and there are more components, the nearest stay, and the overflow is flagged.
         min_size: components of fewer cells are dropped while larger ones remain. Keep it below the narrowest passage:
             a passage whose whole frontier is smaller would be forgotten while anything else remains.
         most_subgoals: where there are more components than ``max_subgoals`` a trial decides again with an array of

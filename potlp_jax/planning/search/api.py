@@ -39,7 +39,7 @@ def plan_actions(
 ) -> Plan:
     """Search one problem for the action of least expected cost.
 
-    Pure; jit with ``config`` static. ``jax.vmap`` over ``problem``, ``key`` or both runs the rows in lockstep. The
+    Pure; jit with ``config`` static. ``jax.vmap`` over ``problem``, ``key`` or both searches all rows in one call. The
     result depends, to the last bit, neither on padding nor on the size of the batch nor on its other rows. Ties go to
     the lowest index. A root without available action, or satisfied, is flagged in ``status``, and so is a problem with
     a value that is not allowed (``problem.screen``): nothing is chosen then. The exact solution (``planning.exact``)
