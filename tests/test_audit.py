@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import jax
 import numpy as np
@@ -537,6 +538,15 @@ def test_formulas_in_any_spelling_are_audited_and_what_is_not_read_is_said(tmp_p
     audited = CliRunner().invoke(app, ["audit", str(out)])
     assert (audited.exit_code, "2 trials, 0 problems" in audited.output) == (0, True), audited.output
     assert ("the auditor does not read this formula" in audited.output) == (not is_read)
+
+
+def test_an_automaton_that_is_not_that_of_a_formula_that_is_not_read_is_said(tmp_path):
+    trial = run("toy", "F goal=1", "baseline", 0)
+    other = Task.from_formula("F hazard | F goal", trial.propositions).to_hoa()
+    renamed = re.sub(r'name: ".*"', 'name: "F goal=1"', other)
+    _, said = _command(dataclasses.replace(trial, task_hoa=renamed), tmp_path)
+    assert "its automaton is not that of this formula" in said
+    assert "the auditor does not read" not in said
 
 
 def test_a_wrong_translation_is_judged_by_the_formula(trial, monkeypatch):

@@ -1,6 +1,7 @@
 """Engines: every unit is done once, wherever, whoever dies meanwhile; what kills its workers is given up."""
 
 import contextlib
+import logging
 import os
 import shutil
 import signal
@@ -10,12 +11,13 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import distributed
 import pytest
 
 from eval.faults.kills import workers_of
-from potlp_jax.engine.cluster import DaskEngine
+from potlp_jax.engine.cluster import DaskEngine, _give_up_after, _Prepared
 from potlp_jax.engine.engine import MOST_KILLED, Broken, Engine, Here
 from potlp_jax.engine.opening import BATCH_SYSTEMS, open_engine
 from potlp_jax.engine.writer import only_writer
@@ -158,6 +160,44 @@ def test_a_scheduler_is_left_as_it_was_and_asked_for_the_most_meanwhile(two):
     assert two.client.run_on_scheduler(allowed_failures) == before
 
 
+def test_what_a_killed_run_asked_of_a_scheduler_is_forgotten(two):
+    before = two.client.run_on_scheduler(allowed_failures)
+    killed = distributed.Client(two.client.scheduler.address, set_as_default=False)
+    killed.run_on_scheduler(_give_up_after, 7, "killed", killed.id)
+    assert two.client.run_on_scheduler(allowed_failures) == 6
+    # It is gone, and has not said that it is over.
+    killed.close()
+    two.prepare("next", 0, 1)
+    assert two.client.run_on_scheduler(allowed_failures) == 0
+    two.restore("next")
+    assert two.client.run_on_scheduler(allowed_failures) == before
+
+
+def test_a_run_that_ends_leaves_what_others_say_and_do_not_say(monkeypatch):
+    # What else a worker is told is nothing for this process.
+    monkeypatch.setattr("potlp_jax.engine.cluster.enable_compilation_cache", lambda: None)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    one, other = (_Prepared(name, (), None) for name in ("potlp-one", "potlp-other"))
+    logger = logging.getLogger("distributed.worker")
+    heard, before = [], list(logger.filters)
+    listener = logging.Handler()
+    listener.emit = lambda record: heard.append(record.getMessage().split()[-1])
+    logger.addHandler(listener)
+    try:
+        for prepared in (one, other):
+            prepared.setup(SimpleNamespace(name="worker"))
+        for key in ("potlp-one-3", "potlp-other-0", "somebody-else"):
+            logger.error("Compute Failed\nKey: %s", key)
+        one.teardown(None)
+        for key in ("potlp-one-3", "potlp-other-0", "somebody-else"):
+            logger.error("Compute Failed\nKey: %s", key)
+        other.teardown(None)
+    finally:
+        logger.removeHandler(listener)
+    assert heard == ["somebody-else", "potlp-one-3", "somebody-else"]
+    assert logger.filters == before
+
+
 def test_a_run_that_outlives_its_engine_asks_nobody(monkeypatch):
     with open_engine(2) as engine:
         run = engine.run(squares, 0, range(6))
@@ -284,7 +324,10 @@ def test_jobs_have_no_limit_of_dask_and_options_as_they_were_given(monkeypatch):
             raise OSError("enough")
 
     monkeypatch.setattr(jobqueue, "SLURMCluster", Kept)
-    where = "slurm:job_extra_directives=--account=x,cores=4,processes=2,memory=2GB"
+    where = (
+        "slurm:job_extra_directives=--account=x,cores=4,processes=2,memory=2GB,"
+        "worker_extra_args=--local-directory '/tmp/a b'"
+    )
     with pytest.raises(EngineError, match="enough"), open_engine(cluster=where):
         pass
     script = made[0].job_script()
@@ -292,6 +335,7 @@ def test_jobs_have_no_limit_of_dask_and_options_as_they_were_given(monkeypatch):
     assert "#SBATCH --account=x\n" in script
     assert "--cpus-per-task=4\n" in script
     assert "--nworkers 2" in script
+    assert "--local-directory '/tmp/a b'" in script
     # Of two the last one counts.
     assert script.rindex("--memory-limit 0") > script.index("--memory-limit 0.93GiB")
     with pytest.raises(EngineError, match="cores: give a whole number of at least 1, found two"):
@@ -319,6 +363,23 @@ def test_workers_that_were_begun_end_where_nobody_can_be_connected_to_them(monke
     with pytest.raises(EngineError, match="no Dask scheduler answers"):
         DaskEngine(Unreachable())
     assert len(closed) == 1
+
+
+def test_a_connection_is_closed_where_nobody_can_use_it(two, monkeypatch):
+    made = []
+
+    class Noted(distributed.Client):
+        def __init__(self, *words, **options):
+            made.append(self)
+            super().__init__(*words, **options)
+
+        def run_on_scheduler(self, *_, **__):
+            raise OSError("lost at once")
+
+    monkeypatch.setattr(distributed, "Client", Noted)
+    with pytest.raises(OSError, match="lost at once"):
+        DaskEngine(two.client.scheduler.address)
+    assert [client.status for client in made] == ["closed"]
 
 
 def test_a_scheduler_that_does_not_answer_is_named(monkeypatch):

@@ -486,6 +486,9 @@ def test_a_remark_that_cannot_be_had_costs_no_record():
 def test_no_robot_knows_the_map(policy):
     with pytest.raises(PotlpError, match="known-map knows all from the start, and this robot does not"):
         potlp_jax.run_robot(Rover(), TASK, policy, KEY)
+    # Nor one whose settings are of a simulation that shows all.
+    with pytest.raises(PotlpError, match="known-map knows all from the start, and this robot does not"):
+        potlp_jax.run_robot(Rover(), TASK, policy, KEY, TrialConfig(revealed=True))
 
 
 def test_a_listener_that_fails_leaves_the_record():

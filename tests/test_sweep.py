@@ -43,6 +43,7 @@ from potlp_jax.errors import (
     WorldError,
 )
 from potlp_jax.planning.policies import Policy
+from potlp_jax.sweep.ending import ENDED, KEPT, ending_when_asked
 from potlp_jax.sweep.results import charged_cost, pair_rows, read_results, remarks_on_worlds, world_of
 from potlp_jax.sweep.rows import path_text, read_path, source_commit
 from potlp_jax.sweep.runner import RESULTS, Progress, Sweep, run_sweep
@@ -368,20 +369,51 @@ def test_an_interrupted_sweep_says_that_it_goes_on(tmp_path, monkeypatch):
     assert "interrupted" not in _potlp("compare", "toy").stderr
 
 
-_ASKED_TO_END = """
-import atexit, time
-atexit.register(time.sleep, 300)
+def test_a_sweep_that_is_asked_to_end_says_that_it_goes_on_where_its_folder_stays(tmp_path, monkeypatch):
+    def run_sweep(*arguments):
+        with ending_when_asked(arguments[-1]):
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(10)
+
+    monkeypatch.setattr("potlp_jax.sweep.runner.run_sweep", run_sweep)
+    # Here the interpreter stays.
+    monkeypatch.setattr("potlp_jax.sweep.ending.end_process_soon", lambda: None)
+    told = _potlp("compare", "toy", "--out", tmp_path / "compared")
+    assert told.exit_code == ENDED
+    assert f"ended by SIGTERM; {KEPT}" in " ".join(told.stderr.split())
+    told = _potlp("compare", "toy")
+    assert "ended by SIGTERM" in told.stderr
+    assert KEPT not in " ".join(told.stderr.split())
+
+
+_EXITS = """
+import atexit, sys, time
+atexit.register(lambda: (time.sleep({seconds}), print("tidied up")))
 from potlp_jax.cli import sweep
 from potlp_jax.sweep import runner
 def run_sweep(*_):
-    raise SystemExit(143)
+    raise SystemExit({code})
 runner.run_sweep = run_sweep
 sweep.run_reported(None, None, 1)
 """
 
 
+def _ended(code, seconds):
+    """A sweep that exits with this code, in an interpreter that then takes a while to end."""
+    words = [sys.executable, "-c", _EXITS.format(code=code, seconds=seconds)]
+    return subprocess.run(words, timeout=60, check=False, capture_output=True, text=True)
+
+
 def test_a_sweep_that_was_asked_to_end_does_not_wait_at_the_end_of_the_interpreter():
-    assert subprocess.run([sys.executable, "-c", _ASKED_TO_END], timeout=60).returncode == 143
+    assert _ended(ENDED, seconds=300).returncode == ENDED
+
+
+@pytest.mark.parametrize(("code", "returned"), [("5", 5), ("'no more worlds'", 1)])
+def test_a_plug_in_that_exits_by_itself_ends_as_it_likes(code, returned):
+    # Longer than a sweep that was asked to end may take.
+    ended = _ended(code, seconds=2)
+    assert ended.returncode == returned
+    assert "tidied up" in ended.stdout
 
 
 def test_other_files_are_no_store(tmp_path):
@@ -761,7 +793,7 @@ def test_after_sigterm_the_command_ends_with_its_workers_and_says_so(command):
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 128 + signal.SIGTERM
-    assert "ended by SIGTERM; what is finished is kept" in errors
+    assert f"ended by SIGTERM; {KEPT}" in errors
     assert all(process_start(worker) != start for worker, start in zip(workers, starts, strict=True))
 
 

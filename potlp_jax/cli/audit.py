@@ -1,18 +1,20 @@
 """``potlp audit``: trials judged against worlds that are made anew."""
 
-import contextlib
 import itertools
 import logging
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from potlp_jax.cli.group import Command, command_app
 from potlp_jax.cli.options import Json
 from potlp_jax.cli.output import FAILED, console, fail, print_json, progress_bar
+
+if TYPE_CHECKING:
+    from potlp_jax.task.task import Task
 
 logger = logging.getLogger(__name__)
 
@@ -107,25 +109,29 @@ def _trial(path: Path) -> tuple[int, list[tuple[str, str]]]:
     generator = make(environment)
     task = task_of_record(trial, generator.propositions)
     if formula_of(task) is None:
-        _tell_of_automaton(str(file), trial.task_text, generator.propositions)
+        _tell_of_automaton(str(file), task)
     problems = problems_of(trial, task, generator.world(trial.world_number, Split(split)))
     return 1, [(str(file), problem) for problem in problems]
 
 
-def _tell_of_automaton(file: str, text: str, propositions: tuple[str, ...]) -> None:
+def _tell_of_automaton(file: str, task: "Task") -> None:
     """Warn where the automaton of a record decides although its name looks like, or is, a formula."""
     from potlp_jax.errors import TaskError
-    from potlp_jax.task.formula import parse_formula
-    from potlp_jax.verify.audit import NOT_READ
+    from potlp_jax.task.task import Task
+    from potlp_jax.verify.audit import NOT_READ, has_table_of
     from potlp_jax.verify.semantics import can_be_judged
 
-    if can_be_judged(text, propositions):
+    its_own = True
+    if not can_be_judged(task.text, task.propositions):
+        try:
+            its_own = not has_table_of(Task.from_formula(task.text, task.propositions), task)
+        except TaskError:
+            # A mere name of an automaton is no formula to Spot, either.
+            return
+    if its_own:
         logger.warning(
-            f"{file}: the task is called {text!r}, and its automaton is not that of this formula: the trial is judged "
-            "by the automaton"
+            f"{file}: the task is called {task.text!r}, and its automaton is not that of this formula: the trial is "
+            "judged by the automaton"
         )
-        return
-    # A mere name of an automaton is no formula to Spot, either.
-    with contextlib.suppress(TaskError):
-        parse_formula(text, propositions)
-        logger.warning(f"{file}: task {text!r}: {NOT_READ}")
+    else:
+        logger.warning(f"{file}: task {task.text!r}: {NOT_READ}")

@@ -23,7 +23,7 @@ from potlp_jax.cli.options import (
     WorldNumber,
 )
 from potlp_jax.cli.output import console, fail, file_console, make_folder, print_json, print_next, to_json
-from potlp_jax.cli.sweep import print_cell, run_reported, told_when_interrupted
+from potlp_jax.cli.sweep import print_cell, run_reported
 
 if TYPE_CHECKING:
     from potlp_jax.environments.base import Generator
@@ -108,14 +108,13 @@ def compare_policies(
     specification = specification_from_dict(entries, "compare")
     warn_of_sweep(specification)
     if out is not None:
-        with told_when_interrupted():
-            results = _run(specification, make_folder(out), processes)
+        results = _run(specification, make_folder(out), processes, kept=True)
         files = _write(results, out)
     # Without a folder the store is needed only until the results are read from it.
     else:
         files = []
         with tempfile.TemporaryDirectory(prefix="potlp-compare-") as folder:
-            results = _run(specification, Path(folder), processes)
+            results = _run(specification, Path(folder), processes, kept=False)
     # The document of `potlp sweep show --json`: one way to read the results of both.
     if json:
         print_json(results.to_dict())
@@ -140,11 +139,11 @@ def _default_policy(
     return default_policy_with_note(made, trial_config(changes, generator), read_estimator(estimator)).value
 
 
-def _run(specification: "Specification", folder: Path, processes: int) -> "Results":
+def _run(specification: "Specification", folder: Path, processes: int, kept: bool) -> "Results":
     from potlp_jax.cli.inputs import open_store
     from potlp_jax.sweep.results import read_results
 
-    run_reported(specification, folder, processes)
+    run_reported(specification, folder, processes, kept=kept)
     with open_store(folder) as store:
         return read_results(store)
 

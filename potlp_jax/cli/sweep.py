@@ -5,8 +5,6 @@ import dataclasses
 import json as json_module
 import logging
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -93,8 +91,7 @@ def run(
     if specification.split is Split.TEST:
         warn_of_test_worlds()
     warn_of_sweep(specification)
-    with told_when_interrupted():
-        run_reported(specification, make_folder(out), processes, cluster, retry_broken)
+    run_reported(specification, make_folder(out), processes, cluster, retry_broken)
     # From the store, so that a sweep shows the same tables whether it has just ended or is shown again.
     show(out, json)
 
@@ -145,6 +142,7 @@ def run_reported(
     processes: int | None,
     cluster: str | None = None,
     retry_broken: bool = False,
+    kept: bool = True,
 ) -> None:
     """Run what is missing of a sweep, with progress on stderr.
 
@@ -153,13 +151,18 @@ def run_reported(
         folder: of the store.
         processes, cluster: where (``engine.opening.open_engine``).
         retry_broken: begin again the trials that were given up.
+        kept: whether the folder stays where the sweep is interrupted, or asked to end: it is said that it can go on.
     """
-    from potlp_jax.sweep.ending import ENDED, end_process_soon
+    from potlp_jax.sweep.ending import ENDED, KEPT, end_process_soon
     from potlp_jax.sweep.runner import run_sweep
 
     reporter = _Reporter()
     try:
-        run_sweep(specification, folder, processes, reporter.report, cluster, reporter.begun, retry_broken)
+        run_sweep(specification, folder, processes, reporter.report, cluster, reporter.begun, retry_broken, kept)
+    except KeyboardInterrupt:
+        if kept:
+            logger.warning(f"interrupted; {KEPT}")
+        raise
     except SystemExit as asked:
         # A plug-in may exit, too, as it likes.
         if asked.code == ENDED:
@@ -167,18 +170,6 @@ def run_reported(
         raise
     finally:
         reporter.close()
-
-
-@contextmanager
-def told_when_interrupted() -> Iterator[None]:
-    """Say at Ctrl-C that a sweep whose folder stays can go on."""
-    from potlp_jax.sweep.ending import KEPT
-
-    try:
-        yield
-    except KeyboardInterrupt:
-        logger.warning(f"interrupted; {KEPT}")
-        raise
 
 
 class _Reporter:

@@ -41,8 +41,8 @@ class RosbridgeLink:
         try:
             self._ros.run(timeout=CONNECT_SECONDS)
         except Exception as error:
-            # Otherwise it would go on trying, and connect later.
-            self._ros.close()
+            # It goes on trying, and has no way to stop before it is connected: when it is, it closes.
+            self._ros.on_ready(self._ros.close)
             raise RobotError(
                 f"nobody answers at {host}:{port}: start rosbridge on the robot (ros2 launch rosbridge_server "
                 "rosbridge_websocket_launch.xml), and look at address and firewall"

@@ -9,6 +9,7 @@ References:
 """
 
 import contextlib
+import dataclasses
 import importlib.util
 import itertools
 import logging
@@ -22,7 +23,7 @@ import uuid
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import distributed
 from distributed.client import FutureCancelledError
@@ -83,14 +84,15 @@ class DaskEngine:
         self._where, self._cores = where, cores
         self._known: frozenset[str] = frozenset()
         self._looked, self._missed = -math.inf, time.monotonic()
-        try:
+        with contextlib.ExitStack() as begun:
+            # Otherwise jobs and machines would go on with nobody to work for,
+            begun.callback(self._close_cluster)
             self.client = self._connected()
             """Connected, as far as is known."""
+            # and a connection with nobody to use it.
+            begun.callback(self.close)
             self.look_after_workers()
-        except BaseException:
-            # Jobs and machines that were begun would go on with nobody to work for.
-            self._close_cluster()
-            raise
+            begun.pop_all()
 
     @property
     def workers(self) -> int:
@@ -110,7 +112,8 @@ class DaskEngine:
 
         Args:
             work: a function of a module that workers can import; pure, because a unit whose worker or scheduler is lost
-                begins again. It is given up when ``MOST_KILLED`` workers have died of it.
+                begins again. It is given up when ``MOST_KILLED`` workers have died of it; when more have, where others
+                use the same scheduler and allow more meanwhile.
             shared: picklable; goes to each worker once, also to those that join later.
             units: picklable; asked for one by one, so that each worker has one in hand and one to go on with.
 
@@ -124,18 +127,19 @@ class DaskEngine:
             EngineError: a scheduler that was lost has not come back within five minutes.
         """
         running = _Running(self, work, shared)
-        suspects: list[Unit] = []
+        suspects: list[tuple[Unit, _Killed]] = []
         try:
             # Of a worker that dies, what it did and what it was to do next are not told apart. So the second death only
             # casts suspicion,
             for unit, found in running.through(iter(units), together=True):
-                if isinstance(found, Broken):
-                    suspects.append(unit)
+                if isinstance(found, _Killed):
+                    suspects.append((unit, found))
                 else:
                     yield unit, found
             # and the third, alone, decides.
-            for unit in suspects:
-                yield from running.through(iter([unit]), together=False)
+            for suspect, before in suspects:
+                for unit, found in running.through(iter([suspect]), together=False):
+                    yield unit, found.together_with(before) if isinstance(found, _Killed) else found
         finally:
             running.cancel()
 
@@ -180,7 +184,7 @@ class DaskEngine:
         Raises:
             OSError, TimeoutError, FutureCancelledError: the scheduler does not answer (``LOST``).
         """
-        self.client.run_on_scheduler(_give_up_after, deaths, name)
+        self.client.run_on_scheduler(_give_up_after, deaths, name, self.client.id)
         self.client.register_plugin(_Prepared(name, self._cores, shared))
 
     def restore(self, name: str) -> None:
@@ -216,6 +220,17 @@ class DaskEngine:
             ) from error
 
 
+@dataclasses.dataclass(frozen=True)
+class _Killed:
+    """That so many workers have died of a unit."""
+
+    workers: int
+
+    def together_with(self, before: "_Killed") -> Broken:
+        """Given up, with what is said of it."""
+        return Broken(f"{before.workers + self.workers} workers that began it died")
+
+
 class _Running:
     """The units that a scheduler has, and what becomes of them."""
 
@@ -223,11 +238,12 @@ class _Running:
         self._engine, self._work, self._shared = engine, work, shared
         # Of its own: others may use the same scheduler at the same time, for other work.
         self._name = f"potlp-{uuid.uuid4().hex}"
+        self._numbers = itertools.count()
         self._reports: queue.SimpleQueue[distributed.Future] = queue.SimpleQueue()
         self._units: dict[distributed.Future, Any] = {}
         self._again: list[Any] = []
 
-    def through(self, remaining: Iterator[Any], together: bool) -> Iterator[tuple[Any, list[Any] | Broken]]:
+    def through(self, remaining: Iterator[Any], together: bool) -> Iterator[tuple[Any, list[Any] | _Killed]]:
         """All that remain, several at a time or each alone: given up at the last death, or before it."""
         prepared = False
         while True:
@@ -268,12 +284,13 @@ class _Running:
                 self._again += itertools.islice(remaining, 1)
             if not self._again:
                 return
-            # Not pure to Dask, which would otherwise give a unit that comes again its old result.
-            future = self._engine.client.submit(_done, self._work, self._name, self._again[-1], pure=False)
+            # A unit that comes again has another key: Dask would otherwise give it its old result.
+            key = f"{self._name}-{next(self._numbers)}"
+            future = self._engine.client.submit(_done, self._work, self._name, self._again[-1], key=key)
             self._units[future] = self._again.pop()
             future.add_done_callback(self._reports.put)
 
-    def _ended(self) -> tuple[Any, list[Any] | Broken | BaseException] | None:
+    def _ended(self) -> tuple[Any, list[Any] | _Killed | BaseException] | None:
         """A unit that has ended; None where none has for a while."""
         try:
             future = self._reports.get(timeout=_LOOK)
@@ -287,11 +304,12 @@ class _Running:
         if future.status not in ("finished", "error"):
             raise ConnectionError("a unit was forgotten")
         # The bytes travel only now; until they are here the unit counts as begun.
-        found: list[Any] | Broken | BaseException
+        found: list[Any] | _Killed | BaseException
         try:
             found = future.result()
-        except KilledWorker:
-            found = Broken(f"{MOST_KILLED} workers that began it died")
+        except KilledWorker as killed:
+            # Not what was asked for: others may have asked the scheduler for more.
+            found = _Killed(killed.allowed_failures + 1)
         except (_UnpreparedError, *LOST) as error:
             # Whether an error is the unit's or the cluster's is known by where it comes from.
             if future.status == "error" and not isinstance(error, _UnpreparedError):
@@ -320,16 +338,28 @@ def _done(work: Callable[[Any, Any], Iterable[Any]], name: str, unit: Any) -> li
     return list(work(prepared.shared, unit))
 
 
-_ALLOWED: weakref.WeakKeyDictionary[Any, dict[str, int]] = weakref.WeakKeyDictionary()
-"""Of a scheduler, in its own process: the deaths that each run allows, and under ``_BEFORE`` those of before."""
+class _Allowed(NamedTuple):
+    """What a run asks of a scheduler.
+
+    Attributes:
+        deaths: so many workers may die of a unit, and one more ends it.
+        client: that the run is connected by; None of what was there before all runs.
+    """
+
+    deaths: int
+    client: str | None
+
+
+_ALLOWED: weakref.WeakKeyDictionary[Any, dict[str, _Allowed]] = weakref.WeakKeyDictionary()
+"""Of a scheduler, in its own process: what each run allows, and under ``_BEFORE`` what was allowed before."""
 
 _BEFORE = ""
 
 
-def _give_up_after(deaths: int, name: str, dask_scheduler: Any) -> None:
-    allowed = _ALLOWED.setdefault(dask_scheduler, {_BEFORE: dask_scheduler.allowed_failures})
+def _give_up_after(deaths: int, name: str, client: str, dask_scheduler: Any) -> None:
+    allowed = _ALLOWED.setdefault(dask_scheduler, {_BEFORE: _Allowed(dask_scheduler.allowed_failures, None)})
     # Dask counts those that are allowed.
-    allowed[name] = deaths - 1
+    allowed[name] = _Allowed(deaths - 1, client)
     _allow_most(dask_scheduler)
 
 
@@ -343,9 +373,13 @@ def _give_up_as_before(name: str, dask_scheduler: Any) -> None:
 def _allow_most(dask_scheduler: Any) -> None:
     """The most that a run allows: of several that use a scheduler none gives a unit up before it is to."""
     allowed = _ALLOWED[dask_scheduler]
-    runs = [number for name, number in allowed.items() if name != _BEFORE]
-    dask_scheduler.allowed_failures = max(runs, default=allowed[_BEFORE])
-    if not runs:
+    before = allowed.pop(_BEFORE)
+    # A run that was killed has not said that it is over, and its client is gone.
+    runs = {name: entry for name, entry in allowed.items() if entry.client in dask_scheduler.clients}
+    dask_scheduler.allowed_failures = max((entry.deaths for entry in runs.values()), default=before.deaths)
+    if runs:
+        _ALLOWED[dask_scheduler] = {_BEFORE: before, **runs}
+    else:
         del _ALLOWED[dask_scheduler]
 
 
@@ -366,7 +400,7 @@ class _Prepared(distributed.WorkerPlugin):
     def setup(self, worker: Any) -> None:
         """Keep to one core, and to what was compiled before."""
         # What a unit raises is raised again where its result is asked for, and told there.
-        logging.getLogger("distributed.worker").addFilter(_is_of_workers)
+        logging.getLogger("distributed.worker").addFilter(self._lets_pass)
         # An interrupt from the terminal reaches all processes, and the one that asked for the work ends the others. A
         # worker that is a thread of that one has nothing to ignore.
         if threading.current_thread() is threading.main_thread():
@@ -378,9 +412,10 @@ class _Prepared(distributed.WorkerPlugin):
 
     def teardown(self, worker: Any) -> None:
         """Let the worker say again what it said before."""
-        logging.getLogger("distributed.worker").removeFilter(_is_of_workers)
+        logging.getLogger("distributed.worker").removeFilter(self._lets_pass)
 
-
-def _is_of_workers(record: logging.LogRecord) -> bool:
-    """Whether a worker says something else than that a unit raised an error, with its traceback."""
-    return not record.getMessage().startswith("Compute Failed")
+    def _lets_pass(self, record: logging.LogRecord) -> bool:
+        """Whether a worker says something else than that a unit of this run raised an error, with its traceback."""
+        said = record.getMessage()
+        # Keys of units hold the name of their run.
+        return not (said.startswith("Compute Failed") and self.name in said)

@@ -41,7 +41,10 @@ SCHEDULERS: tuple[str, ...] = ("tcp", "tls", "ucx", "ws", "wss")
 
 # Of a batch system's options, what other words mean to dask-jobqueue; which of its own are lists, and which numbers.
 _WORDS = MappingProxyType({"partition": "queue"})
-_LISTS = ("job_extra_directives", "job_directives_skip", "job_script_prologue", "job_script_epilogue")
+_LISTS = (
+    *("job_extra_directives", "job_directives_skip", "job_script_prologue", "job_script_epilogue"),
+    "worker_extra_args",
+)
 _NUMBERS = ("cores", "processes")
 # The batch system keeps to the memory that a job has asked for. A worker of Dask would wait, near it, for memory that
 # XLA never gives back.
@@ -129,7 +132,8 @@ def _of_batch_system(kind: str, options: dict[str, str]) -> Any:
     given: dict[str, Any] = {_WORDS.get(name, name): value for name, value in options.items()}
     given |= {name: [given[name]] for name in _LISTS if name in given}
     given |= {name: _whole_number(given[name], f"--cluster {kind}: {name}") for name in _NUMBERS if name in given}
-    given = {"cores": 1, "processes": 1, "memory": "4GB", "worker_extra_args": list(_UNLIMITED), **given}
+    given = {"cores": 1, "processes": 1, "memory": "4GB", **given}
+    given["worker_extra_args"] = [*_UNLIMITED, *given.get("worker_extra_args", [])]
     # dask-jobqueue would go on without workers: what it says about a command that is missing is said in the background.
     system = BATCH_SYSTEMS[kind]
     if shutil.which(system.submit) is None:

@@ -1,6 +1,7 @@
 """The end of a sweep that is asked to end (SIGTERM): soon, and with nothing lost."""
 
 import contextlib
+import functools
 import logging
 import os
 import signal
@@ -24,8 +25,11 @@ _GRACE: float = 1.0
 
 
 @contextlib.contextmanager
-def ending_when_asked() -> Iterator[None]:
+def ending_when_asked(kept: bool) -> Iterator[None]:
     """End the block by SIGTERM as by an error, so that it can tidy up, and the process soon, whatever it does.
+
+    Args:
+        kept: whether what is finished is there afterwards, which the message says then.
 
     Python runs a handler between its own steps alone, and compiling a program may be one step of a minute. So a thread
     ends the process if the handler has not done so in time: nothing is lost, as rows are written as they end.
@@ -38,7 +42,8 @@ def ending_when_asked() -> Iterator[None]:
     writer.setblocking(False)
     ended = threading.Event()
     thread = threading.Thread(target=_end_late, args=(reader, ended), daemon=True)
-    before_fd, before = signal.set_wakeup_fd(writer.fileno()), signal.signal(signal.SIGTERM, _end)
+    before_fd = signal.set_wakeup_fd(writer.fileno())
+    before = signal.signal(signal.SIGTERM, functools.partial(_end, kept))
     thread.start()
     try:
         yield
@@ -64,8 +69,9 @@ def _end_after_grace() -> NoReturn:
     os._exit(ENDED)
 
 
-def _end(number: int, frame: object) -> NoReturn:
-    logger.warning(f"ended by {signal.Signals(number).name}; {KEPT}")
+def _end(kept: bool, number: int, frame: object) -> NoReturn:
+    # At once: closing what is open may take longer than the grace.
+    logger.warning(f"ended by {signal.Signals(number).name}{f'; {KEPT}' if kept else ''}")
     raise SystemExit(ENDED)
 
 

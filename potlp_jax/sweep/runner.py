@@ -243,6 +243,7 @@ def run_sweep(
     cluster: str | None = None,
     begun: Callable[[Engine], None] = lambda engine: None,
     retry_broken: bool = False,
+    kept: bool = True,
 ) -> None:
     """Run what is missing of a sweep; returns when every trial has a row, or was given up.
 
@@ -253,17 +254,21 @@ def run_sweep(
         report: is called now and then with the progress.
         begun: is called once with the engine, if there is anything to do.
         retry_broken: begin again the trials that were given up.
+        kept: whether the folder stays where the process is asked to end; the message tells then that the sweep can go
+            on.
 
     Raises:
         StoreError: the folder holds another sweep, cannot be written, or another command works on it; of a sweep that
             is finished nothing is written.
         EngineError, SweepError: nobody is left who could do the work; what is finished is kept.
-        SystemExit: the process was asked to end (SIGTERM); it and its workers do within two seconds.
+        SystemExit: the process was asked to end (SIGTERM). Its workers do within two seconds, and so does the process
+            where the caller lets ``sweep.ending.end_process_soon`` see to it, as ``potlp`` does; otherwise Dask may
+            hold the end of the interpreter up.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if _is_finished(specification, folder, retry_broken):
         return
-    with ending_when_asked(), only_writer(folder, StoreError):
+    with ending_when_asked(kept), only_writer(folder, StoreError):
         sweep = Sweep(specification, folder)
         try:
             with open_engine(processes, cluster) as engine:

@@ -72,7 +72,8 @@ def run_robot(
     """
     policy = named_policy(policy)
     watched = WatchedRobot(robot, seconds_per_cell)
-    config = TrialConfig() if config is None else config
+    # No robot of one's own knows the map, whatever the settings of a simulation say.
+    config = dataclasses.replace(TrialConfig() if config is None else config, revealed=False)
 
     def record(run: RunRecord) -> Trial:
         resolution = float(watched.last_map.resolution)

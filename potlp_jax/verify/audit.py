@@ -183,7 +183,7 @@ def task_of_record(trial: Trial, propositions: tuple[str, ...]) -> Task:
             translated = Task.from_formula(trial.task_text, propositions)
     except TaskError:
         return recorded
-    return translated if _has_table_of(translated, recorded) else recorded
+    return translated if has_table_of(translated, recorded) else recorded
 
 
 def _world_differences(claimed: World, world: World) -> list[str]:
@@ -216,12 +216,13 @@ def _task_differences(trial: Trial, task: Task) -> list[str]:
             f"{task.propositions}"
         )
         return found
-    if not _has_table_of(Task.from_hoa(trial.task_hoa, trial.propositions), task):
+    if not has_table_of(Task.from_hoa(trial.task_hoa, trial.propositions), task):
         found.append("its automaton is not that of the task")
     return found
 
 
-def _has_table_of(task: Task, other: Task) -> bool:
+def has_table_of(task: Task, other: Task) -> bool:
+    """Whether the automata of two tasks over the same propositions have one language."""
     # Both are minimal with their states in one canonical order: equal languages have equal tables.
     mine, true = task.dfa, other.dfa
     tables = ((mine.transitions, true.transitions), (mine.accepting, true.accepting))
