@@ -277,10 +277,6 @@ def report(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _read(path: Path) -> list[dict[str, Any]]:
-    return [row for chunk in read_rows(path) for row in chunk]
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pairs", type=int, default=0, help="pairs to run, those of the file included")
@@ -289,13 +285,13 @@ def main() -> None:
     arguments = parser.parse_args()
     enable_compilation_cache()
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    done = 1 + max((row["pair"] for row in _read(arguments.out)), default=-1)
+    done = 1 + max((row["pair"] for row in read_rows(arguments.out)), default=-1)
     for first in range(done, arguments.pairs, CHUNK):
         count = min(CHUNK, arguments.pairs - first)
         # A chunk is one line, so that what a kill has cut off is run again as a whole.
         append_row(arguments.out, list(run_chunk(first, count)))
         print(f"{first + count} pairs", flush=True)
-    summary = report(_read(arguments.out))
+    summary = report(read_rows(arguments.out))
     for entry in summary["policies"]:
         print(entry)
     if arguments.report:

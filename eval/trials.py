@@ -181,11 +181,7 @@ def rows_of(out: Path, suite: str) -> list[dict[str, Any]]:
     """Rows written so far; a line cut off by a kill is dropped, its item runs again."""
     path = out / f"{suite}.jsonl"
     packed = path.with_suffix(".jsonl.gz")  # as docs/results keeps them
-    rows: list[dict[str, Any]] = []
-    # The rows of an item stand on one line; in files of before each has its own.
-    for found in (*read_rows(packed), *read_rows(path)):
-        rows += found if isinstance(found, list) else [found]
-    return rows
+    return [*read_rows(packed), *read_rows(path)]
 
 
 def report(out: Path) -> str:

@@ -16,6 +16,7 @@ import io
 import json
 import os
 import re
+import shutil
 import stat
 import xml.etree.ElementTree as ElementTree
 import zipfile
@@ -54,6 +55,8 @@ TEMPORARY: str = ".tmp"
 # No setting has a longer name, and messages quote names whole.
 _LONGEST_NAME = 100
 _LONGEST_INTEGER = 63
+# Bytes, of the 255 that names of files may have.
+_LONGEST_BEGINNING = 200
 _LONGEST_REASON = 200
 """Characters of another library's message that are passed on."""
 
@@ -348,8 +351,10 @@ def write_whole(path: Path, text: str) -> None:
 def whole_file(path: Path) -> Iterator[IO[bytes]]:
     """A file to be written under a temporary name in the same folder, and renamed where the block ends well.
 
+    A process that is killed leaves what it had written: a file whose name ends with its number and ``.tmp``.
+
     Args:
-        path: of the file; what is there already is replaced at the end, or stays as it is.
+        path: of the file; what is there already is replaced at the end, and lends its permissions, or stays as it is.
 
     Yields:
         What is written to.
@@ -364,14 +369,19 @@ def whole_file(path: Path) -> Iterator[IO[bytes]]:
         return
     # A link stays one.
     path = path.resolve()
-    # With the process's number: two that write the same file do not write into one.
-    temporary = path.with_name(f"{path.name}.{os.getpid()}{TEMPORARY}")
+    # With the process's number: two that write the same file do not write into one. Of a name that is nearly as long as
+    # may be, the beginning.
+    beginning = path.name.encode()[:_LONGEST_BEGINNING].decode(errors="ignore")
+    temporary = path.with_name(f"{beginning}.{os.getpid()}{TEMPORARY}")
     try:
         with temporary.open("wb") as file:
             yield file
             file.flush()
             # Before the rename: otherwise a power cut could leave the name without the contents.
             os.fsync(file.fileno())
+        if path.exists():
+            # Those with whom a file is shared may write to it as before.
+            shutil.copymode(path, temporary)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)

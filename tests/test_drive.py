@@ -342,7 +342,24 @@ def test_a_map_in_another_frame_is_another_map():
     inbox.handle("/map", renamed)
     assert inbox.heard.frame_id == "world"
     assert inbox.heard.pose == (12.0, 0.0, 0.0)
+    # Where the robot was in the frame of before is nowhere in this one.
+    assert inbox.heard.poses == ((12.0, 0.0, 0.0),)
     assert inbox.heard.maps == 2
+    lost = grid(4, [[0]])
+    lost["header"]["frame_id"] = "nowhere"
+    inbox.handle("/map", lost)
+    assert inbox.heard.pose is None
+    assert not inbox.heard.poses
+
+
+def test_poses_of_a_topic_are_in_the_frame_of_the_map_whatever_it_is_called():
+    inbox = Inbox(dataclasses.replace(CONFIG, topics=Topics(pose="/pose")), FLOOR.propositions)
+    inbox.handle("/map", grid(1, [[0]]))
+    inbox.handle("/pose", {"header": header(1), "pose": make_pose(2.0, 0.0, 0.0)})
+    renamed = grid(3, [[0]])
+    renamed["header"]["frame_id"] = "world"
+    inbox.handle("/map", renamed)
+    assert inbox.heard.pose == (2.0, 0.0, 0.0)
 
 
 def test_a_wheel_that_turns_is_no_pose():

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from eval import trials
-from eval.commits import CONFIG, POLICIES, SIZES, _read, irrevocable_steps, pair, prior, report, run_chunk
+from eval.commits import CONFIG, POLICIES, SIZES, irrevocable_steps, pair, prior, report, run_chunk
 from eval.formulas import random_tasks
-from eval.limit.rows import append_row
+from eval.limit.rows import append_row, read_rows
 from potlp_jax.environments.firefighting import Firefighting
 from potlp_jax.environments.toy import Toy
 from potlp_jax.errors import TaskWarning
@@ -292,9 +292,9 @@ def test_what_a_kill_has_cut_off_is_run_again_as_a_whole(tmp_path):
     whole = file.read_bytes()
     for size in range(len(whole)):
         file.write_bytes(whole[:size])
-        assert len(_read(file)) % 2 == 0
+        assert len(read_rows(file)) % 2 == 0
     append_row(file, [{"pair": 2}])
-    assert [row["pair"] for row in _read(file)][:3] == [0, 1, 2]
+    assert [row["pair"] for row in read_rows(file)][:3] == [0, 1, 2]
     # Rows of before stand on a line each.
     (tmp_path / "rooms.jsonl").write_text('{"number": 1}\n{"number": 2}\n')
     append_row(tmp_path / "rooms.jsonl", [{"number": 3}, {"number": 3}])

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +20,7 @@ from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.splits import Split, world_key
 from potlp_jax.environments.toy import Toy
 from potlp_jax.errors import PluginError, RecordError
+from potlp_jax.files import write_whole
 from potlp_jax.learning.estimator import TrainedEstimator
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.network import EstimatorNetwork, NetworkConfig
@@ -218,6 +220,22 @@ def test_a_decision_is_replayed_with_the_edges_that_were_left_out(tmp_path):
 def test_what_is_written_whole_may_go_into_a_pipe():
     code = "from pathlib import Path; from potlp_jax.files import write_whole; write_whole(Path('/dev/stdout'), 'all')"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout == b"all"
+
+
+def test_what_is_written_whole_stays_writable_for_those_it_is_shared_with(tmp_path):
+    path = tmp_path / "labels.yaml"
+    path.write_text("before")
+    path.chmod(0o664)
+    write_whole(path, "after")
+    assert path.read_text() == "after"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o664
+
+
+def test_what_is_written_whole_may_have_as_long_a_name_as_a_file_may(tmp_path):
+    # In UTF-8 a letter of two bytes, so that the beginning is cut within one.
+    path = tmp_path / ("x" + "ü" * 127)
+    write_whole(path, "all")
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["all"]
 
 
 def test_a_record_that_cannot_be_written_leaves_the_one_before(tmp_path, monkeypatch):

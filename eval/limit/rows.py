@@ -12,16 +12,20 @@ ROWS = "trials.jsonl"
 
 
 def read_rows(file: Path) -> list[Any]:
-    """What ``append_row`` has written so far, packed or not, without a line that a kill has cut off: it runs again."""
+    """What ``append_row`` has written so far, packed or not, without a line that a kill has cut off: it runs again.
+
+    Rows that were written together come one by one, as those do that had a line each.
+    """
     if not file.exists():
         return []
     contents = gzip.decompress(file.read_bytes()) if file.suffix == ".gz" else file.read_bytes()
     rows = []
     for line in contents.decode("utf-8").splitlines():
         try:
-            rows.append(json.loads(line))
+            found = json.loads(line)
         except json.JSONDecodeError:
             continue
+        rows += found if isinstance(found, list) else [found]
     return rows
 
 

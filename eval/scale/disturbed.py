@@ -91,8 +91,9 @@ def undisturbed(out: Path) -> tuple[Path, dict[Item, tuple[Any, ...]]]:
     out.mkdir(parents=True, exist_ok=True)
     file = out / "sweep.yaml"
     file.write_text(json.dumps(SPECIFICATION))
-    subprocess.run([*SWEEP_COMMAND, str(file), "--out", str(out / "whole"), "--json"], check=True, capture_output=True)
-    return file, rows_of(out / "whole")
+    folder = _emptied(out / "whole")
+    subprocess.run([*SWEEP_COMMAND, str(file), "--out", str(folder), "--json"], check=True, capture_output=True)
+    return file, rows_of(folder)
 
 
 def require_same(found: Mapping[Item, Any], whole: Mapping[Item, Any], where: Path) -> None:

@@ -168,6 +168,9 @@ class Inbox:
         if before is not None and same_frame and np.array_equal(before.occupancy, scan.occupancy):
             return None
         heard, renamed = self._heard, frame_id != self._heard.frame_id
+        # Metres of the frame of before mean other places in this one. A topic of poses has no frame but the map's.
+        if renamed and not self._config.topics.pose:
+            heard = replace(heard, poses=(), pose=None)
         self._heard = replace(heard, scan=scan, frame_id=frame_id, maps=heard.maps + 1)
         # What was heard before of where the robot is tells its pose in this frame from now on.
         placed = self._placed() if renamed else None

@@ -328,7 +328,8 @@ class RemoteRobot:
         """Where the robot is at first. A pose that is not on the map may be an error of localisation: it waits."""
         begun = self._clock()
         while True:
-            heard = self._inbox.heard
+            # A map in another frame takes the pose back.
+            heard = self._await_first()
             assert heard.pose is not None
             self._lay(heard)
             cell = self._snapped(self._lattice.cell_of(*heard.pose[:2]))

@@ -29,7 +29,7 @@ from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, require_field
 from potlp_jax.codec import differences, json_copy
 from potlp_jax.engine.writer import only_writer
 from potlp_jax.errors import TrainingError
-from potlp_jax.files import MOST_TEXT, read_json, reading
+from potlp_jax.files import MOST_TEXT, read_json, reading, write_whole
 from potlp_jax.learning.architectures import architecture_of
 from potlp_jax.learning.building_config import BuildingConfig
 from potlp_jax.learning.building_learner import BuildingOptions
@@ -312,10 +312,8 @@ def planned_steps(
     made = _agreed(Planned(plan["steps"], measuring))
     if is_first():
         folder.mkdir(parents=True, exist_ok=True)
-        # Renamed when it is whole: half a plan would stop every resumption.
-        temporary = path.with_suffix(".json.tmp")
-        temporary.write_text(json.dumps(plan | {"measuring": made.measuring}))
-        temporary.replace(path)
+        # Half a plan would stop every resumption.
+        write_whole(path, json.dumps(plan | {"measuring": made.measuring}))
     return made
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from tensorboardX import SummaryWriter
 
 from potlp_jax.errors import TrainingError
-from potlp_jax.files import MOST_RECORD, read_text, reading
+from potlp_jax.files import MOST_RECORD, read_text, reading, write_whole
 from potlp_jax.learning.training import Progress
 
 TABLE: str = "log.csv"
@@ -86,13 +86,12 @@ class Journal:
         return next((row for row in self._rows if row["step"] == step), {})
 
     def _write_table(self) -> None:
-        # Under another name first: who reads the table while a training runs sees a whole one.
-        temporary = self._folder / f"{TABLE}.tmp"
-        with temporary.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(self._rows[0]))
-            writer.writeheader()
-            writer.writerows(self._rows)
-        temporary.replace(self._folder / TABLE)
+        table = io.StringIO(newline="")
+        writer = csv.DictWriter(table, list(self._rows[0]))
+        writer.writeheader()
+        writer.writerows(self._rows)
+        # Who reads the table while a training runs sees a whole one.
+        write_whole(self._folder / TABLE, table.getvalue())
 
 
 def _row_of(progress: Progress) -> Row:
