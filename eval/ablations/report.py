@@ -119,8 +119,8 @@ python -m eval.ablations --out out/ablations --views {views}{option} --report do
 All but the last line are fitted to the same number of views: 1,200 buildings of the explorer, and 400 drives of PO-TLP
 with a first network. The [shipped estimator](estimator.md#how-it-was-made) had many more. Two epochs where nothing
 else is said; the network of one panorama has the settings of its own recipe but for the epochs, of which that has
-seven. **Each network was fitted once**: the intervals are those of the worlds alone, and the same network fitted again
-with other draws would differ, too. Minutes are those of a machine that had other work as well.
+seven. **Each network was fitted once for this table**: the intervals are those of the worlds alone, and the same
+network fitted again with other draws would differ, too. Minutes are those of a machine that had other work as well.
 
 What larger buildings in training bring was measured [for deliveries](delivery.md#deliveries-to-people): no difference
 that could be told.
@@ -153,7 +153,7 @@ in its view alone, which are fewer and nearer.
 _SECOND = """
 ### What a second fit changes
 
-The same networks were fitted once before, to as many views and by other code, and drove in the same worlds
+All but no-paths and no-contrast were fitted once before, to as many views, by other code, and drove in the same worlds
 ([{beside}]({beside})). Points of the share beside the whole network, of this
 fit and then of that one; bold where both can be told from none and have the same sign:
 
@@ -174,7 +174,7 @@ def page(found: Mapping[str, Any], views: Sequence[str], name: str, beside: Path
     return PAGE.format(
         second="" if beside is None else _second(found, name, beside),
         option="" if beside is None else f" --beside {beside}",
-        answer=_answer(found),
+        answer=_answer(found, again=beside is not None),
         views=" ".join(f"{of}=out/{of}" for of in views),
         first=found["worlds"][0],
         last=found["worlds"][-1],
@@ -246,7 +246,7 @@ def _tasks(found: Mapping[str, Any]) -> list[str]:
     return list(found["variants"][WHOLE]["tasks"])
 
 
-def _answer(found: Mapping[str, Any]) -> str:
+def _answer(found: Mapping[str, Any], again: bool) -> str:
     told = []
     for name, entry in found["variants"].items():
         besides = {task: found_in["beside"] for task, found_in in entry["tasks"].items() if found_in["beside"]}
@@ -259,6 +259,11 @@ def _answer(found: Mapping[str, Any]) -> str:
         f"With nothing left out the mean over the tasks of the share of attainable savings is {mean:.0f} %. "
         f"Differences to it that can be told from none, in points (the names are those of the table): {differences}."
     )
+    if again:
+        text += (
+            " Each is of one fit, and its interval of the worlds alone: [another fit](#what-a-second-fit-changes) "
+            "tells again only what is bold there."
+        )
     # As it stands behind the word before it.
     return textwrap.fill(text, 120, initial_indent=" " * len("**Answer.** "), break_on_hyphens=False).lstrip()
 

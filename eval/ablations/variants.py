@@ -93,8 +93,8 @@ VARIANTS: dict[str, Variant] = {
     "no-contrast": Variant(
         says="no comparison of colours across the building", network=(*_BUILDING, "network.contrast=0", "network.raw=0")
     ),
-    "one-epoch": Variant(says="half of the time", network=_WHOLE, epochs=1),
-    "six-epochs": Variant(says="three times the time", network=_WHOLE, epochs=6),
+    "one-epoch": Variant(says="half of the passes", network=_WHOLE, epochs=1),
+    "six-epochs": Variant(says="three times the passes", network=_WHOLE, epochs=6),
 }
 """What is fitted, by name; all differences are to the first."""
 
