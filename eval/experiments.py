@@ -276,20 +276,26 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     # Each shipped recipe from nothing, and what its stages keep: how long one has to train.
     "recipe-firefighting": Experiment(
-        page="estimator", command="potlp fit --recipe firefighting --out {out} --processes {processes}"
+        page="estimator",
+        command="potlp fit --recipe firefighting --out {out} --processes {processes}",
+        minutes=130,
     ),
     "curve-firefighting": Experiment(
         page="estimator",
         command="python -m eval.training_curve {all}/recipe-firefighting --environment firefighting --worlds 60 "
         "--out {out} --report docs/results/estimator/curve",
+        minutes=10,
     ),
     "recipe-delivery": Experiment(
-        page="delivery", command="potlp fit --recipe delivery --out {out} --processes {processes}"
+        page="delivery",
+        command="potlp fit --recipe delivery --out {out} --processes {processes}",
+        minutes=105,
     ),
     "curve-delivery": Experiment(
         page="delivery",
         command="python -m eval.training_curve {all}/recipe-delivery --environment delivery --worlds 100 --out {out} "
         "--report docs/results/delivery/curve",
+        minutes=6,
     ),
     "small-generator": Experiment(
         page="delivery",
@@ -297,12 +303,15 @@ EXPERIMENTS: dict[str, Experiment] = {
         "--processes {processes} --report docs/results/delivery/small_generator",
     ),
     "recipe-parcels": Experiment(
-        page="delivery", command="potlp fit --recipe parcels --out {out} --processes {processes}"
+        page="delivery",
+        command="potlp fit --recipe parcels --out {out} --processes {processes}",
+        minutes=45,
     ),
     "curve-parcels": Experiment(
         page="delivery",
         command="python -m eval.training_curve {all}/recipe-parcels --environment campus-small-parcels --worlds 100 "
         "--out {out} --report docs/results/delivery/curve_parcels",
+        minutes=4,
     ),
     "floors": Experiment(page="floors", command="python -m eval.floor_statistics", variables=_OTHERS, minutes=1),
     "buildings": Experiment(
