@@ -38,7 +38,9 @@ def test_all_that_name_the_version_name_the_same():
     version = PROJECT["project"]["version"]
     assert re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text("utf-8"), re.M)[1] == version
     assert re.search(r"^  version = \{(.+)\},$", (ROOT / "README.md").read_text("utf-8"), re.M)[1] == version
-    assert re.search(r"^## (.+)$", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.M)[1] == version
+    # With its day, as Keep a Changelog asks.
+    heading = re.search(r"^## (.+)$", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.M)[1]
+    assert re.fullmatch(rf"{re.escape(version)} - \d{{4}}-\d\d-\d\d", heading)
 
 
 def test_supported_versions_of_python_are_named():
