@@ -17,6 +17,9 @@ from potlp_jax.task.task import UNNAMED, Task, TaskSizes, stack_tasks
 from potlp_jax.types import NO_CLASS
 from train.write_shipped_tasks import shipped_texts
 
+# Where there is no wheel of it, as on Python 3.14.
+pytest.importorskip("spot")
+
 FIREFIGHTING = [f"firefighting-{number}" for number in range(1, 5)]
 TASKS = [
     *(Task.shipped(name) for name in shipped_tasks()),
