@@ -109,12 +109,12 @@ def _trial(path: Path) -> tuple[int, list[tuple[str, str]]]:
     generator = make(environment)
     task = task_of_record(trial, generator.propositions)
     if formula_of(task) is None:
-        _tell_of_automaton(str(file), task)
+        _tell_of_automaton(str(file), trial.task_text, task)
     problems = problems_of(trial, task, generator.world(trial.world_number, Split(split)))
     return 1, [(str(file), problem) for problem in problems]
 
 
-def _tell_of_automaton(file: str, task: "Task") -> None:
+def _tell_of_automaton(file: str, text: str, task: "Task") -> None:
     """Warn where the automaton of a record decides although its name looks like, or is, a formula."""
     from potlp_jax.errors import TaskError
     from potlp_jax.task.task import Task
@@ -122,16 +122,16 @@ def _tell_of_automaton(file: str, task: "Task") -> None:
     from potlp_jax.verify.semantics import can_be_judged
 
     its_own = True
-    if not can_be_judged(task.text, task.propositions):
+    if not can_be_judged(text, task.propositions):
         try:
-            its_own = not has_table_of(Task.from_formula(task.text, task.propositions), task)
+            its_own = not has_table_of(Task.from_formula(text, task.propositions), task)
         except TaskError:
             # A mere name of an automaton is no formula to Spot, either.
             return
     if its_own:
         logger.warning(
-            f"{file}: the task is called {task.text!r}, and its automaton is not that of this formula: the trial is "
+            f"{file}: the task is called {text!r}, and its automaton is not that of this formula: the trial is "
             "judged by the automaton"
         )
     else:
-        logger.warning(f"{file}: task {task.text!r}: {NOT_READ}")
+        logger.warning(f"{file}: task {text!r}: {NOT_READ}")
