@@ -12,6 +12,7 @@ ORDER = (
     "errors",
     "checks",
     "precision",
+    "compiling",
     "files",
     "images",
     "plugins",

@@ -7,9 +7,9 @@ your own is a pytree with the same fields and methods.
 import dataclasses
 from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
-import jax
 from jaxtyping import Array, Int32, UInt8
 
+from potlp_jax.compiling import jit_by_class
 from potlp_jax.planning.estimates import Estimates, Estimator
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.world.frontiers import Subgoals
@@ -124,7 +124,7 @@ def look_step(before: _Count, number: _Count, every: int) -> _Count:
 _Observing = TypeVar("_Observing", bound=ObservingEstimator)
 
 
-@jax.jit
+@jit_by_class
 def observe_panorama(
     estimator: _Observing, panorama: UInt8[Array, "rows columns 3"], belief: BeliefMap, cell: Int32[Array, "2"]
 ) -> _Observing:
@@ -148,7 +148,7 @@ def observations_of(estimator: Estimator | None, subgoals: Subgoals) -> Int32[Ar
     return _observations(estimator, subgoals) if isinstance(estimator, AnswersFromPanoramas) else None
 
 
-@jax.jit
+@jit_by_class
 def _observations(estimator: AnswersFromPanoramas, subgoals: Subgoals) -> Int32[Array, " S"]:
     return estimator.observations(subgoals)
 

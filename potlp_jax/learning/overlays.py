@@ -12,6 +12,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float32, UInt8
 
+from potlp_jax.compiling import jit_by_class
 from potlp_jax.learning.painting import Painting
 from potlp_jax.learning.resampling import cells_in
 from potlp_jax.planning.estimates import Estimator
@@ -68,7 +69,7 @@ def overlays_of(estimator: Estimator | None, belief: BeliefMap) -> tuple[Overlay
     return _overlays(estimator, belief) if isinstance(estimator, ShowsOverlays) else ()
 
 
-@jax.jit
+@jit_by_class
 def _overlays(estimator: ShowsOverlays, belief: BeliefMap) -> tuple[Overlay, ...]:
     return estimator.overlays(belief)
 

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -20,6 +19,7 @@ from jaxtyping import Array, Bool, Int32, UInt8
 
 from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, require_fields
 from potlp_jax.codec import json_copy
+from potlp_jax.compiling import jit_by_class
 from potlp_jax.errors import DatasetError
 from potlp_jax.learning.dataset import (
     IMAGE_FORMATS,
@@ -156,7 +156,7 @@ class Seen:
     observer: IdealObserver | None
 
 
-@partial(jax.jit, static_argnames=("camera", "glances"))
+@partial(jit_by_class, static_argnames=("camera", "glances"))
 def _after_picture(
     seen: Seen,
     image: UInt8[Array, "rows columns 3"],

@@ -14,6 +14,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float32, Int32
 from scipy import ndimage
 
+from potlp_jax.compiling import jit_by_class
 from potlp_jax.learning.ideal_observer import IdealObserver
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.sample_weights import WeightBounds, Weights, loss_weights
@@ -90,7 +91,7 @@ def survey(
     )
 
 
-@partial(jax.jit, static_argnames="bounds")
+@partial(jit_by_class, static_argnames=("bounds",))
 def label(
     by: TrueMapEstimator | IdealObserver,
     belief: BeliefMap,

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int32, PRNGKeyArray
 
+from potlp_jax.compiling import jit_by_class
 from potlp_jax.errors import BatchError
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import TrainedEstimator
@@ -280,7 +281,7 @@ def _empty_slots(first: Start, memory: Any, setup: Setup, count: int) -> tuple[S
     return jax.tree.map(lambda leaf: jnp.repeat(leaf[None], count, axis=0), (scene, progress))
 
 
-@partial(jax.jit, static_argnames="setup", donate_argnums=0)
+@partial(jit_by_class, static_argnames=("setup",), donate_argnums=(0,))
 def _fill(
     slots: tuple[Scene, Progress],
     slot: Int32[Array, ""],
@@ -295,7 +296,7 @@ def _fill(
     return _put_back(slots, slot, begin(world, arrays, key, memory, setup=setup))
 
 
-@jax.jit
+@jit_by_class
 def _taken_out(slots: tuple[Scene, Progress], slot: Int32[Array, ""]) -> tuple[Scene, Progress]:
     """The content of a slot whose trial has outgrown it; to be run again."""
     scene, progress = jax.tree.map(lambda leaf: leaf[slot], slots)
@@ -303,14 +304,14 @@ def _taken_out(slots: tuple[Scene, Progress], slot: Int32[Array, ""]) -> tuple[S
     return scene, dataclasses.replace(progress, tally=tally)
 
 
-@partial(jax.jit, donate_argnums=0)
+@partial(jit_by_class, donate_argnums=(0,))
 def _put_back(
     slots: tuple[Scene, Progress], slot: Int32[Array, ""], content: tuple[Scene, Progress]
 ) -> tuple[Scene, Progress]:
     return jax.tree.map(lambda leaf, entry: leaf.at[slot].set(entry), slots, content)
 
 
-@partial(jax.jit, static_argnames="setup", donate_argnums=0)
+@partial(jit_by_class, static_argnames=("setup",), donate_argnums=(0,))
 def _run_until_one_ends(slots: tuple[Scene, Progress], asked: Asked, *, setup: Setup) -> tuple[Scene, Progress]:
     scene, progress = slots
     # Until fewer run than at the beginning: then a slot is free, and the host gives it a trial.

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int32, PRNGKeyArray
 
+from potlp_jax.compiling import jit_by_class
 from potlp_jax.errors import PotlpError, RobotError
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import TrainedEstimator, identity_of
@@ -46,7 +47,7 @@ logger = logging.getLogger(__name__)
 
 # Compiled once per policy, configuration and array shapes: no trial after the first compiles anything, but for the
 # first that meets more frontiers than the array of subgoals holds.
-_decide = jax.jit(decide, static_argnames=("policy", "config"))
+_decide = jit_by_class(decide, static_argnames=("policy", "config"))
 _first_tally = jax.jit(rules.first_tally)
 _count_decision = jax.jit(rules.count_decision)
 _arrive = jax.jit(rules.arrive, static_argnames="config")

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Int32, UInt8
 
 from potlp_jax.codec import config_from_dict
+from potlp_jax.compiling import jit_by_class
 from potlp_jax.errors import EstimatorError, RecordError
 from potlp_jax.learning.estimator import TrainedEstimator, identity_of, shipped_estimators
 from potlp_jax.learning.labels import TrueMapEstimator
@@ -293,7 +294,7 @@ def recall_views(
 
 
 # Compiled like the decision itself, so that rounding is the same and equal plans stay equal.
-@functools.partial(jax.jit, static_argnames=("config",))
+@functools.partial(jit_by_class, static_argnames=("config",))
 def _replayed_problem(
     belief: BeliefMap,
     cell: Int32[Array, "2"],

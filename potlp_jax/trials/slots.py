@@ -19,6 +19,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Int16, Int32, Key, PRNGKeyArray
 
 from potlp_jax.cache import is_switched_on
+from potlp_jax.compiling import jit_by_class
 from potlp_jax.learning.labels import TrueMapEstimator
 from potlp_jax.learning.observing import (
     ObservingEstimator,
@@ -142,7 +143,7 @@ class Setup:
         return dataclasses.replace(self, config=dataclasses.replace(self.config, decision=decision))
 
 
-@partial(jax.jit, static_argnames="setup")
+@partial(jit_by_class, static_argnames=("setup",))
 def begin(world: World, arrays: TaskArrays, key: PRNGKeyArray, memory: Any, *, setup: Setup) -> tuple[Scene, Progress]:
     """A trial before its first decision; what is visible from the start is known.
 
