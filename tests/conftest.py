@@ -9,12 +9,14 @@ import ctypes
 import functools
 import gc
 import importlib.metadata
+import importlib.util
 import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 import jax
 import pytest
@@ -22,6 +24,8 @@ from hypothesis import Phase, settings
 from jax._src import compiler
 from jaxtyping import _array_types as jaxtyping_annotations
 from jaxtyping import _decorator as jaxtyping_decorator
+
+_Report = TypeVar("_Report", pytest.TestReport, pytest.CollectReport)
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -117,6 +121,31 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers", "optimised: the module compares numbers, so it and the processes it starts run with XLA's optimiser"
     )
+
+
+# There is no wheel of Spot for the newest Python. What needs it cannot be tested there, wherever in a test, or in a
+# command that the test runs, the formula is made.
+_HAS_SPOT = importlib.util.find_spec("spot") is not None
+_NEEDS_SPOT = "this formula needs Spot, which is not installed"
+
+
+def _skipped_without_spot(report: _Report) -> _Report:
+    """The report of a test, or of a module that is collected; skipped where it failed by a formula without Spot."""
+    told = (report.longreprtext, *(text for _, text in report.sections))
+    if report.failed and not _HAS_SPOT and any(_NEEDS_SPOT in text for text in told):
+        report.outcome = "skipped"
+        report.longrepr = (report.nodeid.partition("::")[0], 0, f"Skipped: {_NEEDS_SPOT}")
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    return _skipped_without_spot((yield))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    return _skipped_without_spot((yield))
 
 
 # glibc's alone: it keeps freed memory, most of it XLA's compiler's, for the thread that had it.

@@ -17,9 +17,6 @@ from potlp_jax.task.task import UNNAMED, Task, TaskSizes, stack_tasks
 from potlp_jax.types import NO_CLASS
 from train.write_shipped_tasks import shipped_texts
 
-# Where there is no wheel of it, as on Python 3.14.
-pytest.importorskip("spot")
-
 FIREFIGHTING = [f"firefighting-{number}" for number in range(1, 5)]
 TASKS = [
     *(Task.shipped(name) for name in shipped_tasks()),
@@ -247,7 +244,6 @@ def test_a_formula_is_compiled_over_the_propositions_given():
 
 @pytest.mark.parametrize("name", ["U", "xor", "True", "first_match", "küche", "my room", 'a "b"', "back\\slash"])
 def test_guards_are_formulas_whatever_the_names_are(name):
-    pytest.importorskip("spot")
     task = Task.from_formula("F b", (name, "b"))
     guard = task.guard_text([(1, -1)])
     letters = Task.from_formula(guard, (name, "b"))

@@ -189,7 +189,6 @@ def test_a_decision_is_replayed_from_its_record():
 
 
 def test_a_record_of_a_task_without_positive_literals_is_read_again(tmp_path):
-    pytest.importorskip("spot")
     task = Task.from_formula("F !hazard", Toy().propositions, 0)
     trial = run_trial(Toy().world(0), task, Policy.BASELINE, jax.random.key(0))
     trial.save(tmp_path / "trial.json")

@@ -197,7 +197,6 @@ def test_the_legend_names_what_is_drawn_and_covers_nothing(trial, tmp_path):
 
 def _long_names(trial):
     """The beginning of the trial on a narrow map, with names as long as names may be."""
-    pytest.importorskip("spot")
     names = tuple(f"{'proposition':_<43}_{name}" for name in trial.propositions)
     task = Task.from_formula(" & ".join(f"F {name}" for name in names), propositions=names)
     occupied, letters = np.array(trial.world.occupied)[:, :8], np.zeros((HEIGHT, 8), np.int32)
@@ -236,7 +235,6 @@ def test_long_names_leave_no_picture(trial, tmp_path):
 
 
 def test_names_and_formulas_with_dollars_are_no_mathematics(trial, tmp_path):
-    pytest.importorskip("spot")
     names = ("cost$a", "co_st$^b")
     task = Task.from_formula('F "cost$a" & F "co_st$^b"', propositions=names)
     dear = dataclasses.replace(trial, propositions=names, task_text=task.text, task_hoa=task.to_hoa())
@@ -498,7 +496,6 @@ def test_automata_in_dot_and_mermaid_have_every_state_and_transition(name, tmp_p
 
 
 def test_no_name_is_markup_of_mermaid():
-    pytest.importorskip("spot")
     text = to_mermaid(Task.from_formula('F "a<b>#1"', propositions=("a<b>#1",)))
     assert "a#lt;b#gt;#35;1" in text
     assert not re.search(r"a<b|#1\b(?!24)", text)
@@ -512,7 +509,6 @@ def test_pictures_are_reproducible(tmp_path):
 
 
 def test_automaton_with_one_state():
-    pytest.importorskip("spot")
     with pytest.warns(TaskWarning):
         task = Task.from_formula("true")
     assert task.dfa.num_states == 1

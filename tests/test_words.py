@@ -52,7 +52,6 @@ def test_states_say_what_is_asked_for():
     ],
 )
 def test_words_follow_the_guard_for_other_formulas(formula, words):
-    pytest.importorskip("spot")
     task = Task.from_formula(formula)
     assert state_words(task, task.dfa.initial) == words
 
@@ -68,7 +67,6 @@ def test_waiting_and_failing():
 
 
 def test_many_alternatives_are_counted():
-    pytest.importorskip("spot")
     task = Task.from_formula("F(a | b | c | d | e | g)")
     assert state_words(task, task.dfa.initial) == "find a, b, c or one of 3 more"
     assert MAX_ALTERNATIVES == 4
