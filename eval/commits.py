@@ -27,7 +27,7 @@ import numpy as np
 
 from eval.limit.rows import append_row, read_rows
 from potlp_jax.cache import enable_compilation_cache
-from potlp_jax.errors import TaskError, TaskWarning
+from potlp_jax.errors import SpotMissingError, TaskError, TaskWarning
 from potlp_jax.planning.estimates import Estimates
 from potlp_jax.planning.policies import Policy
 from potlp_jax.planning.search.config import BestFirstConfig
@@ -82,6 +82,8 @@ def random_task(rng: np.random.Generator) -> Task:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", TaskWarning)
                 task = Task.from_formula(text, propositions=NAMES)
+        except SpotMissingError:
+            raise
         except TaskError:
             continue
         # A proposition on its own: cells with two are too few to be met by chance.

@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 
-from potlp_jax.errors import TaskError, TaskWarning
+from potlp_jax.errors import SpotMissingError, TaskError, TaskWarning
 from potlp_jax.task.task import Task, TaskSizes
 
 
@@ -32,6 +32,8 @@ def random_tasks(count: int, names: tuple[str, ...], largest: TaskSizes, seed: i
                 # Formulas that everything satisfies are drawn too, and dropped below.
                 warnings.simplefilter("ignore", TaskWarning)
                 task = Task.from_formula(random_formula(rng, names, int(rng.integers(2, 5))), propositions=names)
+        except SpotMissingError:
+            raise
         except TaskError:
             continue
         key = task.dfa.transitions.tobytes()

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import sys
 
 import jax
 import numpy as np
@@ -549,6 +550,16 @@ def test_an_automaton_that_is_not_that_of_a_formula_that_is_not_read_is_said(tmp
         _, said = _command(dataclasses.replace(trial, task_hoa=renamed), tmp_path)
         assert "the task is called 'F goal=1', and its automaton is not that of this formula" in " ".join(said.split())
         assert "the auditor does not read" not in said
+
+
+def test_what_cannot_be_read_without_spot_is_said(tmp_path, monkeypatch):
+    trial = run("toy", "F goal=1", "baseline", 0)
+    monkeypatch.setitem(sys.modules, "spot", None)
+    code, said = _command(trial, tmp_path)
+    assert code == 0
+    assert "'F goal=1', which cannot be read here without Spot: the trial is judged by the automaton" in " ".join(
+        said.split()
+    )
 
 
 def test_a_wrong_translation_is_judged_by_the_formula(trial, monkeypatch):

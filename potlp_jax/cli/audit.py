@@ -116,7 +116,7 @@ def _trial(path: Path) -> tuple[int, list[tuple[str, str]]]:
 
 def _tell_of_automaton(file: str, text: str, task: "Task") -> None:
     """Warn where the automaton of a record decides although its name looks like, or is, a formula."""
-    from potlp_jax.errors import TaskError
+    from potlp_jax.errors import SpotMissingError, TaskError
     from potlp_jax.task.task import Task
     from potlp_jax.verify.audit import NOT_READ, has_table_of
     from potlp_jax.verify.semantics import can_be_judged
@@ -125,6 +125,12 @@ def _tell_of_automaton(file: str, text: str, task: "Task") -> None:
     if not can_be_judged(text, task.propositions):
         try:
             its_own = not has_table_of(Task.from_formula(text, task.propositions), task)
+        except SpotMissingError:
+            logger.warning(
+                f"{file}: the task is called {text!r}, which cannot be read here without Spot: the trial is judged by "
+                "the automaton of its record"
+            )
+            return
         except TaskError:
             # A mere name of an automaton is no formula to Spot, either.
             return

@@ -139,4 +139,12 @@ MUTANTS = (
         ("tests/test_drive.py",),
         "clock_began",
     ),
+    Mutant(
+        PART,
+        "an estimator runs the program of another class",
+        "potlp_jax/compiling.py",
+        "hash(jax.tree.structure((args, kwargs)))",
+        "0",
+        ("tests/test_compiling.py",),
+    ),
 )
