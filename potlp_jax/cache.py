@@ -46,17 +46,23 @@ def enable_compilation_cache(folder: Path | None = None) -> Path | None:
     if chosen:
         return Path(chosen)
     folder = cache_folder() if folder is None else folder
-    if not is_private_folder(folder):
+    if folder is None or not is_private_folder(folder):
         return None
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", LEAST_COMPILE_SECONDS)
     return folder
 
 
-def cache_folder() -> Path:
-    """The user's cache folder for this kind of machine: ``$XDG_CACHE_HOME`` or ``~/.cache``, then ``potlp-jax``."""
+def cache_folder() -> Path | None:
+    """The user's cache folder for this kind of machine: ``$XDG_CACHE_HOME`` or ``~/.cache``, then ``potlp-jax``.
+
+    None for a user without a home, as in a container that runs under a number.
+    """
     base = os.environ.get("XDG_CACHE_HOME", "")
-    root = Path(base) if base else Path.home() / ".cache"
+    try:
+        root = Path(base) if base else Path.home() / ".cache"
+    except RuntimeError:
+        return None
     return root / "potlp-jax" / machine_fingerprint()
 
 

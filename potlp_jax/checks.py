@@ -38,6 +38,8 @@ AT_LEAST_ONE: Kind = Kind(lambda value: value >= 1, "at least 1")
 POSITIVE: Kind = Kind(lambda value: is_number(value) and 0 < value < math.inf, "a positive number")
 FINITE: Kind = Kind(lambda value: is_number(value) and math.isfinite(value), "a finite number")
 NOT_NEGATIVE: Kind = Kind(lambda value: is_number(value) and 0 <= value < math.inf, "a number from 0")
+# jax reads a seed modulo 2**32 (without 64 bits): two would be one.
+SEED: Kind = Kind(lambda value: is_whole(value) and 0 <= value < 2**32, f"a whole number from 0 to {2**32 - 1}")
 SHARE: Kind = Kind(lambda value: is_number(value) and 0 <= value <= 1, "a number from 0 to 1")
 
 

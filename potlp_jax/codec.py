@@ -81,7 +81,9 @@ def differences(before: Any, now: Any, name: str = "") -> list[str]:
         prefix = f"{name}." if name else ""
         keys = sorted({*before, *now})
         return [found for key in keys for found in differences(before.get(key), now.get(key), f"{prefix}{key}")]
-    return [] if before == now else [f"{name} was {_short(before)}, is {_short(now)}".lstrip()]
+    # A number that is none is not equal to itself.
+    equal = before == now or (before != before and now != now)
+    return [] if equal else [f"{name} was {_short(before)}, is {_short(now)}".lstrip()]
 
 
 def _short(value: Any) -> str:

@@ -40,6 +40,7 @@ from potlp_jax.planning.problem import PlanningProblem
 from potlp_jax.planning.search.api import plan_actions
 from potlp_jax.planning.search.config import BestFirstConfig, UctConfig
 from potlp_jax.planning.situation import DecisionConfig
+from potlp_jax.precision import in_32_bits
 from potlp_jax.task.propositions import check_propositions, in_order, require_same_propositions
 from potlp_jax.task.task import Task
 from potlp_jax.types import NO_ACTION, NO_STATE, NO_SUBGOAL, Status
@@ -224,14 +225,19 @@ def load_program(folder: Path | str, name: str, propositions: Sequence[str]) -> 
             raise ExportError(f"{folder} holds no program {name!r}; it has: {one_line(', '.join(functions))}")
         entry = functions[name]
         file, digest = folder / Path(entry["file"]).name, entry["sha256"]
-        names = [value["name"] for value in entry["inputs"]]
+        wanted = {value["name"]: f"{value['dtype']}{value['shape']}" for value in entry["inputs"]}
         results = [value["name"] for value in entry["outputs"]]
     program = _load(file, digest)
 
+    @in_32_bits
     def call(**inputs: Any) -> dict[str, Array]:
-        if set(inputs) != set(names):
-            raise ExportError(f"{name} takes exactly {', '.join(names)}; found {', '.join(inputs)}")
-        return dict(zip(results, program.call(*[inputs[each] for each in names]), strict=True))
+        if set(inputs) != set(wanted):
+            raise ExportError(f"{name} takes exactly {', '.join(wanted)}; found {', '.join(inputs)}")
+        try:
+            return dict(zip(results, program.call(*[inputs[each] for each in wanted]), strict=True))
+        except (TypeError, ValueError) as error:
+            takes = ", ".join(f"{each}: {kind}" for each, kind in wanted.items())
+            raise ExportError(f"{name} takes arrays of these types and shapes: {takes}; {one_line(error)}") from error
 
     return call
 

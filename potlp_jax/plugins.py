@@ -4,6 +4,7 @@ Environments, policies, cameras and estimators of other packages are found here,
 its own. A name is resolved again in every process, so it means the same in the workers of a sweep.
 """
 
+import functools
 import hashlib
 import importlib
 import importlib.metadata
@@ -43,7 +44,7 @@ def is_known(name: str, group: str) -> bool:
 
 def reference_of(found: Any) -> str:
     """``module:attribute`` of a function or class, or of the class of anything else: how records name it."""
-    named = found if hasattr(found, "__qualname__") else type(found)
+    named = _named(found)
     return f"{named.__module__}:{named.__qualname__}"
 
 
@@ -57,12 +58,19 @@ def source_digest(found: Any) -> str | None:
 
     None where there is no file, as in a notebook.
     """
-    named = found if hasattr(found, "__qualname__") else type(found)
     try:
-        file = inspect.getsourcefile(named)
+        file = inspect.getsourcefile(_named(found))
         return None if file is None else hashlib.sha256(Path(file).read_bytes()).hexdigest()[:12]
     except (OSError, TypeError):
         return None
+
+
+def _named(found: Any) -> Any:
+    """What has a name and a file: the function within a ``partial``, or within what ``jax.jit`` makes of it."""
+    while isinstance(found, functools.partial):
+        found = found.func
+    found = inspect.unwrap(found)
+    return found if hasattr(found, "__qualname__") else type(found)
 
 
 def load(name: str, *, group: str, kind: str, known: Iterable[str] = ()) -> Any:
@@ -85,6 +93,10 @@ def load(name: str, *, group: str, kind: str, known: Iterable[str] = ()) -> Any:
         return _attribute(match["module"], match["attribute"], f"{kind} {name!r}")
     found = importlib.metadata.entry_points(group=group, name=name)
     for entry in found:
+        if not entry.attr:
+            raise PluginError(
+                f"{kind} {name!r}: its entry point {entry.value!r} names no attribute: write module:attribute"
+            )
         return _attribute(entry.module, entry.attr, f"{kind} {name!r} (entry point {entry.value!r})")
     choices = ", ".join([*known, *entry_points(group)])
     raise PluginError(f"unknown {kind} {name!r}; choose one of: {choices}; or write module:attribute")

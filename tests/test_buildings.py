@@ -101,6 +101,13 @@ def test_metres_and_levels_without_floors(office):
     assert not read.free[read.frame.metres_to_cell(-0.5, 20)]
 
 
+def test_places_of_the_file_that_cannot_be_reached_are_said(office):
+    office.write_text(TWO_ROOMS.replace("DOOR", "hinged").replace('[0, 0, 0, ""]', "[0, 0, 0, corner]"))
+    with pytest.warns(MapWarning, match="places that the robot cannot reach are left out: corner"):
+        generator = make(f"map:{office},level=L1")
+    assert generator.propositions == ("pantry", "desk")
+
+
 def test_the_places_of_the_file_are_the_propositions_of_its_worlds(office):
     generator = make(f"map:{office},level=L1")
     assert generator.propositions == ("pantry", "desk")
@@ -312,3 +319,11 @@ def test_floors_of_kth_are_closed(external_data, name):
     edge = np.concatenate([read.free[0], read.free[-1], read.free[:, 0], read.free[:, -1]])
     assert not edge.any()
     assert clean_map(read).area.reachable > 0.4 * clean_map(read).area.resampled
+
+
+def test_entities_are_found_in_every_encoding(tmp_path):
+    file = tmp_path / "floor.world"
+    text = "<?xml version='1.0' encoding='UTF-16'?><!DOCTYPE a [<!ENTITY b 'c'>]><sdf>&b;</sdf>"
+    file.write_bytes(text.encode("utf-16"))
+    with pytest.raises(MapError, match="declares entities"):
+        load_building(file)

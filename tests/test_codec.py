@@ -123,6 +123,11 @@ def test_differences_are_named_with_both_values():
     assert len(differences("x" * 1000, "", "text")[0]) < 120
 
 
+def test_a_number_that_is_none_does_not_differ_from_itself():
+    assert differences({"a": math.nan}, {"a": float("nan")}) == []
+    assert differences({"a": math.nan}, {"a": 1.0}) == ["a was NaN, is 1.0"]
+
+
 def test_numbers_that_are_not_finite_have_a_form_in_json():
     values = {"cost": math.inf, "list": (1.0, -math.inf, math.nan), "text": "inf", "count": 3}
     text = finite_or_text(values)

@@ -17,6 +17,7 @@ import pytest
 from flax import struct
 
 from examples.own_environment import Corridor
+from potlp_jax.codec import differences
 from potlp_jax.engine.engine import Broken, Here
 from potlp_jax.engine.opening import open_engine
 from potlp_jax.environments.firefighting import Firefighting
@@ -30,7 +31,7 @@ from potlp_jax.learning.dataset_reading import read_dataset
 from potlp_jax.learning.questions import TaskDistribution
 from potlp_jax.learning.recording import overflow_in_words
 from potlp_jax.learning.scenes import survey
-from potlp_jax.recipes.collection import CollectConfig, collect, collection_of, summary
+from potlp_jax.recipes.collection import CollectConfig, collect, collection_of, dataset_metadata, summary
 from potlp_jax.recipes.exploration import Explorer, ExplorerConfig
 from potlp_jax.task.task import Task
 from potlp_jax.world.camera import CameraConfig
@@ -233,7 +234,7 @@ def test_an_environment_of_ones_own_is_collected(tmp_path):
     assert (config.camera.far, config.look_every, config.disturbance.noise) == (25.0, 3, 2.0)
     collect(Dim(), "dim", Split.VALIDATION, 1, tmp_path, config)
     metadata, samples = read_metadata(tmp_path), read_dataset(tmp_path)
-    assert set(metadata.generator) == {"source"}
+    assert set(metadata.generator) == {"source", "first_world"}
     assert metadata.camera["far"] == 25.0
     assert decode(samples.images[0]).shape == (64, 128, 3)
 
@@ -257,6 +258,47 @@ def test_a_collection_does_not_go_on_after_its_environment_has_changed(tmp_path,
     monkeypatch.setattr("potlp_jax.plugins.source_digest", lambda found: "another")
     with pytest.raises(DatasetError, match=r"collected otherwise .*source"):
         collect(Mine(), "mine", Split.VALIDATION, 2, tmp_path, config)
+
+
+def test_a_collection_does_not_go_on_with_another_world_of_the_same_name(tmp_path, monkeypatch):
+    """As a map or labels that were edited are."""
+    config = dataclasses.replace(collection_of(Corridor()), worlds_per_shard=1, views_per_world=2)
+    collect(Corridor(), "mine", Split.VALIDATION, 1, tmp_path, config)
+    generate = Corridor.generate
+
+    def edited(self, key):
+        world = generate(self, key)
+        return world.replace(letters=world.letters.at[tuple(world.start.tolist())].set(1))
+
+    monkeypatch.setattr(Corridor, "generate", edited)
+    with pytest.raises(DatasetError, match=r"collected otherwise .*first_world"):
+        collect(Corridor(), "mine", Split.VALIDATION, 2, tmp_path, config)
+
+
+def test_a_collection_does_not_go_on_with_another_camera_of_the_same_name(tmp_path, monkeypatch):
+    (tmp_path / "lens.py").write_text("from potlp_jax.world.renderer import *\ndef look(world, cell, config): pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    camera = CameraConfig(renderer="lens:look")
+    config = dataclasses.replace(collection_of(Corridor()), camera=camera)
+    before = dataset_metadata(Corridor(), "mine", Split.VALIDATION, config)
+    (tmp_path / "lens.py").write_text("def look(world, cell, config): return None\n")
+    after = dataset_metadata(Corridor(), "mine", Split.VALIDATION, config)
+    found = differences(before.generator, after.generator)
+    assert [text.partition(" was ")[0] for text in found] == ["renderer_source"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"travel_factor": math.nan}, "travel_factor is nan; give a positive number"),
+        ({"travel_factor": -1.0}, "travel_factor is -1.0"),
+        ({"random_frontier": 5.0}, "random_frontier is 5.0; give a number from 0 to 1"),
+        ({"replan_distance": math.nan}, "replan_distance is nan"),
+    ],
+)
+def test_explorers_that_mean_nothing_are_refused(changes, message):
+    with pytest.raises(DatasetError, match=message):
+        ExplorerConfig(**changes)
 
 
 def test_fewer_worlds_than_there_are_is_said(tmp_path):
@@ -367,6 +409,7 @@ def test_the_explorer_sees_much_of_the_building_and_walks_through_known_cells(co
         ({"spacing": (9.0, 2.0)}, "give the least and the most"),
         ({"spacing": (0.0, math.inf)}, "give the least and the most"),
         ({"seed": -1}, "seed is -1"),
+        ({"seed": 2**32}, "seed is 4294967296; give a whole number from 0 to 4294967295"),
         ({"staying_sets": 1}, "staying_sets is 1; give at least 2"),
         ({"image_format": "bmp"}, "image_format is 'bmp'; choose jpeg or png"),
         ({"quality": 200}, "quality is 200; give a number from 0 to 100"),

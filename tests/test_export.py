@@ -276,3 +276,18 @@ def test_loaded_programs_name_what_is_missing(exported):
         load_program(exported, "nothing", Toy.propositions)
     with pytest.raises(ValueError, match="takes exactly travel"):
         load_program(exported, "plan", Toy.propositions)(travel=np.zeros(1))
+
+
+def widened(array):
+    return np.asarray(array, np.float64) if array.dtype == np.float32 else array
+
+
+def test_loaded_programs_take_64_bits_and_name_what_has_another_shape(situation, exported):
+    program, inputs = load_program(exported, "plan", Toy.propositions), plan_inputs(situation.task, 0)
+    expected = program(**inputs)
+    with jax.enable_x64(True):
+        found = program(**{name: widened(value) for name, value in inputs.items()})
+    for name, value in expected.items():
+        np.testing.assert_array_equal(found[name], value)
+    with pytest.raises(ExportError, match=r"plan takes arrays of these types and shapes: travel: float32\["):
+        program(**inputs | {"travel": inputs["travel"][0]})

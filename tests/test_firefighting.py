@@ -247,6 +247,8 @@ def test_the_same_key_gives_the_same_world():
         ({"fire_thickness": 0}, "fire_thickness"),
         ({"dead_end_opens_into_robot_room": 1.5}, "probability"),
         ({"patch_radius": 20}, "two patches"),
+        ({"patch_radius": 10}, "beside a patch of 21x21 cells in the middle another must fit the 60x"),
+        ({"dead_end_fraction": float("nan")}, "dead_end_fraction is nan; give a number from 0 to 1"),
         ({"smoke_density": 2.0}, "smoke_density"),
         ({"tile_size": 0}, "tiles"),
     ],
@@ -268,3 +270,11 @@ def test_the_calibrated_building_is_frozen():
         for array in (world.occupied, world.letters, world.start):
             digest.update(np.asarray(array).tobytes())
     assert digest.hexdigest() == FROZEN
+
+
+def test_the_largest_patches_have_a_place_in_every_world():
+    generator = Firefighting(FirefightingConfig(patch_radius=9))
+    for index in range(60):
+        letters = np.asarray(generator.world(index).letters)
+        for name in ("extinguisher", "exit"):
+            assert np.sum((letters >> generator.propositions.index(name)) & 1) == 19 * 19

@@ -255,6 +255,14 @@ def test_where_outlines_overlap_the_smaller_room_is_kept_whole(tmp_path):
     assert _is_connected(found)
 
 
+def test_a_folder_of_plans_has_one_name_from_wherever_it_is_written(tmp_path, monkeypatch):
+    (tmp_path / "plans").mkdir()
+    _academic().write(tmp_path / "plans", "school")
+    names = {make(f"floorplan:{tmp_path / 'plans'}").name}
+    monkeypatch.chdir(tmp_path / "plans")
+    assert names | {make("floorplan:.").name, make("floorplan:../plans").name} == {"floorplan:plans"}
+
+
 @pytest.mark.parametrize(("pixels", "real", "unit", "factor"), [("18", "90", "cm", 2), ("9", "1.8", "m", 0.5)])
 def test_the_scale_is_the_files(tmp_path, pixels, real, unit, factor):
     plain, scaled = _academic(), _academic()

@@ -542,3 +542,18 @@ def test_what_the_cells_cut_off_on_a_large_map(external_data):
 def test_inspect_names_a_threshold_that_is_wrong(external_data):
     found = as_json("map", "inspect", external_data / "maps/quirks/pal_office_freethresh025.yaml")
     assert "set free_thresh to 0.196 or less" in found["defects"][0]
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["map label . --place a=1,2", "map preview . --out x.png", "run parcels:.", "run map:.", "map inspect ."],
+)
+def test_a_folder_in_place_of_a_file_is_named(words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, words.split())
+    assert (result.exit_code, "is a folder" in result.output) == (2, True), result.output
+
+
+def test_a_clean_map_needs_a_name(office):
+    result = potlp("map", "clean", office, "--out", ".")
+    assert (result.exit_code, "--out . is a folder" in result.output) == (2, True), result.output

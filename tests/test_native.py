@@ -193,3 +193,15 @@ def test_the_command_says_what_is_used(path):
     lines = result.stdout.splitlines()
     assert [line.partition(":")[0] for line in lines] == list(libraries.LIBRARIES)
     assert result.returncode == int(any("JAX twin, because" in line for line in lines))
+
+
+def test_a_user_without_a_home_has_no_cache_and_native_kernels(monkeypatch):
+    """As in a container that runs under a number."""
+
+    def homeless():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", homeless)
+    assert build.cache_folder() is None
+    assert build.built_library("paths").is_file()

@@ -1,8 +1,10 @@
 """Environments, policies, cameras and estimators of others, by ``module:attribute`` and by entry point."""
 
+import functools
 import sys
 from typing import ClassVar
 
+import jax
 import jax.numpy as jnp
 import pytest
 
@@ -96,7 +98,12 @@ def installed(elsewhere):
     folder = elsewhere / "foreign-1.0.dist-info"
     folder.mkdir()
     (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: foreign\nVersion: 1.0\n")
-    lines = ["[potlp_jax.environments]", "small = foreign_worlds:Small", "gone = foreign_worlds:Gone"]
+    lines = [
+        "[potlp_jax.environments]",
+        "small = foreign_worlds:Small",
+        "gone = foreign_worlds:Gone",
+        "bare = foreign_worlds",
+    ]
     (folder / "entry_points.txt").write_text("\n".join(lines))
     sys.path.insert(0, str(elsewhere))
 
@@ -122,7 +129,7 @@ def test_an_environment_is_a_class_an_object_or_a_function(elsewhere, name, heig
 
 def test_an_environment_by_entry_point(installed):
     assert make("small").name == "small"
-    assert plugins.entry_points("potlp_jax.environments") == ("gone", "small")
+    assert plugins.entry_points("potlp_jax.environments") == ("bare", "gone", "small")
     assert completion.complete_environment("s") == ["small"]
 
 
@@ -130,8 +137,12 @@ def test_an_environment_by_entry_point(installed):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("mars", f"unknown environment 'mars'; choose one of: {', '.join([*FAMILIES, 'gone', 'small'])}; or write "),
+        (
+            "mars",
+            f"unknown environment 'mars'; choose one of: {', '.join([*FAMILIES, 'bare', 'gone', 'small'])}; or",
+        ),
         ("gone", "environment 'gone' (entry point 'foreign_worlds:Gone'): foreign_worlds has no attribute 'Gone'"),
+        ("bare", "environment 'bare': its entry point 'foreign_worlds' names no attribute: write module:attribute"),
         ("foreign_worlds:number", "environment 'foreign_worlds:number': int is no environment"),
         ("foreign_worlds:Big", "foreign_worlds has no attribute 'Big'"),
         ("foreign_worlds:Undrawn", "cannot be made: Can't instantiate abstract class Undrawn"),
@@ -183,6 +194,13 @@ def test_what_comes_with_the_package_is_known_by_its_commit(tmp_path):
     store = Store(tmp_path / RESULTS, read_only=True)
     assert "source" not in store.facts()
     store.close()
+
+
+def test_a_function_within_others_is_known_by_its_own_name_and_file(elsewhere):
+    nearest = plugins.load("foreign_worlds:nearest", group=plugins.POLICIES, kind="policy")
+    for found in (functools.partial(nearest), functools.partial(functools.partial(nearest)), jax.jit(nearest)):
+        assert plugins.reference_of(found) == "foreign_worlds:nearest"
+        assert plugins.source_digest(found) == plugins.source_digest(nearest) is not None
 
 
 def test_references_are_told_from_names_and_files():

@@ -7,6 +7,7 @@ import pytest
 
 from potlp_jax.environments.rooms import Rooms
 from potlp_jax.environments.toy import Toy, ToyConfig
+from potlp_jax.errors import WorldError
 from potlp_jax.rl.episodes import OUTCOME_NAMES, StepType, TaskEnv
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.loop import run_trial
@@ -178,3 +179,12 @@ def test_the_gymnasium_wrapper_passes_gymnasiums_own_check():
         assert observation in wrapped.observation_space
         cost, ended = cost - reward, terminated or truncated
     assert cost == pytest.approx(info["cost"], rel=1e-5) or info["outcome"] != "satisfied"
+
+
+def test_worlds_that_do_not_go_together_are_named():
+    toy, wide = Toy().world(0), Toy(ToyConfig(width=21)).world(0)
+    task = Toy().task("2")
+    with pytest.raises(WorldError, match=r"world 1 is of the family 'toy' and has \(9, 21\) cells, the first"):
+        TaskEnv([toy, wide], task)
+    with pytest.raises(WorldError, match="give worlds of one family with the same settings"):
+        TaskEnv([toy, toy.replace(family="another")], task)

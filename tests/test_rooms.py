@@ -7,6 +7,7 @@ import pytest
 from scipy import ndimage
 
 from potlp_jax.environments.rooms import Rooms, RoomsConfig
+from potlp_jax.errors import WorldError
 
 
 @pytest.mark.parametrize("room", [3, 4, 5])
@@ -30,3 +31,12 @@ def test_tasks_hold_names_of_any_kind():
     names = ("my room", "U", "küche", "b")
     rooms = Rooms(RoomsConfig(propositions=names))
     assert all(rooms.task(number).propositions == names for number in ("1", "2"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [({"propositions": ()}, "propositions is empty"), ({"loops": float("nan")}, "loops is nan; give a number from 0")],
+)
+def test_floors_that_cannot_be_are_refused(changes, message):
+    with pytest.raises(WorldError, match=message):
+        RoomsConfig(**changes)

@@ -134,6 +134,8 @@ def write_clean_map(
     from potlp_jax.environments.ros.map_writer import save_map
 
     image_map = load_building(file, level)
+    if not out.name:
+        fail(f"--out {out} is a folder; give the name of a map to write")
     # A cleaned map has lost what was cleaned away, so that it must not replace its source by accident.
     own = {path.resolve() for path in (image_map.settings.file, image_map.settings.image)}
     if own & {out.resolve(), out.with_suffix(".pgm").resolve()}:

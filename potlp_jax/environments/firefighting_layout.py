@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
-from potlp_jax.checks import require_rules
+from potlp_jax.checks import SHARE, require_fields, require_rules
 from potlp_jax.errors import WorldError
 
 Cell = tuple[int, int]
@@ -303,6 +303,8 @@ def _smoke(
 
 
 def _check(config: FirefightingConfig) -> None:
+    # First, because lengths follow from it.
+    require_fields(config, ("dead_end_fraction",), SHARE, WorldError)
     used = (HALLWAYS - 1) * config.hallway_spacing + config.hallway_width
     low, high = config.fire_range
     patch = 2 * config.patch_radius + 1
@@ -316,6 +318,12 @@ def _check(config: FirefightingConfig) -> None:
         (
             config.patch_radius >= 0 and patch <= config.room_width and 2 * patch <= config.room_height,
             f"two patches of {patch}x{patch} cells must fit the {config.room_height}x{config.room_width} room",
+        ),
+        # Wherever the first one lies there must be a place for the other: in the middle, it leaves the least.
+        (
+            max(config.room_height, config.room_width) >= 3 * patch - 1,
+            f"beside a patch of {patch}x{patch} cells in the middle another must fit the "
+            f"{config.room_height}x{config.room_width} room",
         ),
         (config.dead_end_wall >= 1 and config.alarm_depth >= 1, "dead_end_wall and alarm_depth must be at least 1"),
         (config.fire_thickness >= 1, "fire_thickness must be at least 1"),

@@ -10,6 +10,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Int32, PRNGKeyArray
 
+from potlp_jax.checks import SHARE, require_fields
 from potlp_jax.environments.base import Generator, host_generators
 from potlp_jax.errors import WorldError
 from potlp_jax.task.propositions import in_formula
@@ -53,6 +54,9 @@ class RoomsConfig:
             )
         if not 1 <= self.door_width < self.room or self.patches < 1 or not 0 <= self.patch_radius < self.room // 2:
             raise WorldError("door_width, patches and patch_radius must be positive and smaller than a room")
+        if not self.propositions:
+            raise WorldError("propositions is empty; give at least one")
+        require_fields(self, ("loops", "obstacles"), SHARE, WorldError)
 
 
 class Rooms(Generator):

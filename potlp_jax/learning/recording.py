@@ -17,7 +17,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Int32, UInt8
 
-from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, require_fields
+from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, SEED, require_fields
 from potlp_jax.codec import json_copy
 from potlp_jax.compiling import jit_by_class
 from potlp_jax.errors import DatasetError
@@ -87,7 +87,8 @@ class RecordingConfig:
 
     def __post_init__(self) -> None:
         require_fields(self, ("views_per_world", "classes", "tasks_per_world"), AT_LEAST_ONE, DatasetError)
-        require_fields(self, ("seed", "look_every"), NOT_NEGATIVE, DatasetError)
+        require_fields(self, ("look_every",), NOT_NEGATIVE, DatasetError)
+        require_fields(self, ("seed",), SEED, DatasetError)
         if not 0 <= self.spacing[0] <= self.spacing[1] < math.inf:
             raise DatasetError(f"spacing is {self.spacing}: give the least and the most, in cells")
         # A sheet of questions goes from one set to another (``question_sheet``).

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, require_fields
+from potlp_jax.checks import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SEED, SHARE, require_fields
 from potlp_jax.errors import TrainingError
 from potlp_jax.learning.augmentation import Augmentation
 
@@ -48,9 +48,8 @@ class TrainingOptions:
         require_fields(self, names, AT_LEAST_ONE, TrainingError)
         require_fields(self, ("weighting", "warmup", "average_decay"), SHARE, TrainingError)
         require_fields(self, ("learning_rate", "clip_norm"), POSITIVE, TrainingError)
-        require_fields(
-            self, ("seed", "weight_decay", "cost_share", "view_share", "patience"), NOT_NEGATIVE, TrainingError
-        )
+        require_fields(self, ("weight_decay", "cost_share", "view_share", "patience"), NOT_NEGATIVE, TrainingError)
+        require_fields(self, ("seed",), SEED, TrainingError)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -119,9 +119,9 @@ def built_library(name: str) -> Path:
 def _folder() -> Path:
     """Where libraries are kept."""
     # Whoever can write to the folder can run code here.
-    kept = cache_folder() / "native"
-    if not is_switched_on(CACHE_SWITCH) and is_private_folder(kept.parent) and is_private_folder(kept):
-        return kept
+    cache = None if is_switched_on(CACHE_SWITCH) else cache_folder()
+    if cache is not None and is_private_folder(cache) and is_private_folder(cache / "native"):
+        return cache / "native"
     folder = tempfile.mkdtemp(prefix="potlp-native-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return Path(folder)

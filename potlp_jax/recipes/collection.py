@@ -54,9 +54,10 @@ from potlp_jax.task.task import Task
 from potlp_jax.trials.config import trial_config_for
 from potlp_jax.trials.loop import versions
 from potlp_jax.trials.robot import photograph_after
-from potlp_jax.world.camera import Disturbance
-from potlp_jax.world.grid import World
+from potlp_jax.world.camera import CameraConfig, Disturbance
+from potlp_jax.world.grid import World, world_digest
 from potlp_jax.world.moves import Cell
+from potlp_jax.world.renderer import renderer_of
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -255,18 +256,21 @@ def dataset_metadata(generator: Generator, environment: str, split: Split, confi
         propositions=generator.propositions,
         environment=environment,
         family=world.family,
-        generator=_described(generator),
+        generator=_described(generator, world, config.camera),
         split=split.value,
         unit=unit_of(resolution),
         resolution=resolution,
     )
 
 
-def _described(generator: Generator) -> dict[str, Any]:
-    """What makes the worlds what they are: the configuration, and of a family of one's own the file that defines it."""
-    config = {} if generator.config is None else json_copy(dataclasses.asdict(generator.config))
-    source = None if plugins.is_ours(generator) else plugins.source_digest(generator)
-    return config if source is None else {**config, "source": source}
+def _described(generator: Generator, first: World, camera: CameraConfig) -> dict[str, Any]:
+    """What makes the worlds and pictures what they are: configuration, first world, and the files of one's own code."""
+    found = {} if generator.config is None else json_copy(dataclasses.asdict(generator.config))
+    # Maps, labels and plans are read from files, whose names stay when they are edited.
+    found["first_world"] = world_digest(first)
+    own = {"source": generator, "renderer_source": renderer_of(camera)}
+    digests = {name: plugins.source_digest(thing) for name, thing in own.items() if not plugins.is_ours(thing)}
+    return found | {name: digest for name, digest in digests.items() if digest is not None}
 
 
 def _recorded(job: _Job, shard: int) -> Iterator[Recorder]:

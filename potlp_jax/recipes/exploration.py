@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int32
 
+from potlp_jax.checks import NOT_NEGATIVE, POSITIVE, SHARE, require_fields
+from potlp_jax.errors import DatasetError
 from potlp_jax.learning.questions import LARGEST
 from potlp_jax.learning.scenes import Pose
 from potlp_jax.planning.distances.paths import KnownPath, shortest_path
@@ -53,6 +55,12 @@ class ExplorerConfig:
     travel_factor: float = 6.0
     sensor: SensorConfig = SensorConfig()
     frontiers: FrontierConfig = FrontierConfig()
+
+    def __post_init__(self) -> None:
+        """Raises DatasetError on values that make no explorer."""
+        require_fields(self, ("random_frontier",), SHARE, DatasetError)
+        require_fields(self, ("replan_distance",), NOT_NEGATIVE, DatasetError)
+        require_fields(self, ("travel_factor",), POSITIVE, DatasetError)
 
 
 class Explorer:

@@ -147,7 +147,7 @@ class TaskEnv:
         Raises:
             PropositionsError: a world has other propositions than the task.
             TaskError: every word satisfies the task.
-            WorldError: there is no world.
+            WorldError: there is no world, or two differ in shape, family or settings.
         """
         if not worlds:
             raise WorldError("there is no world to begin an episode in: give at least one")
@@ -155,7 +155,14 @@ class TaskEnv:
             require_same_propositions(task.propositions, world.propositions, asker=f"the task {task.text!r}")
         if task.dfa.accepting[task.dfa.initial]:
             raise TaskError(f"there is nothing to do for {task.text!r}: every word satisfies it")
-        # Their settings are static and must agree too, which jax.tree.map checks.
+        first = worlds[0]
+        for number, world in enumerate(worlds):
+            if (world.shape, world.family, world.settings) != (first.shape, first.family, first.settings):
+                raise WorldError(
+                    f"world {number} is of the family {world.family!r} and has {world.shape} cells, the first is of "
+                    f"{first.family!r} and has {first.shape}: give worlds of one family with the same settings, and "
+                    "of one shape (world.grid.pad_world)"
+                )
         self.worlds: World = jax.tree.map(lambda *leaves: jnp.stack(leaves), *worlds)
         self.task = task
         self.config: TrialConfig = config_in(worlds[0], config)

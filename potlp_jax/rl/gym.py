@@ -6,9 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from potlp_jax.checks import COUNT
 from potlp_jax.environments.base import Generator
 from potlp_jax.environments.registry import make
 from potlp_jax.environments.splits import Split
+from potlp_jax.errors import WorldError
 from potlp_jax.rl.episodes import OUTCOME_NAMES, EnvState, Observation, TaskEnv, TimeStep
 from potlp_jax.task.task import Task
 
@@ -43,6 +45,8 @@ class GymTaskEnv(gymnasium.Env[dict[str, np.ndarray], np.int64]):
             split: from which they are taken.
         """
         self._generator = make(environment) if isinstance(environment, str) else environment
+        if not COUNT.allows(worlds):
+            raise WorldError(f"worlds is {worlds}; give {COUNT.wanted}")
         self._worlds, self._split = worlds, split
         asked = task if isinstance(task, Task) else self._generator.task(task)
         self.env = TaskEnv([self._generator.world(0, split)], asked)

@@ -8,7 +8,6 @@ import dataclasses
 import itertools
 import logging
 from collections.abc import Callable, Iterable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from potlp_jax.sweep.specification import Cell, Specification
 from potlp_jax.sweep.store import POSSIBLE, Item, Row, Store, has_tables
 from potlp_jax.sweep.work import Examined, Unit, Work, do
 from potlp_jax.trials.record import Trial
+from potlp_jax.world.renderer import renderer_of
 
 logger = logging.getLogger(__name__)
 
@@ -217,8 +217,8 @@ class Sweep:
         found: dict[str, Any] = {name: self.work.generator(name) for name in names}
         found |= {name: named_policy(name) for name in specification.policies}
         if specification.estimator is not None and plugins.is_known(specification.estimator, plugins.ESTIMATORS):
-            estimator = named_estimator(specification.estimator)
-            found[specification.estimator] = estimator.func if isinstance(estimator, partial) else estimator
+            found[specification.estimator] = named_estimator(specification.estimator)
+        found[specification.config.camera.renderer] = renderer_of(specification.config.camera)
         own = {name: thing for name, thing in found.items() if not plugins.is_ours(thing)}
         digests = {name: plugins.source_digest(thing) for name, thing in own.items()}
         return {name: digest for name, digest in digests.items() if digest is not None}

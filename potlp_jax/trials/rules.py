@@ -14,7 +14,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, ArrayLike, Bool, Float32, Int8, Int32, PRNGKeyArray, UInt32
 
-from potlp_jax.errors import PotlpError
+from potlp_jax.checks import SEED
+from potlp_jax.errors import ConfigurationError, PotlpError
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import TrainedEstimator, estimator_for
 from potlp_jax.learning.labels import TrueMapEstimator
@@ -22,6 +23,7 @@ from potlp_jax.planning.commitment import Intention
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.move import Move, MoveKind
 from potlp_jax.planning.policies import Policy, PolicyFunction
+from potlp_jax.precision import in_32_bits
 from potlp_jax.task.propositions import require_same_propositions
 from potlp_jax.task.task import TaskArrays
 from potlp_jax.trials.config import TrialConfig
@@ -49,9 +51,17 @@ _SATISFIED, _INFEASIBLE, _STUCK, _BUDGET = (
 # Keys. Each use of a trial's key is folded in by its own number, so that no draw depends on how often another is made.
 
 
+@in_32_bits
 def trial_key(world: int, seed: int = 0) -> PRNGKeyArray:
-    """The key of every policy's trial in world number ``world``, in a sweep or alone; ``seed`` gives other draws."""
-    return jax.random.fold_in(jax.random.key(seed), world)
+    """The key of every policy's trial in world number ``world``, in a sweep or alone; ``seed`` gives other draws.
+
+    Raises:
+        ConfigurationError: the seed is none: ``checks.SEED``.
+    """
+    if not SEED.allows(seed):
+        raise ConfigurationError(f"the seed is {seed}; give {SEED.wanted}")
+    # The implementation is named, so that no setting of jax changes what is drawn.
+    return jax.random.fold_in(jax.random.key(seed, impl="threefry2x32"), world)
 
 
 def planning_key(key: PRNGKeyArray) -> PRNGKeyArray:

@@ -238,9 +238,14 @@ def _looked(
     return jnp.take_along_axis(enter, first[None], axis=0)[0]
 
 
+def renderer_of(config: CameraConfig) -> Callable[..., Any]:
+    """The function that draws a camera's pictures. Raises PluginError where there is none of the name."""
+    return plugins.load(config.renderer, group=plugins.CAMERAS, kind="camera") if config.renderer else render
+
+
 def _render_elsewhere(world: World, cell: Int32[Array, "2"], config: CameraConfig) -> UInt8[Array, "rows columns 3"]:
     """The picture of a renderer that is not ours."""
-    picture = plugins.load(config.renderer, group=plugins.CAMERAS, kind="camera")(world, cell, config)
+    picture = renderer_of(config)(world, cell, config)
     found = getattr(picture, "dtype", type(picture).__name__), getattr(picture, "shape", ())
     wanted = (jnp.uint8, (config.height, config.width, 3))
     # Shapes are known while jit traces, so the check costs nothing later.

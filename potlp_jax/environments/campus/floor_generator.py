@@ -58,8 +58,9 @@ class FloorGenerator(Generator):
         Raises:
             WorldError: the configuration leaves no space for the rooms that the errand needs.
         """
-        # The building does not change with the people in it.
-        floor_key, furnish_key = jax.random.split(key)
+        # The building does not change with the people in it. No setting of jax changes either.
+        with jax.threefry_partitionable(True):
+            floor_key, furnish_key = jax.random.split(key)
         floor = self.draw_floor(floor_key)
         world, placement = furnish(floor, furnish_key, self.errand, self._furnishing, self._shape)
         return self.signed(world), floor, placement

@@ -13,6 +13,7 @@ the world is impossible, and sweeps draw another. ``needs=professor+grad`` leave
 every plan needs is a hallway, where the robot starts, and a place.
 """
 
+import os
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -107,7 +108,8 @@ class FloorPlans(Generator):
         if not floors:
             raise MapError(path, "", "no plan can be used:\n" + "\n".join(self.left_out.values()))
         self.floors: tuple[PlanFloor, ...] = tuple(floors)
-        self.name = f"{FLOOR_PLAN_PREFIX}{path.stem}"
+        # From whatever folder its path is written.
+        self.name = f"{FLOOR_PLAN_PREFIX}{Path(os.path.abspath(path)).stem}"
         self.settings = Settings({**MANY_DOORS, **scaled_to(config.resolution)})
         shapes = np.array([floor.floor.rooms.shape for floor in floors])
         self._shape = int(shapes[:, 0].max()), int(shapes[:, 1].max())

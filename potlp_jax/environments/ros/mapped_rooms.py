@@ -41,6 +41,7 @@ from potlp_jax.environments.ros.cleaning import CleanMap, clean_map, warn_of_cut
 from potlp_jax.environments.ros.occupancy_map import load_map
 from potlp_jax.environments.ros.places import Region, load_regions
 from potlp_jax.errors import MapError, MapWarning
+from potlp_jax.files import require_file
 from potlp_jax.world.grid import World
 from potlp_jax.world.settings import Settings
 
@@ -103,7 +104,10 @@ class MappedRooms(Generator):
                 less than ``LEAST_ROOM`` of them.
         """
         self.config = config
-        file = Path(config.rooms) if config.rooms is not None else Path(config.file).with_suffix(".rooms.yaml")
+        if config.rooms is None:
+            file = require_file(config.file, MapError).with_suffix(".rooms.yaml")
+        else:
+            file = Path(config.rooms)
         if config.rooms is None and not file.exists():
             raise MapError(
                 Path(config.file),

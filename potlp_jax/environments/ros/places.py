@@ -28,7 +28,7 @@ from scipy import ndimage
 from potlp_jax.environments.ros.grid_frame import GridFrame
 from potlp_jax.environments.ros.map_settings import parse_number, parse_numbers, read_yaml
 from potlp_jax.errors import MapError
-from potlp_jax.files import short, write_whole
+from potlp_jax.files import require_file, short, write_whole
 from potlp_jax.task.propositions import MAX_PROPOSITIONS
 
 PLACE_RADIUS = 0.5
@@ -40,6 +40,7 @@ Point = tuple[float | int, float | int]
 
 def places_file(file: Path, level: str | None = None) -> Path:
     """The file of a map's labels: beside it, and of every level that is named one of its own."""
+    require_file(file, MapError)
     return file.with_suffix(".places.yaml" if level is None else f".{level.replace('/', '_')}.places.yaml")
 
 

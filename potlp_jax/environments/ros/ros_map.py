@@ -25,6 +25,7 @@ from potlp_jax.environments.ros.cleaning import CleanMap, clean_map, warn_of_cut
 from potlp_jax.environments.ros.occupancy_map import OccupancyMap
 from potlp_jax.environments.ros.places import Places, load_places, place_letters, places_file
 from potlp_jax.errors import MapError, MapWarning
+from potlp_jax.files import one_line
 from potlp_jax.task.propositions import MAX_PROPOSITIONS
 from potlp_jax.world.grid import World, make_world
 
@@ -163,6 +164,13 @@ def _find_places(config: RosMapConfig, image_map: OccupancyMap) -> Places:
     clean = clean_map(image_map, config.resolution, config.radius)
     named = None if image_map.places is None else reachable_places(image_map.places, clean)
     if named is not None and 0 < len(named.propositions) <= MAX_PROPOSITIONS:
+        lost = [name for name in (image_map.places or named).names if name not in named.names]
+        if lost:
+            warnings.warn(
+                f"{config.file}: places that the robot cannot reach are left out: {one_line(', '.join(lost))}",
+                MapWarning,
+                stacklevel=3,
+            )
         return named
     many = "" if named is None else f"It names {len(named.names)} places: --named of `potlp map label` takes them. "
     # The example in the message has two points that exist on this very map.
