@@ -67,9 +67,8 @@ def source_digest(found: Any) -> str | None:
 
 def _named(found: Any) -> Any:
     """What has a name and a file: the function within a ``partial``, or within what ``jax.jit`` makes of it."""
-    while isinstance(found, functools.partial):
-        found = found.func
-    found = inspect.unwrap(found)
+    while within := found.func if isinstance(found, functools.partial) else getattr(found, "__wrapped__", None):
+        found = within
     return found if hasattr(found, "__qualname__") else type(found)
 
 

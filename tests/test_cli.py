@@ -43,7 +43,10 @@ FAST = ("--simulations", "20")
 
 
 def _potlp(*arguments):
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    # Shown where the test fails.
+    print(result.output)
+    return result
 
 
 def _json(result):
@@ -587,7 +590,9 @@ def _process(code: str) -> subprocess.CompletedProcess[str]:
 
 def test_exit_codes_of_the_process():
     program = Path(sys.executable).with_name("potlp")
-    good = subprocess.run([program, "task", "F a", "--json"], capture_output=True, text=True, timeout=120, check=False)
+    good = subprocess.run(
+        [program, "task", "F goal", "--json"], capture_output=True, text=True, timeout=120, check=False
+    )
     assert good.returncode == 0
     assert json.loads(good.stdout)["accepting"] == [1]
     assert good.stderr == ""

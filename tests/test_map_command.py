@@ -55,7 +55,10 @@ def office(tmp_path):
 
 
 def potlp(*arguments):
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    # Shown where the test fails.
+    print(result.output)
+    return result
 
 
 def as_json(*arguments):

@@ -383,6 +383,17 @@ class Breaks(Rover):
             # Nothing checks types where somebody else makes it.
             object.__setattr__(belief, "cells", None)
             return belief, cell
+        if self.fault == "fraction":
+            belief, cell = super().observe()
+            object.__setattr__(belief, "letters", np.asarray(belief.letters, np.float32))
+            return belief, cell
+        if self.fault in ("letter", "extent"):
+            belief, cell = super().observe()
+            changed = {
+                "letter": {"letters": belief.letters.at[cell].set(9)},
+                "extent": {"extent": belief.extent * 0},
+            }
+            return belief.replace(**changed[self.fault]), cell
         if self.fault == "no map":
             cells[:] = 7
         resolution = 0.5 if self.fault == "resolution" else 1.0
@@ -402,7 +413,10 @@ FAULTS = (
     ("number", "the cell that observe\\(\\) returns is a pair \\(row, column\\), found 5"),
     ("floats", "of whole numbers, found"),
     ("ragged", "found \\(\\(1, 2\\), 3\\)"),
-    ("damaged map", "the map that observe\\(\\) returned raised AttributeError"),
+    ("damaged map", "the cells of the robot's map are object; give whole numbers"),
+    ("letter", r"the robot's map: letters of .* must lie in 0\.\.3, found 0\.\.9"),
+    ("fraction", "the letters of the robot's map are float32; give whole numbers"),
+    ("extent", r"and the extent \[0, 0\]"),
     ("no map", "observe\\(\\) of the robot raised WorldError"),
     ("fractions", "each cell of a leg is a pair \\(row, column\\) of whole numbers, found"),
     ("flat", "each cell of a leg is a pair \\(row, column\\), found 5"),

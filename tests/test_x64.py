@@ -20,7 +20,10 @@ from potlp_jax import (
     UctConfig,
 )
 from potlp_jax.environments.splits import Split, world_key
+from potlp_jax.learning.estimator import estimator_file
+from potlp_jax.learning.serialization import load_estimator
 from potlp_jax.precision import in_32_bits
+from potlp_jax.trials.replay import replay_decision
 from potlp_jax.trials.robot import initial_belief
 from tests.reference.toy_plan import TASK, C, S, plan, problem
 
@@ -148,3 +151,15 @@ def test_arguments_are_rounded_and_results_are_the_callers():
     values, name = doubled({"values": jnp.arange(3.0)}, "kept")
     assert (values.dtype, name) == (np.float32, "kept")
     assert jnp.zeros(1).dtype == np.float64
+
+
+def test_an_estimator_is_read_as_without_the_switch():
+    path = estimator_file("firefighting-panorama")
+    params, *_ = load_estimator(path)
+    expected, *_ = narrow(load_estimator, path)
+    assert_same(params, expected)
+
+
+def test_a_decision_is_searched_again_as_without_the_switch():
+    trial = potlp_jax.run_trial(TOY.world(1), TASK, "oracle", jax.random.key(0), CONFIG, environment="toy")
+    assert_same(replay_decision(trial, 1), narrow(replay_decision, trial, 1))

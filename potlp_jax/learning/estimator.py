@@ -113,7 +113,7 @@ def identity_of(estimator: TrainedEstimator | Estimator) -> str:
     if isinstance(estimator, TrainedEstimator):
         return estimator.identity
     # A plain function goes through jit as a ``Partial``, which is a pytree without leaves.
-    return plugins.reference_of(estimator.func if isinstance(estimator, functools.partial) else estimator)
+    return plugins.reference_of(estimator)
 
 
 @functools.cache

@@ -94,13 +94,21 @@ def paint(
         The painting in which every cell in sight, nearer than ever before, has its colours of this panorama.
 
     Raises:
-        ValueError: the panorama is not as large as the camera's.
+        ValueError: the panorama is not as large as the camera's, or the painting not as the belief.
     """
     # The kernel reads pixels by numbers of the camera.
     if panorama.shape != (camera.height, camera.width, 3):
         raise ValueError(
             f"the panorama has shape {panorama.shape}, must be {(camera.height, camera.width, 3)}: the camera's"
         )
+    # Nor does it look where an array ends.
+    for name in ("floor", "beyond", "distance"):
+        found = getattr(painting, name).shape[:2]
+        if found != belief.cells.shape:
+            raise ValueError(
+                f"the painting's {name} has {found} cells and the belief {belief.cells.shape}: begin with "
+                "blank_painting of the belief's shape, and move it where that grows (moved_painting)"
+            )
     looks = jnp.asarray(_looks(camera, *belief.cells.shape))
     free_until = obstacle_distances(belief.occupied, cell, camera)
     lines = sight_lines(camera, *belief.cells.shape) if glances else _no_lines(camera)

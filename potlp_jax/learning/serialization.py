@@ -22,6 +22,7 @@ from potlp_jax.files import read_npz, reading, require_mapping, short, whole_fil
 from potlp_jax.learning.architectures import ARCHITECTURES, EstimatorConfig, architecture_of
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.network import Params
+from potlp_jax.precision import in_32_bits
 
 ESTIMATOR_FORMAT: str = "potlp-estimator-4"
 """Changed when older files can no longer be read."""
@@ -59,6 +60,7 @@ def save_estimator(
         np.savez(file, **contents)
 
 
+@in_32_bits
 def load_estimator(path: Path | str) -> tuple[Params, EstimatorConfig, Domain, dict[str, Any]]:
     """Parameters, network configuration, domain and metadata of an estimator.
 

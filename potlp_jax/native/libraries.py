@@ -114,6 +114,9 @@ _choice.multiple_results = True
 
 @_choice.def_impl
 def _run(*leaves: jax.Array, **choice: Any) -> list[jax.Array]:
+    # What is bound within ``jit`` would come back here.
+    if jax.config.values["jax_disable_jit"]:
+        return choice["native" if jax.default_backend() == "cpu" else "twin"](*leaves)
     return jax.jit(lambda *leaves: _choice.bind(*leaves, **choice))(*leaves)
 
 

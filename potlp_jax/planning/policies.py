@@ -160,7 +160,37 @@ def _reported_move(policy: PolicyFunction, situation: Situation, *arguments: Any
             f"policy {policy_name(policy)} returned {type(move).__name__}, expected a Move, as planning.move.move_to "
             "makes it"
         )
-    return dataclasses.replace(move, status=move.status | situation.status)
+    move = dataclasses.replace(move, status=move.status | situation.status)
+    return _unless_impossible(situation, move)
+
+
+def _unless_impossible(situation: Situation, move: Move) -> Move:
+    """A user's move; none, flagged INVALID, where its path is no path: simulators believe it, and robots would."""
+    path, free = move.path, situation.belief.free
+    (row, column), (next_row, next_column) = path.cells[:-1].T, path.cells[1:].T
+    step = jnp.maximum(jnp.abs(next_row - row), jnp.abs(next_column - column))
+    is_inside = jnp.all((path.cells[1:] >= 0) & (path.cells[1:] < jnp.array(free.shape, jnp.int32)[None]), axis=1)
+    # Diagonally past no obstacle's corner.
+    passes = free[next_row, next_column] & free[row, next_column] & free[next_row, column]
+    leads = (path.states[1:] >= 0) & (
+        situation.all_transitions[next_row, next_column, path.states[:-1]] == path.states[1:]
+    )
+    is_made = jnp.arange(step.shape[0], dtype=jnp.int32) < path.length
+    begins = jnp.all(path.cells[0] == situation.cell) & (path.states[0] == situation.state)
+    possible = begins & (path.length <= step.shape[0])
+    possible &= jnp.all(~is_made | ((step == 1) & is_inside & passes & leads))
+    stays = KnownPath(
+        cells=jnp.broadcast_to(situation.cell, path.cells.shape),
+        states=jnp.broadcast_to(situation.state, path.states.shape),
+        length=jnp.int32(0),
+        cost=jnp.float32(jnp.inf),
+    )
+    return dataclasses.replace(
+        move,
+        kind=jnp.where(possible, move.kind, MoveKind.NONE),
+        path=jax.tree.map(lambda mine, other: jnp.where(possible, mine, other), path, stays),
+        status=move.status | status_if(~possible, Status.INVALID),
+    )
 
 
 def direct_move(situation: Situation, policy: Policy, config: DecisionConfig) -> Move:
@@ -281,7 +311,8 @@ def planned_move(
     # may already hold the end of the task, which needs no estimates.
     frontier_cell, frontier_state, frontier_cost = nearest_frontier(situation)
     finishes = plan.action == subgoals.mask.shape[0] * task.edge_mask.shape[0]
-    finishes |= invalid & jnp.isfinite(situation.finish_cost)
+    # Nor does a task that is done.
+    finishes |= (invalid | task.accepting[situation.state]) & jnp.isfinite(situation.finish_cost)
     acts = (plan.action != NO_ACTION) & ~finishes
     falls_back = (plan.action == NO_ACTION) & jnp.isfinite(frontier_cost)
     kind = jnp.where(falls_back, MoveKind.FALLBACK, jnp.where(acts, MoveKind.ACTION, MoveKind.NONE))

@@ -85,17 +85,18 @@ class PlanningProblem:
         Returns:
           The problem.
         """
-        # Types alone: values may be traced here, so that nothing can be checked.
+        # Types alone: values may be traced here, so that nothing can be checked. Copies, because a
+        # caller's buffer may be filled anew.
         return cls(
             task=task,
-            travel=jnp.asarray(travel, jnp.float32),
-            finish=jnp.asarray(finish, jnp.float32),
-            success_probability=jnp.asarray(success_probability, jnp.float32),
-            success_cost=jnp.asarray(success_cost, jnp.float32),
-            failure_cost=jnp.asarray(failure_cost, jnp.float32),
-            dfa_state=jnp.asarray(dfa_state, jnp.int32),
-            subgoal_mask=jnp.asarray(subgoal_mask, jnp.bool_),
-            dead_end_cost=jnp.asarray(dead_end_cost, jnp.float32),
+            travel=jnp.array(travel, jnp.float32),
+            finish=jnp.array(finish, jnp.float32),
+            success_probability=jnp.array(success_probability, jnp.float32),
+            success_cost=jnp.array(success_cost, jnp.float32),
+            failure_cost=jnp.array(failure_cost, jnp.float32),
+            dfa_state=jnp.array(dfa_state, jnp.int32),
+            subgoal_mask=jnp.array(subgoal_mask, jnp.bool_),
+            dead_end_cost=jnp.array(dead_end_cost, jnp.float32),
         )
 
     @property

@@ -11,7 +11,7 @@ slots, or no others, they go on from where they are in slots with longer arrays:
 
 import dataclasses
 import time
-from collections.abc import Hashable, Iterable, Iterator
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from functools import partial
 from itertools import chain
 from typing import Any
@@ -21,10 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int32, PRNGKeyArray
 
+from potlp_jax.checks import COUNT
 from potlp_jax.compiling import jit_by_class
 from potlp_jax.errors import BatchError
 from potlp_jax.learning.domain import Domain
-from potlp_jax.learning.estimator import TrainedEstimator
+from potlp_jax.learning.estimator import TrainedEstimator, identity_of
 from potlp_jax.learning.observing import ObservingEstimator
 from potlp_jax.planning.estimates import Estimator
 from potlp_jax.planning.policies import Policy, PolicyFunction, named_policy
@@ -34,6 +35,7 @@ from potlp_jax.task.task import TaskArrays
 from potlp_jax.trials import rules
 from potlp_jax.trials.config import TrialConfig, config_in
 from potlp_jax.trials.record import Outcome
+from potlp_jax.trials.robot import initial_belief
 from potlp_jax.trials.slots import EMPTY, OUTGROWN, Asked, Progress, Scene, Setup, begin, step
 from potlp_jax.world.grid import World
 from potlp_jax.world.moves import length_of
@@ -110,14 +112,14 @@ def run_batch(
             than the first trial of the batch.
         EstimatorError: no estimator is shipped for the first trial's task in its world.
         BatchError: a world or task has another shape than the first one, or its world is of another family or has other
-            settings.
+            settings; or the memory of an estimator does not keep its shape.
 
     Warns:
         PotlpWarning: the estimator given was made for other worlds.
     """
     policy = named_policy(policy)
-    if slots < 1:
-        raise BatchError(f"slots is {slots}, must be at least 1")
+    if not COUNT.allows(slots):
+        raise BatchError(f"slots is {slots}; give {COUNT.wanted}")
     starts = iter(starts)
     first = next(starts, None)
     if first is None:
@@ -127,6 +129,8 @@ def run_batch(
     here = Domain.of_world(first.world, config.camera)
     asked = rules.estimator_of(policy, first.arrays.propositions, here, estimator)
     shared = _nothing_seen(asked, first.world, config)
+    if not isinstance(asked, TrainedEstimator):
+        _check_memory(shared, first.world, config)
 
     def checked(start: Start) -> Start:
         _check_start(start, first)
@@ -141,6 +145,30 @@ def _nothing_seen(asked: TrainedEstimator | Asked, world: World, config: TrialCo
     if not isinstance(asked, TrainedEstimator):
         return asked
     return asked.start(*world.shape, config.panoramas, float(world.resolution))
+
+
+def _check_memory(asked: Asked, world: World, config: TrialConfig) -> None:
+    """Raise BatchError where a memory becomes other arrays: those of a slot stay what they are."""
+    if not isinstance(asked, ObservingEstimator):
+        return
+
+    def remember() -> Any:
+        seen = jnp.zeros((config.camera.height, config.camera.width, 3), jnp.uint8)
+        return asked.remember(asked.encode(seen), initial_belief(world, config), world.start).memory
+
+    before, after = asked.memory, jax.eval_shape(remember)
+    kinds = [
+        [(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in jax.tree.leaves(memory)] for memory in (before, after)
+    ]
+    if jax.tree.structure(before) != jax.tree.structure(after) or kinds[0] != kinds[1]:
+        raise BatchError(
+            f"the memory of {identity_of(asked)} begins as {_as_text(kinds[0])} and is {_as_text(kinds[1])} after a "
+            "picture: in a batch it needs all its arrays from the beginning"
+        )
+
+
+def _as_text(kinds: Sequence[tuple[tuple[int, ...], Any]]) -> str:
+    return ", ".join(f"{kind}{list(shape)}" for shape, kind in kinds) or "nothing"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -227,6 +255,10 @@ def _shown(value: Any) -> Any:
 
 
 def _check_start(start: Start, first: Start) -> None:
+    if not isinstance(start.arrays, TaskArrays):
+        raise BatchError(f"trial {start.name!r}: its arrays are a {type(start.arrays).__name__}; give Task.arrays")
+    if jnp.asarray(start.key).dtype != jnp.asarray(first.key).dtype:
+        raise BatchError(f"trial {start.name!r}: its key is of another kind than the first one's")
     asker = f"the task of trial {start.name!r}"
     require_same_propositions(start.arrays.propositions, start.world.propositions, asker=asker, knower="its world")
     # They are static parts of the arrays, as settings are: JAX could not put both into one batch, and would say so

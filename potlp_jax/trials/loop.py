@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Int32, PRNGKeyArray
 
 from potlp_jax.compiling import jit_by_class
-from potlp_jax.errors import PotlpError, RobotError
+from potlp_jax.errors import PotlpError, RobotError, TaskError
 from potlp_jax.learning.domain import Domain
 from potlp_jax.learning.estimator import TrainedEstimator, identity_of
 from potlp_jax.learning.observing import (
@@ -159,6 +159,7 @@ def drive(
         PropositionsError: the robot's map, task, estimator and ``world`` are not over the same propositions.
         EstimatorError: no estimator is shipped for the task's propositions in such a world.
         PotlpError: the policy is ``oracle`` and there is no ``world``, or ``known-map`` and nothing is ``revealed``.
+        TaskError: ``arrays`` are those of another task.
         BrokenDriveError: the robot raised ``RobotError`` after its first observation.
     """
     policy = named_policy(policy)
@@ -174,6 +175,8 @@ def drive(
     resolution = float(belief.resolution)
     here = Domain.of_robot(resolution) if world is None else Domain.of_world(world, config.camera)
     asked = rules.estimator_of(policy, task.propositions, here, estimator)
+    if arrays is not None:
+        _require_arrays_of(task, arrays)
 
     def first_estimator(shape: tuple[int, int]) -> Estimator | None:
         # An estimator that remembers where it was needs to know how large the map is.
@@ -191,6 +194,18 @@ def drive(
         listener,
     )
     return loop.run(belief, cell)
+
+
+def _require_arrays_of(task: Task, arrays: TaskArrays) -> None:
+    """Raise TaskError where the arrays, whatever their padding, are not those of the task's automaton."""
+    dfa, (states, letters) = task.dfa, task.dfa.transitions.shape
+    same = (
+        np.array_equal(np.asarray(arrays.transitions)[:states, :letters], dfa.transitions)
+        and np.array_equal(np.asarray(arrays.accepting)[:states], dfa.accepting)
+        and int(arrays.initial) == dfa.initial
+    )
+    if not same:
+        raise TaskError(f"the arrays are not those of the task {task.text!r}: give task.padded(sizes), or none")
 
 
 class _Loop:

@@ -31,6 +31,7 @@ from potlp_jax.planning.search.graph import Tree
 from potlp_jax.planning.search.plan import Plan
 from potlp_jax.planning.search.uct import UctTree
 from potlp_jax.planning.situation import DecisionConfig, assess, planning_problem
+from potlp_jax.precision import in_32_bits
 from potlp_jax.task.task import Task, TaskArrays
 from potlp_jax.trials.config import TrialConfig
 from potlp_jax.trials.record import LOG_PREFIX, ROBOT_PREFIX, Decision, Trial
@@ -60,6 +61,7 @@ class Views:
     overlays: Mapping[int, tuple[Overlay, ...]] = dataclasses.field(default_factory=dict)
 
 
+@in_32_bits
 def replay_decision(
     trial: Trial, index: int, estimator: TrainedEstimator | Estimator | None = None
 ) -> tuple[PlanningProblem, Plan, Tree | UctTree]:
@@ -96,7 +98,9 @@ def replay_decision(
         config,
     )
     # The decision's own key: no need to know how it came from the trial's.
-    key = jax.random.wrap_key_data(jnp.asarray(decision.key, jnp.uint32))
+    if len(decision.key) != 2:
+        raise RecordError(f"the decision's key has {len(decision.key)} words: keys of threefry2x32 alone are read")
+    key = jax.random.wrap_key_data(jnp.asarray(decision.key, jnp.uint32), impl="threefry2x32")
     plan, tree = search_tree(problem, key, config.search)
     return problem, plan, tree
 
@@ -114,6 +118,7 @@ def _decision_config_at(trial: Trial, index: int) -> DecisionConfig:
     return config
 
 
+@in_32_bits
 def estimator_at(trial: Trial, index: int, estimator: TrainedEstimator | Estimator | None = None) -> Estimator | None:
     """What a decision of the policies ``oracle`` and ``potlp`` asked, with all that it had seen.
 
@@ -226,6 +231,7 @@ def _panorama_of_step(trial: Trial, step: int, config: TrialConfig) -> UInt8[Arr
     return photograph(trial.world, cell, jax.random.key(0), config.camera, config.disturbance)
 
 
+@in_32_bits
 def views_of(trial: Trial, estimator: TrainedEstimator | Estimator | None = None) -> Views:
     """The panoramas of a trial in simulation, and what its estimator has to show, made again.
 
@@ -251,6 +257,7 @@ def views_of(trial: Trial, estimator: TrainedEstimator | Estimator | None = None
     return recall_views(trial, asked, config, lambda step: _panorama_of_step(trial, step, config))
 
 
+@in_32_bits
 def recall_views(
     trial: Trial,
     asked: TrainedEstimator | Estimator | None,

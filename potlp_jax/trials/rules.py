@@ -6,7 +6,9 @@ inside its compiled step, the loop compiles it alone.
 """
 
 import dataclasses
-import inspect
+import functools
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -120,14 +122,27 @@ def estimator_of(
     return asked
 
 
+@dataclasses.dataclass(frozen=True)
+class _Callable:
+    """A ``functools.partial`` as a function: a ``Partial`` of it alone would not be known by its function's name."""
+
+    __wrapped__: Callable[..., Any]
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.__wrapped__(*arguments)
+
+
 def asked_of(
     policy: Policy | PolicyFunction, given: TrainedEstimator | Estimator | None
 ) -> TrainedEstimator | Estimator | None:
     """As ``estimator_of``, without a default for ``potlp``: what is given where the policy asks for it."""
     if isinstance(policy, Policy) and policy is not Policy.POTLP:
         return None
-    # A function is no pytree; as a ``Partial`` it is one without leaves, and goes through jit.
-    return jax.tree_util.Partial(given) if inspect.isfunction(given) else given
+    # A function is no pytree, nor is any other object that can be called, unless its class is one; as a ``Partial`` it
+    # is one without leaves, and goes through jit.
+    if given is None or not jax.tree_util.all_leaves([given]):
+        return given
+    return jax.tree_util.Partial(_Callable(given) if isinstance(given, functools.partial) else given)
 
 
 def first_estimator(

@@ -291,7 +291,8 @@ def _consider(
     """What every policy is given: the situation, and estimates where it asks for them."""
     # Panoramas first: an estimator answers from what can be seen here too.
     running, decision = progress.tally.running, setup.config.decision
-    memory = None if progress.memory is None else _memory_after_looking(setup, asked, progress, scene)
+    looks = isinstance(asked, ObservingEstimator)
+    memory = _memory_after_looking(setup, asked, progress, scene) if looks else progress.memory
     situation = _phase(
         running,
         partial(assess, config=decision.frontiers, irrevocable_last=decision.irrevocable_last),

@@ -9,17 +9,19 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int32, UInt8
 
-from potlp_jax.errors import RobotError
+from potlp_jax.errors import RobotError, WorldError
 from potlp_jax.files import short
 from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.trials.record import NEVER_SEEN, Correction, belief_seen_by
 from potlp_jax.trials.robot import GrowingRobot, Leg, NoticesDoubts, RemembersItsWay, Robot
 from potlp_jax.trials.rules import Stop
-from potlp_jax.world.grid import BeliefMap, World
+from potlp_jax.world.grid import BeliefMap, World, belief_from_numpy
 from potlp_jax.world.moves import Cell
 
 Shown = tuple[int, int]
@@ -52,6 +54,7 @@ class WatchedRobot:
         self._belief: BeliefMap | None = None
         self._last_origin: Cell = (0, 0)
         self._expected: Cell | None = None
+        self._picture: tuple[int, ...] | None = None
         # Where the last leg led, in the lattice that never moves.
         self._leg: tuple[Cell, ...] = ()
 
@@ -97,12 +100,24 @@ class WatchedRobot:
     def panorama(self) -> UInt8[Array, "rows columns 3"]:
         """What the robot's camera sees."""
         with its_own("panorama() of the robot"):
-            return self._robot.panorama()
+            found = self._robot.panorama()
+        return self._as_picture(found, "panorama()")
 
     def panorama_before(self, back: int) -> UInt8[Array, "rows columns 3"] | None:
         """What the robot's camera saw on its way, where it remembers that."""
         with its_own("panorama_before() of the robot"):
-            return self._robot.panorama_before(back) if isinstance(self._robot, RemembersItsWay) else None
+            found = self._robot.panorama_before(back) if isinstance(self._robot, RemembersItsWay) else None
+        return None if found is None else self._as_picture(found, "panorama_before()")
+
+    def _as_picture(self, found: Any, what: str) -> UInt8[Array, "rows columns 3"]:
+        shape = np.shape(found)
+        if getattr(found, "dtype", None) != np.uint8 or len(shape) != 3 or shape[2] != 3:
+            kind = getattr(found, "dtype", type(found).__name__)
+            raise RobotError(f"{what} returns a picture, an array of uint8 [rows, columns, 3], found {kind}{[*shape]}")
+        if self._picture is not None and self._picture != shape:
+            raise RobotError(f"{what} returned a picture of {self._picture} before, and one of {shape} now")
+        self._picture = shape
+        return jnp.asarray(found)
 
     def advance(self, path: KnownPath, stop: Stop) -> Leg:
         """Follow a path."""
@@ -122,6 +137,7 @@ class WatchedRobot:
         return leg
 
     def _check_map(self, belief: BeliefMap) -> None:
+        _check_values(belief)
         before = self._belief
         if before is None:
             return
@@ -232,6 +248,20 @@ def _as_leg(leg: object) -> Leg:
     with its_own("the check of the cells of the leg"):
         cells = tuple(_as_cell(cell, "each cell of a leg") for cell in leg.cells)
     return dataclasses.replace(leg, cells=cells)
+
+
+def _check_values(belief: BeliefMap) -> None:
+    """Raise RobotError where a map holds what no map may: the planner would take it for something else."""
+    cells, letters, extent = (np.asarray(array) for array in (belief.cells, belief.letters, belief.extent))
+    for name, array in (("cells", cells), ("letters", letters), ("extent", extent)):
+        if array.dtype.kind not in "iu":
+            raise RobotError(f"the {name} of the robot's map are {array.dtype}; give whole numbers")
+    if extent.shape != (2,) or not np.all((extent >= 1) & (extent <= cells.shape)):
+        raise RobotError(f"the robot's map has {_size(belief)} cells and the extent {extent.tolist()}")
+    try:
+        belief_from_numpy(cells, letters, float(belief.resolution), propositions=belief.propositions)
+    except WorldError as error:
+        raise RobotError(f"the robot's map: {error}") from error
 
 
 class MapHistory:

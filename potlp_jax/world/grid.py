@@ -233,7 +233,8 @@ def make_world(
         appearance = appearance.padded(1, 1, 1, 1)
         row, column = row + 1, column + 1
     return World(
-        occupied=jnp.asarray(occupied),
+        # A copy, because the caller's array may change.
+        occupied=jnp.array(occupied),
         letters=jnp.asarray(np.where(occupied, 0, letters).astype(np.int32)),
         start=jnp.asarray(np.array([row, column], np.int32)),
         resolution=jnp.asarray(np.float32(resolution)),

@@ -93,6 +93,8 @@ def product_distances(
     """
     source_cells, source_states = _checked_sources(source_cells, source_states)
     _require_map(free, transitions.shape[:2])
+    if wildcard is not None:
+        _require_wildcard(wildcard, transitions.shape)
     # As plain arrays: vmap puts marks in their place, which are none.
     letters = None if wildcard is None else (wildcard.cells, wildcard.successors)
     return _product_distances(transitions, free, source_cells, source_states, jnp.asarray(resolution), letters)
@@ -365,6 +367,14 @@ def _checked_sources(cells: Array, states: Array) -> tuple[Int32[Array, "Q 2"], 
     states = whole_numbers(states, "source_states", ProblemError)
     require_shapes({"source_states": (states, (states.size,)), "source_cells": (cells, (states.size, 2))})
     return cells, states
+
+
+def _require_wildcard(wildcard: Wildcard, shape: tuple[int, ...]) -> None:
+    expected = {
+        "wildcard.cells": (wildcard.cells, shape[:2]),
+        "wildcard.successors": (wildcard.successors, (shape[2], shape[2])),
+    }
+    require_shapes(expected, f"the product is {shape}")
 
 
 def _require_map(free: Array, shape: tuple[int, ...]) -> None:

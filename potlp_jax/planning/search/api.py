@@ -195,8 +195,12 @@ def plan_within(
     spent, plan, tree = _timed(_first, problem, key, config=config)
     # A round begins as long as time is left, so the last one may end late by its own length.
     while spent < seconds and float(plan.value) > float(plan.lower_bound) and int(tree.size) < config.tree_capacity:
+        simulations = int(tree.simulations)
         step, plan, tree = _timed(_more, problem, key, tree, config=config)
         spent += step
+        # Where nothing can be done there is nothing to simulate.
+        if int(tree.simulations) == simulations:
+            break
     return plan, tree
 
 
