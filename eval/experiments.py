@@ -301,6 +301,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         page="delivery",
         command="python -m eval.small_generator {all}/recipe-delivery --plans {data}/floorplans --out {out} "
         "--processes {processes} --report docs/results/delivery/small_generator",
+        minutes=102,
     ),
     "recipe-parcels": Experiment(
         page="delivery",

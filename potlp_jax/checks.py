@@ -32,6 +32,7 @@ def is_number(value: object) -> bool:
     return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
+FLAG: Kind = Kind(lambda value: type(value).__name__ in ("bool", "bool_"), "True or False")
 COUNT: Kind = Kind(lambda value: is_whole(value) and value >= 1, "a whole number of at least 1")
 WHOLE: Kind = Kind(lambda value: is_whole(value) and value >= 0, "a whole number from 0")
 AT_LEAST_ONE: Kind = Kind(lambda value: value >= 1, "at least 1")

@@ -4,6 +4,10 @@ jax compares the structures of two dataclasses (``flax.struct.dataclass`` among 
 the names of their fields: two estimators with as many fields look alike to it. Their hashes differ, but its caches look
 at a part of a hash alone, so that about one pair in a hundred runs the program of the other class, and gets back an
 object of that class (seen with jax 0.10.1 and 0.10.2).
+
+``jax.lax.cond``, ``scan`` and ``while_loop``, and ``jax.eval_shape``, compare in the same way where they are given the
+same function again. So what has callers' classes among its operands is given functions that are made anew, as all of
+the package's are.
 """
 
 import functools

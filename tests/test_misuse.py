@@ -1,5 +1,6 @@
 """Calls that are easily made wrongly: each ends in one clear error, or does what its documentation says."""
 
+import copy
 import dataclasses
 import functools
 
@@ -11,6 +12,7 @@ from flax import struct
 
 import potlp_jax
 from potlp_jax import Policy, Start
+from potlp_jax.checks import FLAG
 from potlp_jax.environments.registry import make
 from potlp_jax.errors import BatchError, ProblemError, RobotError, TaskError
 from potlp_jax.learning.estimator import identity_of
@@ -166,6 +168,16 @@ def test_a_task_that_is_done_is_finished_whoever_is_asked():
         )
         assert (int(move.kind), int(move.path.length)) == (MoveKind.FINISH, 0)
         assert not int(move.status) & Status.FALLBACK
+
+
+def test_a_flag_is_true_or_false():
+    assert all(map(FLAG.allows, (True, False, np.bool_(True))))
+    assert not any(map(FLAG.allows, ("no", 1, 0, None)))
+    for config, name in ((CONFIG, "revealed"), (CONFIG.decision, "irrevocable_last")):
+        wrong = copy.copy(config)
+        object.__setattr__(wrong, name, "no")
+        with pytest.raises(ValueError, match=f"{name} is no; give True or False"):
+            wrong.__post_init__()
 
 
 # Arrays.

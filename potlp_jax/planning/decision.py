@@ -38,6 +38,8 @@ def frontier_subgoals(
 ) -> Subgoals:
     """The subgoals of a belief, nearest first by product distance from the robot (docs/model.md section 6).
 
+    For ``jax.jit``, with ``config`` static: without it parts are compiled anew in every call.
+
     Args:
       belief: what is known of the map.
       cell: the robot's cell, which the belief knows to be free.

@@ -13,7 +13,7 @@ from flax import struct
 from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Bool, Float32, Int32, UInt32
 
-from potlp_jax.checks import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, as_python_numbers, require_fields
+from potlp_jax.checks import COUNT, FLAG, NOT_NEGATIVE, POSITIVE, SHARE, as_python_numbers, require_fields
 from potlp_jax.errors import ProblemError
 from potlp_jax.planning.distances.product import (
     distance_table,
@@ -63,6 +63,7 @@ class DecisionConfig:
     def __post_init__(self) -> None:
         if not isinstance(self.search, BestFirstConfig | UctConfig):
             raise ValueError(f"search is {self.search!r}; give a BestFirstConfig or a UctConfig")
+        require_fields(self, ("irrevocable_last",), FLAG, ValueError)
         require_fields(self, ("dead_end_factor",), POSITIVE, ValueError)
         require_fields(self, ("commitment",), NOT_NEGATIVE, ValueError)
         require_fields(self, ("least_chance",), SHARE, ValueError)

@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from potlp_jax.checks import COUNT, NOT_NEGATIVE, POSITIVE, WHOLE, as_python_numbers, require_fields
+from potlp_jax.checks import COUNT, FLAG, NOT_NEGATIVE, POSITIVE, WHOLE, as_python_numbers, require_fields
 from potlp_jax.codec import with_settings
 from potlp_jax.environments.base import Generator
 from potlp_jax.errors import PotlpWarning
@@ -46,6 +46,7 @@ class TrialConfig:
     revealed: bool = False
 
     def __post_init__(self) -> None:
+        require_fields(self, ("revealed",), FLAG, ValueError)
         require_fields(self, ("panoramas",), COUNT, ValueError)
         require_fields(self, ("look_every",), WHOLE, ValueError)
         require_fields(self, ("replan_distance",), NOT_NEGATIVE, ValueError)
