@@ -86,7 +86,7 @@ SCENES = {
     Status.DEPTH_OVERFLOW: {"config": searching(max_depth=1)},
     Status.VIEW_OVERFLOW: {"status": Status.VIEW_OVERFLOW},
     # Nothing is left to do.
-    Status.ACCEPTING_ROOT | Status.NO_FRONTIER: {"state": int(np.flatnonzero(TASK.dfa.accepting)[0])},
+    Status.ACCEPTING_ROOT: {"state": int(np.flatnonzero(TASK.dfa.accepting)[0])},
     # Without chances the robot still goes to a frontier, if there is one.
     Status.DEAD_END | Status.FALLBACK: {"chance": 0.0},
     Status.DEAD_END | Status.NO_FRONTIER: {"drawing": "#.......#"},

@@ -197,7 +197,10 @@ def drive(
 
 
 def _require_arrays_of(task: Task, arrays: TaskArrays) -> None:
-    """Raise TaskError where the arrays, whatever their padding, are not those of the task's automaton."""
+    """Raise where the arrays, whatever their padding, are not those of the task's automaton and propositions."""
+    require_same_propositions(
+        task.propositions, arrays.propositions, asker=f"the task {task.text!r}", knower="the arrays given with it"
+    )
     dfa, (states, letters) = task.dfa, task.dfa.transitions.shape
     same = (
         np.array_equal(np.asarray(arrays.transitions)[:states, :letters], dfa.transitions)

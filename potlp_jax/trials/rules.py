@@ -140,7 +140,7 @@ def asked_of(
         return None
     # A function is no pytree, nor is any other object that can be called, unless its class is one; as a ``Partial`` it
     # is one without leaves, and goes through jit.
-    if given is None or not jax.tree_util.all_leaves([given]):
+    if not callable(given) or not jax.tree_util.all_leaves([given]):
         return given
     return jax.tree_util.Partial(_Callable(given) if isinstance(given, functools.partial) else given)
 
