@@ -152,15 +152,19 @@ def _check_memory(asked: Asked, world: World, config: TrialConfig) -> None:
     if not isinstance(asked, ObservingEstimator):
         return
 
-    def remember() -> Any:
-        seen = jnp.zeros((config.camera.height, config.camera.width, 3), jnp.uint8)
-        return asked.remember(asked.encode(seen), initial_belief(world, config), world.start).memory
+    structures = []
 
-    before, after = asked.memory, jax.eval_shape(remember)
-    kinds = [
-        [(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in jax.tree.leaves(memory)] for memory in (before, after)
-    ]
-    if jax.tree.structure(before) != jax.tree.structure(after) or kinds[0] != kinds[1]:
+    # Leaves, because classes of arrays refuse shapes in their place.
+    def remember() -> list[Array]:
+        seen = jnp.zeros((config.camera.height, config.camera.width, 3), jnp.uint8)
+        memory = asked.remember(asked.encode(seen), initial_belief(world, config), world.start).memory
+        leaves, structure = jax.tree.flatten(memory)
+        structures.append(structure)
+        return leaves
+
+    leaves = jax.tree.leaves(asked.memory), jax.eval_shape(remember)
+    kinds = [[(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in found] for found in leaves]
+    if jax.tree.structure(asked.memory) != structures[0] or kinds[0] != kinds[1]:
         raise BatchError(
             f"the memory of {identity_of(asked)} begins as {_as_text(kinds[0])} and is {_as_text(kinds[1])} after a "
             "picture: in a batch it needs all its arrays from the beginning"
