@@ -311,7 +311,7 @@ def planned_move(
     # may already hold the end of the task, which needs no estimates.
     frontier_cell, frontier_state, frontier_cost = nearest_frontier(situation)
     finishes = plan.action == subgoals.mask.shape[0] * task.edge_mask.shape[0]
-    # Nor does a task that is done.
+    # A task that is done needs none either.
     finishes |= (invalid | task.accepting[situation.state]) & jnp.isfinite(situation.finish_cost)
     acts = (plan.action != NO_ACTION) & ~finishes
     falls_back = (plan.action == NO_ACTION) & jnp.isfinite(frontier_cost)

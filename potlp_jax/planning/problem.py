@@ -85,8 +85,8 @@ class PlanningProblem:
         Returns:
           The problem.
         """
-        # Types alone: values may be traced here, so that nothing can be checked. Copies, because a
-        # caller's buffer may be filled anew.
+        # Types alone: values may be traced here, so that nothing can be checked. Copies, because a caller's buffer may
+        # be filled anew.
         return cls(
             task=task,
             travel=jnp.array(travel, jnp.float32),

@@ -21,7 +21,7 @@ from potlp_jax.planning.distances.paths import KnownPath
 from potlp_jax.trials.record import NEVER_SEEN, Correction, belief_seen_by
 from potlp_jax.trials.robot import GrowingRobot, Leg, NoticesDoubts, RemembersItsWay, Robot
 from potlp_jax.trials.rules import Stop
-from potlp_jax.world.grid import BeliefMap, World, belief_from_numpy
+from potlp_jax.world.grid import BeliefMap, World, check_belief
 from potlp_jax.world.moves import Cell
 
 Shown = tuple[int, int]
@@ -259,7 +259,7 @@ def _check_values(belief: BeliefMap) -> None:
     if extent.shape != (2,) or not np.all((extent >= 1) & (extent <= cells.shape)):
         raise RobotError(f"the robot's map has {_size(belief)} cells and the extent {extent.tolist()}")
     try:
-        belief_from_numpy(cells, letters, float(belief.resolution), propositions=belief.propositions)
+        check_belief(cells, letters, float(belief.resolution), belief.propositions)
     except WorldError as error:
         raise RobotError(f"the robot's map: {error}") from error
 

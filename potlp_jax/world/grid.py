@@ -322,6 +322,20 @@ def belief_from_numpy(
             letter, a letter has a bit without a name, or the resolution is not positive.
         TaskError: where the propositions are no distinct names, or too many.
     """
+    names = check_belief(cells, letters, resolution, propositions)
+    return BeliefMap(
+        cells=jnp.asarray(cells.astype(np.int8)),
+        letters=jnp.asarray(letters.astype(np.int32)),
+        resolution=jnp.asarray(np.float32(resolution)),
+        extent=jnp.asarray(np.array(cells.shape if extent is None else extent, np.int32)),
+        propositions=names,
+    )
+
+
+def check_belief(
+    cells: Num[np.ndarray, "H W"], letters: Int[np.ndarray, "..."], resolution: float, propositions: Sequence[str]
+) -> tuple[str, ...]:
+    """The names of a belief's propositions; raises as ``belief_from_numpy``, whose arguments these are."""
     names = check_propositions(propositions)
     _check_resolution(resolution)
     # First, for letters of a row, a column or a cell would be compared with every cell, and taken for all of them.
@@ -333,13 +347,7 @@ def belief_from_numpy(
     if np.any((cells == BeliefMap.UNKNOWN) & (letters != 0)):
         raise WorldError("a belief has letters in cells that were not observed; set them to 0")
     _check_letters(letters, names)
-    return BeliefMap(
-        cells=jnp.asarray(cells.astype(np.int8)),
-        letters=jnp.asarray(letters.astype(np.int32)),
-        resolution=jnp.asarray(np.float32(resolution)),
-        extent=jnp.asarray(np.array(cells.shape if extent is None else extent, np.int32)),
-        propositions=names,
-    )
+    return names
 
 
 def world_to_dict(world: World) -> dict[str, Any]:
